@@ -1,7 +1,7 @@
 -- Owner: registry (written by the coordinator through `registry::Write`).
--- What the coordinator has decided, the runs it tells of, and the fence of every task.
+-- The coordinator's decisions, the runs they concern, and the fence of every task.
 
--- One row holds the facts of one decision. A snapshot stands for all up to its number, which then go.
+-- One row holds the facts of one decision. A snapshot replaces all facts up to its number, which are then deleted.
 CREATE TABLE IF NOT EXISTS facts (
     seq   INTEGER PRIMARY KEY,
     at_ms INTEGER NOT NULL,
@@ -29,12 +29,12 @@ CREATE TABLE IF NOT EXISTS runs (
     idempotency_key TEXT    UNIQUE,
     created_ms      INTEGER NOT NULL,
     updated_ms      INTEGER NOT NULL,
-    -- Set when it ends: as clients see it; as the coordinator takes it up again.
+    -- Set at the end of the run: `view` is for clients, `archive` lets the coordinator resume the run.
     view            TEXT    CHECK (json_valid(view)),
     archive         TEXT    CHECK (json_valid(archive))
 ) STRICT;
 
--- What there is of a stage's value that no run in the coordinator's memory waits for: tries, shards, checkpoints.
+-- Unfinished executions that no run in the coordinator's memory needs: attempts, shards, checkpoints.
 CREATE TABLE IF NOT EXISTS executions (
     key       TEXT    PRIMARY KEY,
     run       TEXT    NOT NULL,
@@ -43,7 +43,7 @@ CREATE TABLE IF NOT EXISTS executions (
     at_ms     INTEGER NOT NULL
 ) STRICT, WITHOUT ROWID;
 
--- A write that carries a grant is stored only while the grant's fence equals this one.
+-- A write with a grant is stored only if the grant's fence equals this one.
 CREATE TABLE IF NOT EXISTS fences (
     task  TEXT    PRIMARY KEY,
     fence INTEGER NOT NULL

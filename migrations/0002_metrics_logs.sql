@@ -1,5 +1,5 @@
 -- Owner: registry.
--- Values by step and log lines. Primary keys make a batch that is sent twice count once.
+-- Values by step, and log lines. The unique keys store a batch once, even if it is sent twice.
 
 CREATE TABLE IF NOT EXISTS series (
     id      INTEGER PRIMARY KEY,
@@ -13,7 +13,7 @@ CREATE TABLE IF NOT EXISTS series (
 
 CREATE INDEX IF NOT EXISTS series_of_stage ON series (run, stage, key);
 
--- `value` is null where it was not a number.
+-- `value` is null for NaN.
 CREATE TABLE IF NOT EXISTS metrics (
     series INTEGER NOT NULL REFERENCES series (id),
     step   INTEGER NOT NULL,

@@ -1,5 +1,5 @@
 -- Owner: registry.
--- What stages made. A row here is the point at which blobs that were uploaded before begin to count.
+-- Outputs of stages. Uploaded blobs count from the commit of the row that names them.
 
 CREATE TABLE IF NOT EXISTS checkpoints (
     id       INTEGER PRIMARY KEY AUTOINCREMENT,
@@ -43,7 +43,7 @@ CREATE TABLE IF NOT EXISTS artifacts (
     at_ms  INTEGER NOT NULL
 ) STRICT;
 
--- `child` was made of `parent`, which stood in the field `role`.
+-- `child` was made from `parent`, which the field `role` named.
 CREATE TABLE IF NOT EXISTS edges (
     parent TEXT NOT NULL,
     child  TEXT NOT NULL,

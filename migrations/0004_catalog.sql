@@ -1,9 +1,9 @@
 -- Owner: registry.
--- Models, their versions, movable names for versions, and the log of every move.
+-- Models, their versions, the versions' aliases, and the log of every alias's moves.
 
 CREATE TABLE IF NOT EXISTS models (
     model  TEXT    PRIMARY KEY,
-    -- Which metric decides `@best`, and in which direction; null until a registration declares them.
+    -- The metric that ranks `@best`, and its direction; null until a registration declares them.
     metric TEXT,
     mode   TEXT    CHECK (mode IN ('min', 'max')),
     at_ms  INTEGER NOT NULL
@@ -20,7 +20,7 @@ CREATE TABLE IF NOT EXISTS versions (
     UNIQUE (model, artifact)
 ) STRICT;
 
--- Metrics may be added; what a version is may not change.
+-- Metrics may be added; the other columns never change.
 CREATE TRIGGER IF NOT EXISTS versions_are_never_edited BEFORE UPDATE OF model, version, artifact, source, at_ms ON versions
 BEGIN SELECT RAISE(ABORT, 'a model version is never edited'); END;
 
@@ -46,7 +46,7 @@ CREATE TABLE IF NOT EXISTS promotions (
     to_version   INTEGER NOT NULL,
     actor        TEXT    NOT NULL,
     reason       TEXT    NOT NULL,
-    -- The gates as written, each with the numbers it was judged by.
+    -- The gates as written, each with the numbers that it compared.
     gates        TEXT    NOT NULL CHECK (json_valid(gates)),
     FOREIGN KEY (model, to_version) REFERENCES versions (model, version)
 ) STRICT;

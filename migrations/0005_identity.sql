@@ -1,12 +1,12 @@
 -- Owner: registry.
--- Which store this is and how far it has come. One row, written when the store is made.
+-- Identity and counters of the store. One row, written when the store is created.
 
 CREATE TABLE IF NOT EXISTS store (
     one     INTEGER PRIMARY KEY CHECK (one = 1),
     id      TEXT    NOT NULL,
-    -- Raised by every opening. A transaction of an older epoch is refused: somebody else has opened the store since.
+    -- Raised by every opening. A transaction of an older epoch is refused, because another process has opened the store since.
     epoch   INTEGER NOT NULL,
-    -- Committed transactions. The witness file beside the database knows a number that this one has reached.
+    -- Number of committed transactions. The witness file beside the database records a number that this one has reached.
     commits INTEGER NOT NULL,
     at_ms   INTEGER NOT NULL
 ) STRICT;

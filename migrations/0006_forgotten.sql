@@ -1,5 +1,5 @@
 -- Owner: registry.
--- Runs that were forgotten. What others still need of them goes with a later one.
+-- Forgotten runs. Rows that other runs or models still need are deleted with a later run.
 
 CREATE TABLE IF NOT EXISTS forgotten (
     run   TEXT    PRIMARY KEY,

@@ -30,7 +30,7 @@ def farthest(base, ending):
         bpy.ops.import_scene.gltf(filepath=base + ".glb")
         assert any(len(thing.data.vertices) > 100 for thing in bpy.data.objects if thing.type == "MESH"), "no figure"
     else:
-        # Centimetres, y up.
+        # Centimetres, y points up.
         bpy.ops.import_anim.bvh(filepath=base + ".bvh", global_scale=0.01, axis_forward="-Z", axis_up="Y", frame_start=0)
     armature = next(thing for thing in bpy.data.objects if thing.type == "ARMATURE")
     first, last = (round(frame) for frame in armature.animation_data.action.frame_range)

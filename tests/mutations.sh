@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
-# Breaks the code on purpose, one fault at a time, and wants a test to fail: tests/mutations.sh [NAME...]
-# Works on a copy of what is committed; what it builds lies in target/mutations, or where MUTATIONS_TARGET says.
-# Ends with 1 if a fault is found by no test, or stands no longer where this file looks for it.
+# Breaks the code on purpose, one fault at a time, and expects a test to fail: tests/mutations.sh [NAME...]
+# Works on a copy of the last commit; builds into target/mutations, or into MUTATIONS_TARGET.
+# Exits with 1 if no test finds a fault, or if the code that a fault changes no longer exists.
 set -euo pipefail
 root=$(cd "$(dirname "$0")/.." && pwd)
 copy=$(mktemp -d)
@@ -13,7 +13,7 @@ log=$copy/mutation.log
 wanted=("$@")
 missed=0
 
-# mutation NAME FILE PERL CRATES: PERL changes FILE, and a test of one of CRATES must fail; the first that has one ends the search.
+# mutation NAME FILE PERL CRATES: PERL changes FILE, and a test of one of CRATES must fail; the first failure ends the search.
 mutation() {
     local name=$1 file=$2 change=$3 crates=$4 crate
     if [ ${#wanted[@]} -gt 0 ] && [[ ! " ${wanted[*]} " == *" $name "* ]]; then return; fi
@@ -40,7 +40,7 @@ mutation() {
     git checkout --quiet -- .
 }
 
-mutation leniency-times-ten trainer/coordinator/src/observe.rs 's/heard\.after\(overslept\)\.min\(at\)/heard.after(overslept * 10)/' coordinator
+mutation leniency-times-ten trainer/coordinator/src/observe.rs 's/then\.after\(overslept\)\.min\(at\)/then.after(overslept * 10)/' coordinator
 mutation back-off-times-ten trainer/coordinator/src/policy.rs 's/(self\.backoff_ms)\.saturating_mul/$1.saturating_mul(10).saturating_mul/' coordinator
 mutation heard-is-lost trainer/coordinator/src/batch.rs 's/(Ask::Observation\(\.\.\) =>) [^,]*,/$1 {}/' coordinator
 mutation cancelled-shards-forgotten registry/src/sqlite/retention.rs "s/state = 'finished'/state IN ('finished', 'cancelled')/g" "registry coordinator"
@@ -56,4 +56,62 @@ mutation pipe-as-token-file trainer/access/src/file.rs 's/if file\.metadata\(\)\
 mutation lock-follows-links registry/src/blob/disk.rs 's/OFlag::O_NOFOLLOW \| //' registry
 mutation gang-in-the-clear worker/src/gang/seal.rs 's/Ok\(stream\.local_addr\(\)\?\.ip\(\)\.to_canonical\(\) != .*\)$/Ok(stream.local_addr().is_err())/m' worker
 mutation nonce-that-repeats worker/src/gang/seal.rs 's/bytes\[4\.\.\]\.copy_from_slice\(&number\.to_le_bytes\(\)\);/let _ = number; bytes[4] = 1;/' worker
+mutation every-queued-run-is-visited trainer/coordinator/src/schedule.rs 's/(let prepared = )(prepared_gangs)/cx.state.visits += cx.state.runs.size() as u64;\n    $1$2/' coordinator
+mutation a-rank-is-not-brought-up-to-date trainer/coordinator/src/state/apply.rs 's/(concerned\.append\(&mut self\.concerned\(fact\)\);)/$1\n        concerned.clear();/' coordinator
+mutation parts-of-a-given-up-snapshot-count registry/src/sqlite/apply.rs 's/run\(conn, sqlx::query\(given_up\)\.bind\(int\(seq\)\)\.bind\(int\(seq\)\)\)\.await\?;/let _ = given_up;/' registry
+mutation readers-take-all-connections trainer/coordinator/src/shell/listener.rs 's/own >= limits\.of_token/own > limits.most/' coordinator
+mutation no-limit-of-calls trainer/coordinator/src/shell/rate.rs 's/bucket\.left < 1\.0/bucket.left < -1.0e9/' coordinator
+mutation no-limit-of-live-runs trainer/coordinator/src/decide/runs.rs 's/if live < most \{/if live < most || most > 0 {/' coordinator
+mutation no-limit-of-a-runs-lines registry/src/sqlite/usage.rs 's/bind\(int\(log_bytes\)\)/bind(0)/' coordinator
+mutation a-refused-blob-is-tried-again worker/src/blobs.rs 's/BlobError::Unfit\(message\)/BlobError::Unavailable(message)/' worker
+mutation name-of-another-token trainer/coordinator/src/state/worker.rs 's/if own\.caller != by\.caller/if own.caller.is_empty()/' coordinator
+mutation name-of-a-live-process trainer/coordinator/src/state/worker.rs 's/if own\.secret == by\.secret =>/if !own.caller.is_empty() =>/' coordinator
+mutation name-beyond-its-pattern trainer/coordinator/src/shell/secrets.rs 's/\|names\| !names\.allow\(worker\.as_str\(\)\)/|_| false/' coordinator
+mutation poll-without-its-secret trainer/coordinator/src/shell/secrets.rs 's/if identity\.secret == Digest::of\(self\.secret\.0\.as_bytes\(\)\)/if !self.secret.0.contains("?")/' coordinator
+mutation grant-without-its-secret trainer/coordinator/src/shell/secrets.rs 's/if is\(secrets\.mac\(&\("grant", &self\.caller\.name, grant\)\), &self\.secret\.0\)/if !secrets.of_grant(&self.caller.name, grant).is_empty()/' coordinator
+mutation grant-of-every-token trainer/coordinator/src/shell/secrets.rs 's/\("grant", caller, grant\)/("grant", "", grant)/; s/\("grant", &self\.caller\.name, grant\)/("grant", "", grant)/' coordinator
+mutation receipt-of-every-process trainer/coordinator/src/shell/secrets.rs 's/\("upload", caller, &grant\.task, &grant\.worker, grant\.incarnation, digest\)/("upload", caller, grant.task.as_str().len(), digest)/' coordinator
+mutation manifest-of-foreign-blobs trainer/coordinator/src/shell/vouching.rs 's/return Ok\(Some\((next|file\.digest)\)\);/continue;/g' coordinator
+mutation mention-of-foreign-blobs trainer/coordinator/src/shell/vouching.rs 's/if leads_somewhere && seen\.insert\(other\)/if leads_somewhere \&\& seen.insert(other) \&\& queue.len() > 99/' coordinator
+mutation staged-of-everybody trainer/coordinator/src/shell/uploads.rs 's/let is_known = receipt\.is_some\(\)/let is_known = receipt.is_none()/' coordinator
+mutation worker-reads-everything trainer/coordinator/src/shell/uploads.rs 's/if !proof\.caller\.scopes\.allow\(Scope::Read\)/if proof.caller.scopes.allow(Scope::Promote)/' coordinator
+mutation poll-in-anothers-name trainer/coordinator/src/observe.rs 's/if \(&said\.grant\.worker, said\.grant\.incarnation\) != \(&worker, poll\.incarnation\)/if said.grant.worker.as_str().is_empty()/' coordinator
+mutation promotion-without-scope trainer/access/src/tokens.rs 's/if !allow\(Scope::Promote\)/if false/' "access coordinator"
+mutation protected-from-none trainer/access/src/tokens.rs 's/Some\(names\) if !names\.contains\(name\) =>/Some(_) if false =>/' access
+mutation promotion-without-a-second-look trainer/coordinator/src/shell/effects.rs 's/&& let Err\(why\) = actor_handle\.may_promote\(&owner, &alias\)/\&\& let Err::<(), String>(why) = Ok(drop(alias.clone()))/' coordinator
+mutation submission-promotes-unasked trainer/coordinator/src/shell/actor_handle.rs 's/self\.check_registrations\(&pipeline, &owner\)\.await\?;//' coordinator
+mutation runs-of-others-are-shown trainer/coordinator/src/shell/records.rs 's/self\.sees\.as_ref\(\)\.is_none_or\(\|group\| run\.owner\.group\(\) == \*group\)/run.number > 0/' coordinator
+mutation runs-of-others-are-controlled trainer/coordinator/src/shell/queries.rs 's/owner\.is_some\(\) && !caller\.controls\(owner\.as_ref\(\)\)/false/' coordinator
+mutation models-of-others-are-taken registry/src/sqlite/owners.rs 's/if !is_its_own/if false \&\& !is_its_own/' registry
+mutation revoked-and-served trainer/coordinator/src/shell/token_table.rs 's/self\.changed\.send_modify\(\|version\| \*version \+= 1\);//' coordinator
+mutation expired-and-served trainer/access/src/expiry.rs 's/now_ms >= self\.at_ms/now_ms < self.at_ms \&\& false/' "access coordinator"
+mutation refusals-one-by-one trainer/coordinator/src/shell/audit.rs 's/pending\.count\(kind, now_ms, REFUSED_MS\)/pending.line(kind.line(now_ms, now_ms, 1))/' coordinator
+mutation links-out-of-a-data-root trainer/motion/src/roots.rs 's/ResolveFlag::RESOLVE_BENEATH \| //' motion
+mutation a-root-is-no-bound trainer/motion/src/data_access.rs 's/Some\(DataPath::beneath\(Arc::clone\(root\), root\.relative\(path\)\?, path\.to_owned\(\)\)\)/Some(DataPath::local(path))/' motion
+mutation errors-quote-files trainer/protocol/src/printable.rs 's/AtomicBool::new\(false\)/AtomicBool::new(true)/' "protocol hostile"
+mutation digests-on-trust trainer/motion/src/data_access.rs 's/before\.digest != \*expected/false/' motion
+mutation changes-while-read-unseen trainer/motion/src/data_access.rs 's/Ok\(after\) if after == \*before =>/Ok(_) =>/' motion
+mutation keys-without-digests trainer/coordinator/src/state/run.rs 's/inputs\.contains_key\(&folder\.field\)/!folder.field.is_empty() || inputs.is_empty()/' coordinator
+mutation named-without-proof registry/src/proofs.rs 's/(if inner\.is_condemned\(&artifact, proven\.since\)) \{/$1 \&\& false {/' registry
+mutation named-while-removed registry/src/proofs.rs 's/ended\.is_none_or\(\|ended\| ended > since\)/ended.is_some_and(|ended| ended > since)/' registry
+mutation decided-without-proof trainer/coordinator/src/shell/actor_handle.rs 's/if artifacts\.is_empty\(\)/if artifacts.len() < 100/' coordinator
+mutation silence-is-health registry/src/blob/objects/health.rs 's/silent >= SILENCE/silent >= SILENCE * 1000/' coordinator
+mutation lease-not-asked-for-a-name registry/src/proofs.rs 's/lease\.check\(\)\.map_err/Ok(()).map_err/' registry
+mutation lease-not-asked-for-a-removal registry/src/lease.rs 's/self\.check\(\)\.map_err\(\|e\| BlobError/Ok(()).map_err(|e: NoLease| BlobError/' registry
+mutation holder-not-refused registry/src/lease.rs 's/Some\(held\) if held != first => return Ok\(Err\(held\.by\)\),/Some(held) if held != first => return Ok(Ok(())),/' registry
+mutation joiner-outvotes-holder trainer/coordinator/src/state/evidence.rs 's/\(Self::Absent \| Self::Empty \| Self::Late, Self::Holds\(_\)\) => 0/(Self::Holds(_), Self::Empty) => 0/' coordinator
+mutation one-complaint-is-enough trainer/coordinator/src/state/evidence.rs 's/let over = at\.since\(since\) >= hearing_ms;/let over = true;/' coordinator
+mutation liar-stays trainer/coordinator/src/state/evidence.rs 's/Reverse\(degree\(rank\)\)/degree(rank)/' coordinator
+mutation word-outlives-membership trainer/coordinator/src/state/apply.rs 's/drop\(words\.remove\(&member\.worker\)\)/drop(words.get(\&member.worker))/' coordinator
+mutation suspicion-never-fades trainer/coordinator/src/decide/gangs.rs 's/saturating_sub\(u32::try_from\(faded\)[^)]*\)\)/saturating_sub(u32::try_from(faded * 0).unwrap_or(0))/' coordinator
+mutation too-few-lose-their-state trainer/coordinator/src/decide/attempts.rs 's/!left\.is_empty\(\) && self\.may_hold/left.is_empty() \&\& self.may_hold/' coordinator
+mutation failing-lead-ends-the-try trainer/coordinator/src/outcome.rs 's/&& self\.goes_on_without/\&\& !self.goes_on_without/' coordinator
+mutation joins-without-reaching worker/src/prepare.rs 's/for Member \{ worker, peer_address, \.\. \} in &task\.peers \{/for Member { worker, peer_address, .. } in task.peers.iter().take(0) {/' worker
+mutation only-whole-frames-count worker/src/gang/link.rs 's/if count > 0 \{/if count > 1 << 20 {/' worker
+mutation signs-behind-frames worker/src/gang/link.rs 's/writer\.sign\(sign, patience, abort\)\?;/let _ = sign;/' worker
+mutation slow-is-not-named worker/src/gang/pace.rs 's/const FAR_OVER: u32 = 3;/const FAR_OVER: u32 = 3_000_000;/' worker
+mutation finished-as-last-reported trainer/coordinator/src/view.rs 's/    progress\.done = progress\.total;\n//' coordinator
+mutation new-run-with-each-start trainer/coordinator/src/decide/runs.rs 's/&& old\.until == run\.until/\&\& false/' coordinator
+mutation paused-if-interrupted trainer/coordinator/src/state/run.rs 's/self\.parked && self\.state == RunState::Paused/false/' coordinator
+mutation every-word-is-known trainer/motion/src/vocabulary.rs 's/!self\.words\.contains_key\(&word\) && //; s/!unknown\.contains\(&word\)/false \&\& !unknown.contains(\&word)/' motion
 exit $missed

@@ -1,9 +1,9 @@
 #!/usr/bin/env bash
-# Starts published recipes at their own widths, in a few small steps on made-up clips: tests/recipes.sh [RECIPE...]
-# Each is planned, then run with one worker, with two and with three, and once with the trainer killed in every training stage and started again; the
-# digests of all must be equal. RECIPE is a name in configs/; without one, those of Free-T2M and of control.
-# A worker of free-stablemofusion takes 12 GB of memory, a training state of it 4.8 GB of disk.
-# TRAINER is the program (a release build: an unoptimised one takes ten times as long), STEPS those of each training, BATCH the examples of a step, in three slices.
+# Runs published recipes at their own widths, in a few small steps on synthetic clips: tests/recipes.sh [RECIPE...]
+# Each is planned, then run with one, two and three workers, and once with the trainer killed and restarted in every training stage. The
+# digests of all runs must be equal. RECIPE is a name in configs/; the default is those of Free-T2M and of control.
+# A worker of free-stablemofusion needs 12 GB of memory, and a training state of it 4.8 GB of disk.
+# TRAINER is the program (a release build: an unoptimised one takes ten times as long), STEPS the steps of each training, BATCH the examples of a step, in three slices.
 set -euo pipefail
 root=$(cd "$(dirname "$0")/.." && pwd)
 trainer=${TRAINER:-$root/target/release/trainer} steps=${STEPS:-2} batch=${BATCH:-6}
@@ -22,7 +22,7 @@ kind() {
     awk -v stage="$2" '/^  [a-z_0-9]+:/ { name = $1; sub(":", "", name) } name == stage && match($0, /kind: [a-z.0-9]+/) { print substr($0, RSTART + 6, RLENGTH - 6); exit }' "$1"
 }
 
-# Digests of what training and encoding gave.
+# Digests of the results of training and encoding.
 digests() {
     python3 -c 'import json, sys; print("\n".join(s["name"] + " " + " ".join(sorted(s["outputs"].values())) for s in json.load(open(sys.argv[1]))["stages"] if s["outputs"]))' "$1"
 }
@@ -33,7 +33,7 @@ for recipe in "${recipes[@]}"; do
     for stage in $(training "$file"); do
         sets+=(--set "stages.$stage.steps=$steps" --set "stages.$stage.warmup=0" --set "stages.$stage.batch={global: $batch, slices: 3}")
         sets+=(--set "stages.$stage.checkpoint={every: 1, keep: {latest: 1}}")
-        # What is trained in batches of its own is cut into three slices too.
+        # Stages with their own batch size are cut into three slices too.
         case $(kind "$file" "$stage") in
         train.evaluator) sets+=(--set "stages.$stage.movement.batch=$batch") ;;
         train.vae) sets+=(--set "stages.$stage.windows.batch=$batch") ;;
@@ -41,7 +41,7 @@ for recipe in "${recipes[@]}"; do
     done
     echo "== $recipe: plan" >&2
     "$trainer" plan "$file" "${sets[@]}" --no-time --store "$work/none"
-    # Every stage that trains, to its end, in the store $2 with $1 workers; digests of all that was made go to $3.
+    # Runs every training stage to its end, in the store $2 with $1 workers; digests of all results go to $3.
     all() {
         for stage in $(training "$file"); do
             "$trainer" run "$file" "${sets[@]}" --until "$stage" --workers "$1" --store "$2" -o json >"$work/run.json"
@@ -59,7 +59,7 @@ for recipe in "${recipes[@]}"; do
     for stage in $(training "$file"); do
         "$trainer" run "$file" "${sets[@]}" --until "$stage" --workers 2 --store "$store" -o json >/dev/null 2>&1 &
         run=$!
-        # A worker says at once what it begins.
+        # A worker logs at once which stage it begins.
         until grep -qs "/$stage attempt=" "$store"/workers/*.log || ! kill -0 $run 2>/dev/null; do sleep 0.05; done
         kill -9 $run 2>/dev/null || true
         wait $run 2>/dev/null || true

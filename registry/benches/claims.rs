@@ -1,5 +1,5 @@
-//! How many claims (a fence and a fact, on disk before the answer) the store takes in a second, by how many callers
-//! wait at once. `cargo bench -p registry`; numbers in ARCHITECTURE.md are from this.
+//! Benchmark of claims (a fence and a fact, durable before the answer) per second, by number of concurrent callers. Run
+//! it with `cargo bench -p registry`.
 
 use std::io::Write as _;
 use std::time::Instant;
@@ -54,8 +54,5 @@ async fn main() -> Result<(), Box<dyn std::error::Error>> {
         store.write(vec![Write::Metrics { grant: grant.clone(), rows: (0..1000).map(row).collect() }]).await?;
     }
     writeln!(out, "metrics in batches of 1000: {:.0} values/s", 50_000.0 / started.elapsed().as_secs_f64())?;
-    let started = Instant::now();
-    let curves = store.metrics(&"m".into(), &"s".into(), None, 500).await?;
-    writeln!(out, "50000 values read as {} points: {:?}", curves["loss"].points.len(), started.elapsed())?;
     Ok(())
 }

@@ -1,20 +1,20 @@
-//! A store in another folder, as it was at one moment, and back.
+//! Backup of a store into another folder, as of one moment, and restore.
 //!
 //! ```text
 //! BACKUP/
-//!   backup.json         whose it is, of when, and what belongs to it, each with its digest; written last
+//!   backup.json         store, time and content, each file with its digest; written last
 //!   stride-TIME.db      the database, copied by SQLite as of one moment
-//!   blobs/IDENTITY      which store the blobs belong to
+//!   blobs/IDENTITY      the store that the blobs belong to
 //!   blobs/sha256/       every blob that this database needs
 //! ```
 //!
-//! Any process that reads the store's folder makes it, whether or not another one holds the store and goes on working; only
-//! collection waits. A blob is linked where both
-//! folders are on one file system, else copied, and hashed either way; blobs in a bucket are fetched, so a backup holds them too. A second backup into the same folder adds what is new;
-//! until its `backup.json` is in place the one before is whole. One that was cut short is made again by the same command.
+//! Any process that can read the store's folder can make a backup. Another process may hold the store and continue to
+//! write; only garbage collection waits. Each blob is copied and hashed. Blobs in a bucket are downloaded, so a backup
+//! contains them too. A second backup into the same folder adds only new blobs; the previous one stays whole until the
+//! new `backup.json` is in place. After an interruption, run the same command again.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::fs::{self, DirBuilder, File};
+use std::fs::{self, DirBuilder, File, OpenOptions};
 use std::io::{self, ErrorKind, Read, Write as _};
 use std::os::unix::fs::DirBuilderExt;
 use std::path::{Path, PathBuf};
@@ -25,50 +25,51 @@ use serde::{Deserialize, Serialize};
 use sha2::{Digest as _, Sha256};
 
 use crate::blob::Backend;
-use crate::blob::disk::write_whole;
+use crate::blob::disk::{regular, write_whole};
 use crate::blob::fs::Folder;
 use crate::blob::place::Place;
 use crate::identity::Marker;
+use crate::lease::{self, LeaseTerms};
 use crate::lock::CollectionLock;
-use crate::retention::{self, Rows};
+use crate::retention::{self, BlobCalls, Rows};
 use crate::{BlobStore, QueryError, ReadStore, StoreId, clock, folder, sqlite};
 
 const MANIFEST: &str = "backup.json";
 const FORMAT: u32 = 1;
 
-/// What a backup or a restored store holds.
+/// Summary of a backup or a restored store.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Summary {
-    /// Whose it is.
+    /// Identity of the store.
     pub store: StoreId,
-    /// Of when, in milliseconds since 1970.
+    /// Time of the backup, in milliseconds since 1970.
     pub at_ms: i64,
-    /// Blobs in it.
+    /// Number of blobs.
     pub blobs: u64,
-    /// Their bytes.
+    /// Total bytes of the blobs.
     pub bytes: u64,
 }
 
-/// Why there is no backup, or nothing was restored.
+/// Error of a backup or a restore.
 #[derive(Debug, thiserror::Error)]
 pub enum BackupError {
-    /// The folder is not one for it.
+    /// The folder cannot hold a backup or a store.
     #[error("{0}")]
     Folder(String),
-    /// What is to be copied is not whole.
+    /// The source is damaged or incomplete.
     #[error("{0}")]
     Damaged(String),
-    /// The disk.
+    /// A file system call failed.
     #[error("{did} `{}`: {cause}", path.display())]
     Disk {
-        /// What was tried.
+        /// The operation that failed.
         did: &'static str,
-        /// On what.
+        /// Its path.
         path: PathBuf,
-        /// Why it failed.
+        /// Cause from the operating system.
         cause: io::Error,
     },
-    /// The database.
+    /// A query of the database failed.
     #[error(transparent)]
     Query(#[from] QueryError),
 }
@@ -78,11 +79,11 @@ struct Manifest {
     format: u32,
     store: StoreId,
     at_ms: i64,
-    /// The database's file, its length and its digest.
+    /// File name of the database in the backup.
     database: String,
     database_bytes: u64,
     database_digest: Digest,
-    /// Blobs with their lengths.
+    /// Blobs with their lengths in bytes.
     blobs: BTreeMap<Digest, u64>,
 }
 
@@ -95,7 +96,7 @@ impl Manifest {
             Err(cause) => return Err(BackupError::Disk { did: "cannot read", path, cause }),
         };
         let manifest: Self = serde_json::from_str(&text)
-            .map_err(|e| BackupError::Damaged(format!("`{}` does not read: {e}", path.display())))?;
+            .map_err(|e| BackupError::Damaged(format!("cannot parse `{}`: {e}", path.display())))?;
         if manifest.format != FORMAT {
             let found = manifest.format;
             return Err(BackupError::Folder(format!(
@@ -136,7 +137,7 @@ fn names(dir: &Path) -> Result<Vec<String>, BackupError> {
         .collect()
 }
 
-/// The digest and the length of a file, read part by part.
+/// Returns the digest and the length of a file, read part by part.
 fn hashed(path: &Path) -> io::Result<(Digest, u64)> {
     let (mut file, mut hasher, mut bytes) = (File::open(path)?, Sha256::new(), 0);
     let mut part = vec![0; 1 << 20];
@@ -162,16 +163,19 @@ fn expect(path: &Path, digest: Digest) -> Result<u64, BackupError> {
 }
 
 impl ReadStore {
-    /// Makes or renews a backup in `to`, which is empty, missing, or holds an older backup of this store.
+    /// Makes or renews a backup in `to`. The folder must be empty, missing, or hold an older backup of this store.
     pub async fn backup(&self, to: &Path) -> Result<Summary, BackupError> {
         let path = CollectionLock::path(self.dir());
         let _nothing_goes = CollectionLock::keep_away(self.dir()).await.map_err(disk("cannot lock", &path))?;
         self.check_identity().await.map_err(BackupError::Damaged)?;
         let absolute = std::path::absolute(to).map_err(disk("cannot find", to))?;
-        // The nearest folder that is there, with links followed; the rest of the path is still to be made.
+        // The nearest existing ancestor, with links resolved; the rest of the path does not exist yet.
         let there = absolute.ancestors().find_map(|path| path.canonicalize().ok()).unwrap_or_default();
         if there.starts_with(self.dir()) || self.dir().starts_with(&absolute) {
-            return Err(BackupError::Folder(format!("`{}` and the store lie in each other", to.display())));
+            return Err(BackupError::Folder(format!(
+                "`{}` and the store's folder must not contain each other",
+                to.display()
+            )));
         }
         prepare(self, to)?;
         let to = to.canonicalize().map_err(disk("cannot find", to))?;
@@ -181,9 +185,9 @@ impl ReadStore {
         let rows = Rows::from(self.copy_to(&copy).await?);
         sync(&copy)?;
         let (blobs, from, store) = (self.blobs().clone(), self.dir().to_owned(), self.id().clone());
-        let ended = |e: tokio::task::JoinError| BackupError::Damaged(format!("the copying ended early: {e}"));
+        let ended = |e: tokio::task::JoinError| BackupError::Damaged(format!("copying stopped early: {e}"));
+        let needed = retention::needed(&BlobCalls::of(self), &rows).await?;
         let work = move || {
-            let needed = retention::needed(&blobs, &rows)?;
             let blobs = copy_blobs(&blobs, &from, &to, needed)?;
             let (database_digest, database_bytes) = hashed(&copy).map_err(disk("cannot read", &copy))?;
             let manifest = Manifest { format: FORMAT, store, at_ms, database, database_bytes, database_digest, blobs };
@@ -197,7 +201,7 @@ impl ReadStore {
     }
 }
 
-/// Makes the folder one that a backup of this store may be in.
+/// Prepares the folder for a backup of this store.
 fn prepare(store: &ReadStore, to: &Path) -> Result<(), BackupError> {
     let names = names(to)?;
     let folder = Folder::to_read(to);
@@ -214,12 +218,12 @@ fn prepare(store: &ReadStore, to: &Path) -> Result<(), BackupError> {
     claim(&folder, marker, store.id())
 }
 
-/// Says beside the blobs at `place` that they are the store's, unless somebody else says otherwise at the same time.
+/// Marks the blobs at `place` as this store's. Fails if another process has just written a marker.
 fn claim(place: &dyn Backend, old: Option<Marker>, store: &StoreId) -> Result<(), BackupError> {
     if old.is_some() {
         return Ok(());
     }
-    let written = Marker { store: store.clone(), epoch: 0 }.write(None, place);
+    let written = Marker { store: store.clone(), epoch: 0, held: None }.write(None, place);
     if written.map_err(|e| BackupError::Damaged(e.to_string()))? {
         return Ok(());
     }
@@ -253,11 +257,14 @@ fn copy_blobs(
     Ok(copied)
 }
 
-/// Links or copies a blob; it has its name only once it is whole.
+/// Copies a blob through a temporary file; the final name appears only when the copy is complete. The file system may
+/// share the bytes copy-on-write, but files are never hard-linked: damage to the store must not reach a backup.
 fn copy_blob(blobs: &BlobStore, source: &Path, target: &Path, digest: Digest) -> Result<u64, BackupError> {
     let part = target.with_extension("part");
     let _ = fs::remove_file(&part);
-    if fs::hard_link(source, &part).is_err() {
+    let copied = regular(OpenOptions::new().read(true), source)
+        .and_then(|mut file| io::copy(&mut file, &mut File::create(&part)?));
+    if copied.is_err() {
         let damaged = |e: BlobError| BackupError::Damaged(e.to_string());
         let mut reader = blobs.read(digest).map_err(damaged)?;
         let mut file = File::create(&part).map_err(disk("cannot write", &part))?;
@@ -271,7 +278,7 @@ fn copy_blob(blobs: &BlobStore, source: &Path, target: &Path, digest: Digest) ->
     Ok(bytes)
 }
 
-/// Removes what only an older backup in the same folder needed.
+/// Removes files that only an older backup in the same folder needed.
 fn remove_what_is_over(to: &Path, manifest: &Manifest) -> Result<(), BackupError> {
     let remove = |path: &Path| fs::remove_file(path).map_err(disk("cannot remove", path));
     for name in names(to)? {
@@ -291,8 +298,9 @@ fn remove_what_is_over(to: &Path, manifest: &Manifest) -> Result<(), BackupError
     Ok(())
 }
 
-/// Makes a store of a backup in `to`, which is missing or empty, with its blobs at `place` if that is given: a place without blobs,
-/// or where the same store's are. The store appears under its name once all of it was verified.
+/// Restores a backup into `to`, which must be missing or empty. `place` optionally gives another place for the blobs,
+/// which must be empty or hold blobs of the same store. The store appears under its name only after all of it was
+/// verified.
 pub async fn restore(backup: &Path, to: &Path, place: Option<&Place>) -> Result<Summary, BackupError> {
     let Some(manifest) = Manifest::read(backup)? else {
         return Err(BackupError::Folder(format!(
@@ -302,7 +310,7 @@ pub async fn restore(backup: &Path, to: &Path, place: Option<&Place>) -> Result<
     };
     if !names(to)?.is_empty() {
         return Err(BackupError::Folder(format!(
-            "`{}` is not empty; a store is restored into a folder of its own",
+            "`{}` is not empty; restore into an empty or missing folder",
             to.display()
         )));
     }
@@ -318,7 +326,7 @@ pub async fn restore(backup: &Path, to: &Path, place: Option<&Place>) -> Result<
     }
     let made = verified(backup, &fresh, &manifest, place).await;
     if let Err(e) = made {
-        // What went wrong matters more than how cleaning up goes; the next try cleans up as well.
+        // The first error matters more than a failed clean-up; the next try cleans up again.
         let _ = fs::remove_dir_all(&fresh);
         return Err(e);
     }
@@ -327,16 +335,15 @@ pub async fn restore(backup: &Path, to: &Path, place: Option<&Place>) -> Result<
     Ok(manifest.summary())
 }
 
-/// Makes a store of a backup in `fresh`, and checks it as `fsck` does.
+/// Makes a store from a backup in `fresh` and checks it as `fsck` does.
 async fn verified(backup: &Path, fresh: &Path, manifest: &Manifest, place: Option<&Place>) -> Result<(), BackupError> {
     let (from, to, parts, place) = (backup.to_owned(), fresh.to_owned(), manifest.clone(), place.cloned());
-    let ended = |e: tokio::task::JoinError| BackupError::Damaged(format!("the copying ended early: {e}"));
+    let ended = |e: tokio::task::JoinError| BackupError::Damaged(format!("copying stopped early: {e}"));
     let copied = tokio::task::spawn_blocking(move || copy_back(&from, &to, &parts, place)).await.map_err(ended)?;
-    // Every other copy of the database is refused from here on.
+    // Every other copy of the database is refused from then on.
     sqlite::reach_epoch(fresh, copied?).await.map_err(QueryError::from)?;
-    let unsound = |problem: String| {
-        BackupError::Damaged(format!("the backup is not whole, and no store was made of it: {problem}"))
-    };
+    let unsound =
+        |problem: String| BackupError::Damaged(format!("the backup is damaged and was not restored: {problem}"));
     let read = ReadStore::open(fresh).await.map_err(|e| unsound(e.to_string()))?;
     let problems = read.fsck().await?.problems;
     read.close().await;
@@ -346,11 +353,11 @@ async fn verified(backup: &Path, fresh: &Path, manifest: &Manifest, place: Optio
     }
 }
 
-/// Copies a backup to `fresh`, and its blobs to `place`; returns the epoch that is known there.
+/// Copies a backup to `fresh` and its blobs to `place`. Returns the epoch in the marker there.
 fn copy_back(backup: &Path, fresh: &Path, manifest: &Manifest, place: Option<Place>) -> Result<u64, BackupError> {
     make_dir(&fresh.join("blobs"))?;
     let (from, to) = (backup.join(&manifest.database), fresh.join(folder::DATABASE));
-    // Not linked: a store must not share its files with what is to bring it back.
+    // Copied, not linked: a store must not share files with its backup.
     fs::copy(&from, &to).map_err(disk("cannot copy", &from))?;
     expect(&to, manifest.database_digest)?;
     sync(&to)?;
@@ -359,20 +366,26 @@ fn copy_back(backup: &Path, fresh: &Path, manifest: &Manifest, place: Option<Pla
     if let Some(place) = &place {
         place.remember(fresh).map_err(disk("cannot write to", fresh))?;
     }
-    let looked = place.unwrap_or_else(|| Place::Folder(fresh.to_owned())).look(fresh).map_err(unusable)?;
-    let seen = looked.to_read().map_err(disk("cannot read", fresh))?;
-    let marker = Marker::read(&*seen).map_err(|e| BackupError::Folder(e.to_string()))?;
+    let location = place.unwrap_or_else(|| Place::Folder(fresh.to_owned())).locate(fresh).map_err(unusable)?;
+    let place_blobs = location.to_read().map_err(disk("cannot read", fresh))?;
+    let marker = Marker::read(&*place_blobs).map_err(|e| BackupError::Folder(e.to_string()))?;
     let is_foreign = match &marker {
         Some(marker) => marker.store != manifest.store,
-        None => !seen.is_empty().map_err(unusable)?,
+        None => !place_blobs.is_empty().map_err(unusable)?,
     };
     if is_foreign {
-        let why = format!("there are blobs of another store: see `{}`", seen.marker_place());
+        let why = format!("there are blobs of another store: see `{}`", place_blobs.marker_place());
         return Err(BackupError::Folder(why));
     }
+    let own = lease::lock_of(fresh).map_err(disk("cannot read", fresh))?;
+    let free = lease::wait_until_free(&*place_blobs, &own, LeaseTerms::default());
+    free.map_err(|e| BackupError::Folder(e.to_string()))?.map_err(|by| {
+        BackupError::Folder(format!("{by} holds the blobs (`{}`); stop that process first", place_blobs.marker_place()))
+    })?;
+    let marker = Marker::read(&*place_blobs).map_err(|e| BackupError::Folder(e.to_string()))?;
     let epoch = marker.as_ref().map_or(0, |marker| marker.epoch);
-    claim(&*seen, marker, &manifest.store)?;
-    let blobs = looked.open().map_err(disk("cannot open the blobs of", fresh))?;
+    claim(&*place_blobs, marker, &manifest.store)?;
+    let blobs = location.open().map_err(disk("cannot open the blobs of", fresh))?;
     for digest in manifest.blobs.keys() {
         put_back(&blobs, &blob_path(backup, *digest), *digest)?;
     }
@@ -381,7 +394,7 @@ fn copy_back(backup: &Path, fresh: &Path, manifest: &Manifest, place: Option<Pla
     Ok(epoch)
 }
 
-/// Stores a backup's blob, unless it is there already.
+/// Stores a backup's blob unless the store has it already.
 fn put_back(blobs: &BlobStore, from: &Path, digest: Digest) -> Result<(), BackupError> {
     let stored = |e: BlobError| match e {
         e @ BlobError::Corrupt { .. } => BackupError::Damaged(format!("`{}` is damaged: {e}", from.display())),

@@ -1,14 +1,14 @@
-//! The one place of this crate that reads the clock. Times are for people; nothing is decided by them but the grace
-//! that fresh blobs have from collection.
+//! The only module of this crate that reads the clock. The one decision that uses the time is the grace period of fresh
+//! blobs in a collection.
 
 use std::time::{SystemTime, UNIX_EPOCH};
 
-/// Milliseconds since 1970, UTC.
+/// Returns milliseconds since 1970, UTC.
 pub(crate) fn now_ms() -> i64 {
     SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |d| i64::try_from(d.as_millis()).unwrap_or(i64::MAX))
 }
 
-/// `2026-03-01 12:30:05 UTC`.
+/// Formats a time as `2026-03-01 12:30:05 UTC`.
 pub(crate) fn format_ms(ms: i64) -> String {
     let seconds = ms.div_euclid(1000);
     let (days, rest) = (seconds.div_euclid(86_400), seconds.rem_euclid(86_400));
@@ -16,7 +16,7 @@ pub(crate) fn format_ms(ms: i64) -> String {
     format!("{year:04}-{month:02}-{day:02} {:02}:{:02}:{:02} UTC", rest / 3600, rest / 60 % 60, rest % 60)
 }
 
-/// The calendar date of a day counted from 1970-01-01, by eras of 400 years that begin in March.
+/// Converts a day number since 1970-01-01 to a date, with eras of 400 years that start in March.
 fn civil(days: i64) -> (i64, i64, i64) {
     let days = days + 719_468;
     let era = days.div_euclid(146_097);

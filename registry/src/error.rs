@@ -1,60 +1,65 @@
-//! Why a question has no answer, and why nothing was written.
+//! Errors of queries and writes.
 
 use protocol::{Fence, TaskId};
 
-/// Why a question has no answer.
+/// Error of a query.
 #[derive(Debug, thiserror::Error)]
 pub enum QueryError {
-    /// No such thing.
+    /// The object does not exist.
     #[error("{0}")]
     NotFound(String),
-    /// The question is malformed.
+    /// The query is malformed.
     #[error("{0}")]
     Invalid(String),
-    /// The database.
+    /// The database failed.
     #[error("database: {0}")]
     Database(String),
-    /// The blobs.
+    /// A blob could not be read.
     #[error("{0}")]
     Blob(String),
-    /// The disk did not take a change.
+    /// The disk refused a change.
     #[error("{0}")]
     Storage(String),
 }
 
-/// Why nothing of a transaction was stored.
+/// Reason why a transaction was not stored.
 #[derive(Debug, thiserror::Error)]
 pub enum WriteError {
-    /// Somebody else holds the task now.
-    #[error("stale fence: task `{task}` is at fence {current}, the write carries {carried}")]
+    /// Another grant holds the task now.
+    #[error("stale fence: the grant of task `{task}` with fence {carried} has been superseded")]
     StaleFence {
         task: TaskId,
-        /// The fence in the store.
+        /// The fence in the store. It is not part of the message, which the caller sees.
         current: Fence,
         /// The fence of the write.
         carried: Fence,
     },
-    /// Another process has opened the store since this one did, so this one may not write to it any more.
-    #[error(
-        "the store was opened by another process: this one held it under epoch {epoch}, which is over; nothing was written"
-    )]
+    /// Another process has opened the store since, so this one may no longer write.
+    #[error("another process has opened the store, which ended this one's epoch {epoch}; nothing was written")]
     Superseded {
         /// This process's epoch.
         epoch: u64,
     },
-    /// What is stored contradicts it.
+    /// The write contradicts stored data.
     #[error("{0}")]
     Conflict(String),
-    /// A promotion gate does not hold; the message says by how much.
+    /// A promotion gate fails; the message has the numbers.
     #[error("{0}")]
     Gate(String),
-    /// No such thing.
+    /// The object does not exist.
     #[error("{0}")]
     NotFound(String),
-    /// Full or not writable.
+    /// The disk is full or not writable.
     #[error("{0}")]
     Storage(String),
-    /// A fault of ours or of the database.
+    /// The artifact is not proven whole, or a collection has started since its proof. The write may succeed after
+    /// [`Store::prove`](crate::Store::prove).
+    #[error("artifact {artifact} is not proven whole; upload its missing blobs and repeat the request")]
+    Unproven { artifact: protocol::Digest },
+    /// The blobs' backend does not answer; the same write may succeed later.
+    #[error("{0}")]
+    Unreachable(String),
+    /// An internal error, or one of the database.
     #[error("{0}")]
     Internal(String),
 }

@@ -1,9 +1,9 @@
 //! Points at which tests kill the process: `blob::{before,after}_{write,fsync,rename}` and `db::{before,after}_commit`.
 //!
-//! Built only with the feature `failpoints`; a process is told by `STRIDE_FAILPOINT=name` or `name@3` (the third time it
-//! gets there) to end as by `kill -9` at one of them.
+//! Built only with the feature `failpoints`. `STRIDE_FAILPOINT=name`, or `name@3` for the third pass, kills the process
+//! at that point like `kill -9`.
 
-/// Every point, in the order in which a blob and then its row reach them.
+/// All points, in the order in which a blob and then its row reach them.
 pub const ALL: [&str; 8] = [
     "blob::before_write",
     "blob::after_write",
@@ -15,10 +15,10 @@ pub const ALL: [&str; 8] = [
     "db::after_commit",
 ];
 
-/// Arms what `STRIDE_FAILPOINT` names; called once by a binary's `main`. Does nothing without the feature.
+/// Arms the point in `STRIDE_FAILPOINT`; called once by a binary's `main`. Does nothing without the feature.
 ///
 /// # Panics
-/// If the variable names no known point: a test would otherwise pass without having killed anything.
+/// Panics if the variable names an unknown point, so that a test cannot pass without killing anything.
 #[cfg(feature = "failpoints")]
 pub fn arm_from_env() {
     let Ok(text) = std::env::var("STRIDE_FAILPOINT") else { return };
@@ -31,7 +31,7 @@ pub fn arm_from_env() {
     fail::cfg_callback(name, move || {
         if seen.fetch_add(1, std::sync::atomic::Ordering::SeqCst) + 1 == nth {
             let _ = nix::sys::signal::kill(nix::unistd::Pid::this(), nix::sys::signal::Signal::SIGKILL);
-            // The signal is on its way; nothing may happen after it.
+            // Nothing may run until the signal arrives.
             loop {
                 std::thread::park();
             }
@@ -40,6 +40,6 @@ pub fn arm_from_env() {
     .expect("a fail point takes a callback");
 }
 
-/// Arms what `STRIDE_FAILPOINT` names; called once by a binary's `main`. Does nothing without the feature.
+/// Arms the point in `STRIDE_FAILPOINT`; called once by a binary's `main`. Does nothing without the feature.
 #[cfg(not(feature = "failpoints"))]
 pub fn arm_from_env() {}

@@ -1,30 +1,35 @@
-//! Forgetting runs that have ended: their rows go, and their blobs with the next collection. What each may take:
+//! Deletion of ended runs: their rows are deleted now, their blobs by the next collection. Each kind of data is deleted
+//! at its time:
 //!
-//! | what | goes |
+//! | data | deleted |
 //! |---|---|
-//! | a checkpoint | as its stage's `checkpoint.keep` says, while it is trained |
+//! | a checkpoint | while its stage trains, by the stage's `checkpoint.keep` |
 //! | a shard | once its run is finished |
-//! | the values, states, logs and curves of a sweep's trials that are not the best | with the run, or before it by [`Store::forget_leftovers`] |
-//! | checkpoints, shards, logs and curves of work that was cancelled, failed or taken over and has no value | likewise |
+//! | the values, states, logs and curves of a sweep's trials that are not the best | with the run, or earlier by [`Store::forget_leftovers`] |
+//! | checkpoints, shards, logs and curves of cancelled, failed or replaced work without a value | likewise |
 //! | everything else of a run | with the run |
-//! | a model version, and what it was made of | never |
+//! | a model version, and its lineage | never |
 //!
-//! A stage of the run stays, with all its rows, as long as somebody needs it: a model version or a pin whose lineage it is in,
-//! another run that has its value, or a run under way that has a stage of its name and may be about to use it. What stays is
-//! looked at again whenever a run is forgotten.
+//! A stage of the run stays, with all its rows, as long as one of these holds:
+//!
+//! - A model version or a pin has the stage in its lineage.
+//! - Another run has the stage's value.
+//! - A running run has a stage of the same name and may be about to use the value.
+//!
+//! Stages that stayed are checked again whenever a run is forgotten.
 
 use serde::{Deserialize, Serialize};
 
-/// What went of a run.
+/// Numbers of deleted rows.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Forgotten {
-    /// Values by step.
+    /// Number of values by step.
     pub values: u64,
-    /// Log lines.
+    /// Number of log lines.
     pub lines: u64,
     pub checkpoints: u64,
-    /// Values of stages; their artifacts are collected next.
+    /// Number of stage values; the next collection removes their artifacts.
     pub results: u64,
-    /// Stages that somebody still needs, as `run/stage`.
+    /// Stages that are still needed, as `run/stage`.
     pub kept: Vec<String>,
 }

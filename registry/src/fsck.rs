@@ -1,4 +1,4 @@
-//! Whether what is kept is whole: the database's own check, every blob hashed again, every reference resolved.
+//! Check of a whole store: the database's own check, every blob hashed again, every reference resolved.
 
 use serde::{Deserialize, Serialize};
 
@@ -6,24 +6,24 @@ use crate::blob::BlobStore;
 use crate::catalog::Root;
 use crate::{QueryError, ReadStore};
 
-/// What a check found.
+/// Result of a check.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Report {
-    /// Blobs that were hashed.
+    /// Number of hashed blobs.
     pub blobs: u64,
-    /// Their bytes.
+    /// Total bytes of these blobs.
     pub bytes: u64,
-    /// References that were followed.
+    /// Number of references checked.
     pub references: u64,
-    /// What is wrong, in words.
+    /// Descriptions of the problems.
     pub problems: Vec<String>,
-    /// What lies in the store and is not part of it: strangers' files, and damaged blobs that were put aside and made anew.
+    /// Other files in the store: foreign ones, and damaged blobs that were put aside and stored again.
     #[serde(default)]
     pub notes: Vec<String>,
 }
 
 impl ReadStore {
-    /// Checks everything. Reads every byte, so it takes as long as that takes.
+    /// Checks the whole store. Reads every byte.
     pub async fn fsck(&self) -> Result<Report, QueryError> {
         let mut problems = Vec::new();
         if let Err(problem) = self.check_identity().await {
@@ -32,7 +32,7 @@ impl ReadStore {
         problems.extend(self.problems().await?);
         let roots = self.needs().await?.roots;
         let blobs = self.blobs().clone();
-        let ended = |e: tokio::task::JoinError| QueryError::Blob(format!("the check ended early: {e}"));
+        let ended = |e: tokio::task::JoinError| QueryError::Blob(format!("the check stopped early: {e}"));
         let mut report = tokio::task::spawn_blocking(move || check(&blobs, &roots)).await.map_err(ended)?;
         problems.append(&mut report.problems);
         Ok(Report { problems, ..report })
@@ -57,7 +57,9 @@ fn check(blobs: &BlobStore, roots: &[Root]) -> Report {
     }
     match (blobs.strays(), blobs.aside()) {
         (Ok(strays), Ok(aside)) => {
-            report.notes.extend(strays.iter().map(|path| format!("`{path}` is not the store's and is left alone")));
+            report
+                .notes
+                .extend(strays.iter().map(|path| format!("`{path}` does not belong to the store and is left alone")));
             report.notes.extend(aside.iter().map(|path| format!("`{path}` is a damaged blob that was put aside")));
         }
         (Err(e), _) | (_, Err(e)) => report.problems.push(e.to_string()),

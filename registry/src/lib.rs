@@ -1,14 +1,16 @@
-//! What is kept: blobs, what the coordinator decided, metrics, checkpoints, stage results, model versions and aliases.
+//! Storage: blobs, the coordinator's decisions, metrics, checkpoints, stage results, model versions and aliases.
 //!
-//! [`Store`] is the whole. What may be written is data ([`Write`]); a call of [`Store::write`] is one transaction that also
-//! checks the fences of the tasks it writes about, and returns once it would survive a loss of power. A blob is stored
-//! before the row that names it; the row is the point from which it counts.
+//! [`Store`] is the entry point. Writes are data ([`Write`]). A call of [`Store::write`] is one transaction that also
+//! checks the fences of the tasks concerned, and returns when it is durable. A blob is stored before the row that names
+//! it; the blob counts from that row on.
 //!
-//! Not its job: who works on what (the coordinator), what tensors mean (the stages).
+//! Not part of this crate: assignment of work (the coordinator) and the meaning of tensors (the stages).
 
+pub mod audit;
 pub mod backup;
 pub mod blob;
 pub mod bundle;
+mod calls;
 pub mod catalog;
 pub mod cli;
 mod clock;
@@ -18,28 +20,40 @@ pub mod failpoints;
 mod folder;
 pub mod forget;
 pub mod fsck;
+mod history;
 mod identity;
 pub mod leaderboard;
+mod lease;
 mod lock;
 mod open_error;
+mod proofs;
+mod prove;
 mod reserve;
 pub mod retention;
+mod rollup;
+mod scoped;
+mod server_key;
 mod sqlite;
 mod store;
 mod store_id;
 pub mod testing;
 pub mod versions;
-mod vouched;
 mod write;
 
 pub use blob::BlobStore;
 pub use blob::place::Place;
-pub use catalog::{CheckpointRow, EndedRow, LineageNode, LogRow, Recovery, RunRow, StageResultRow};
-pub use curve::{Curve, Point};
+pub use catalog::{
+    CheckpointRow, EndedRow, HistoryQuery, HistoryRow, LineageNode, LogRow, Recovery, RunRow, StageResultRow, Usage,
+};
+pub use curve::{Axis, Buckets, Curve, Page, Point, Window};
 pub use error::{QueryError, WriteError};
+pub use history::{HistoryEntry, HistoryKind};
 pub use identity::Mismatch;
+pub use lease::LeaseTerms;
 pub use lock::Holder;
 pub use open_error::OpenError;
+pub use proofs::Proof;
+pub use server_key::ServerKey;
 pub use store::{ReadStore, Store};
 pub use store_id::{StoreId, Stored};
 pub use versions::{Expect, Gate, Model, ModelRef, Pick, Promotion, Version};

@@ -1,5 +1,5 @@
-//! Who holds a store. The lock is the operating system's (`flock`), so it ends with its process however that ends; the
-//! file only says who holds it, and means nothing without the lock.
+//! Locks of a store. The lock is the operating system's (`flock`), so it ends with its process, even after a crash. The
+//! file only names the holder and means nothing without the lock.
 
 use std::fmt;
 use std::fs::{File, OpenOptions, TryLockError};
@@ -13,19 +13,19 @@ use serde::{Deserialize, Serialize};
 
 use crate::blob::disk::regular;
 
-/// Who holds a store.
+/// A process that holds a store.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Holder {
     /// Process id; 0 if unknown.
     pub pid: u32,
-    /// What it is, for people: `trainer run configs/quickstart.yaml`.
+    /// Description for messages, such as `trainer run configs/quickstart.yaml`.
     pub what: String,
-    /// Where it answers requests, once it does: `http://127.0.0.1:7070`.
+    /// Address of its server, such as `http://127.0.0.1:7070`, once it has one.
     pub address: Option<String>,
 }
 
 impl Holder {
-    /// This process.
+    /// Describes this process.
     pub fn this_process(what: impl Into<String>) -> Self {
         Self { pid: std::process::id(), what: what.into(), address: None }
     }
@@ -44,30 +44,30 @@ impl fmt::Display for Holder {
     }
 }
 
-/// The lock, held as long as this lives.
+/// The lock of a store, held until it is dropped.
 #[derive(Debug)]
 pub(crate) struct StoreLock {
     file: File,
     holder: Mutex<Holder>,
 }
 
-/// What came of trying.
+/// Result of taking the lock.
 pub(crate) enum Taken {
     Ours(StoreLock),
     Busy(Holder),
 }
 
-/// How long an opening waits for commands that read the store, each of which is short.
+/// Time for which an opening waits for commands that read the store; each of them is short.
 const READERS_END: Duration = Duration::from_secs(10);
 const BETWEEN: Duration = Duration::from_millis(20);
 
-/// Kept by processes that read a store which nobody holds.
+/// Lock of processes that read a store without a holder.
 #[derive(Debug)]
 pub(crate) struct SharedLock(#[expect(dead_code, reason = "the lock lasts as long as the file is open")] File);
 
 impl SharedLock {
-    /// `None` if somebody holds the store. A store without the file is held by nobody, and not locked: it is being made, or was
-    /// put there without it.
+    /// Takes the lock; `None` if the store has a holder. A store without the file is free and not locked: it is being
+    /// created, or was copied without the file.
     pub(crate) fn try_take(path: &Path) -> io::Result<Option<Self>> {
         let file = match regular(OpenOptions::new().read(true), path) {
             Ok(file) => file,
@@ -82,7 +82,7 @@ impl SharedLock {
     }
 }
 
-/// Who holds the store whose lock is at `path`, if somebody does.
+/// Returns the holder of the store with its lock at `path`, if there is one.
 pub(crate) fn holder(path: &Path) -> io::Result<Option<Holder>> {
     let file = match regular(OpenOptions::new().read(true), path) {
         Ok(file) => file,
@@ -96,7 +96,7 @@ pub(crate) fn holder(path: &Path) -> io::Result<Option<Holder>> {
     }
 }
 
-/// Kept by a process that collects, alone, and by those who copy what a collection could take from under them.
+/// Lock between a collection, which takes it alone, and copies, which share it.
 #[derive(Debug)]
 pub(crate) struct CollectionLock(#[expect(dead_code, reason = "the lock lasts as long as the file is open")] File);
 
@@ -105,12 +105,12 @@ impl CollectionLock {
         dir.join("collecting")
     }
 
-    /// Waits until nobody copies, and keeps others from beginning.
+    /// Waits for copies to end and blocks new ones.
     pub(crate) async fn collect(dir: &Path) -> io::Result<Self> {
         Self::wait(dir, File::try_lock).await
     }
 
-    /// Waits until nobody collects, and keeps others from beginning.
+    /// Waits for a collection to end and blocks new ones.
     pub(crate) async fn keep_away(dir: &Path) -> io::Result<Self> {
         Self::wait(dir, File::try_lock_shared).await
     }
@@ -134,7 +134,7 @@ impl CollectionLock {
 }
 
 impl StoreLock {
-    /// Takes the lock, once commands that only read have ended.
+    /// Takes the lock after waiting for read-only commands to end.
     pub(crate) async fn take(path: &Path, holder: Holder) -> io::Result<Taken> {
         let until = Instant::now() + READERS_END;
         loop {
@@ -148,7 +148,7 @@ impl StoreLock {
                 Err(TryLockError::Error(e)) => return Err(e),
                 Err(TryLockError::WouldBlock) => {}
             }
-            // A lock that can be shared is one that readers share.
+            // A lock that can be shared is held only by readers.
             if SharedLock::try_take(path)?.is_none() {
                 return Ok(Taken::Busy(read(file)?));
             }
@@ -170,7 +170,7 @@ impl StoreLock {
         self.write(&holder)
     }
 
-    /// One write that ends its line, then the cut: a reader in between sees one whole line, the old or the new.
+    /// Writes a whole line before truncating, so that a concurrent reader sees either the old or the new line.
     fn write(&self, holder: &Holder) -> io::Result<()> {
         let mut text = serde_json::to_string(holder)?;
         text.push('\n');
@@ -187,7 +187,7 @@ fn read(mut file: File) -> io::Result<Holder> {
     Ok(serde_json::from_str(line).unwrap_or(Holder { pid: 0, what: "another process".into(), address: None }))
 }
 
-/// The kind of network file system that `path` is on, if it is on one that does not keep SQLite's locks.
+/// Returns the network file system of `path`, if SQLite's locks do not work on it.
 #[cfg(target_os = "linux")]
 pub(crate) fn network_filesystem(path: &Path) -> io::Result<Option<&'static str>> {
     let kind = nix::sys::statfs::statfs(path)?.filesystem_type().0;
@@ -196,7 +196,7 @@ pub(crate) fn network_filesystem(path: &Path) -> io::Result<Option<&'static str>
     Ok(network_kind(kind as u32))
 }
 
-/// Elsewhere the kind is not a number; nothing is refused.
+/// Other systems report no number for the kind, so nothing is refused.
 #[cfg(not(target_os = "linux"))]
 pub(crate) fn network_filesystem(_: &Path) -> io::Result<Option<&'static str>> {
     Ok(None)
@@ -204,7 +204,7 @@ pub(crate) fn network_filesystem(_: &Path) -> io::Result<Option<&'static str>> {
 
 #[cfg(any(target_os = "linux", test))]
 fn network_kind(magic: u32) -> Option<&'static str> {
-    // statfs(2) and the kernel's `magic.h`.
+    // Numbers from statfs(2) and the kernel's `magic.h`.
     Some(match magic {
         0x6969 => "NFS",
         0xFF53_4D42 | 0xFE53_4D42 | 0x517B => "SMB",

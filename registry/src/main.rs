@@ -1,4 +1,4 @@
-//! The `registry` command: on a store's folder, or through the server that holds it. All logic is in `registry::cli`.
+//! The `registry` command, on a store's folder or through the server that holds it. All logic is in `registry::cli`.
 
 use std::io::Write as _;
 use std::path::PathBuf;
@@ -10,14 +10,14 @@ use registry::cli::{OutputArg, Verb, execute};
 
 /// Models, their versions, and the aliases that point at them
 #[derive(Debug, Parser)]
-#[command(name = "registry", version)]
+#[command(name = "registry", version = env!("STRIDE_VERSION"), after_help = registry::cli::EXIT_CODES)]
 struct Cli {
     /// The store's folder
     #[arg(long, env = "STRIDE_STORE", default_value = ".stride", global = true)]
     store: PathBuf,
     #[command(flatten)]
     server: ServerOptions,
-    /// How the answer is printed; for `export`, the file of a bundle, FILE.tar.zst
+    /// Output format of the answer; for `export` also the file of a bundle, FILE.tar.zst
     #[arg(short, long, default_value = "table", value_name = "table|json", global = true)]
     output: OutputArg,
     #[command(subcommand)]
@@ -28,13 +28,13 @@ fn main() -> ExitCode {
     registry::failpoints::arm_from_env();
     let cli = Cli::parse();
     if !matches!(cli.verb, Verb::Export { .. }) {
-        // What is made in a store is its user's alone.
+        // Files of a store belong to its user alone.
         nix::sys::stat::umask(nix::sys::stat::Mode::from_bits_truncate(0o077));
     }
     let runtime = match tokio::runtime::Runtime::new() {
         Ok(runtime) => runtime,
         Err(e) => {
-            // Without a reader there is nobody to tell.
+            // The error is lost if stderr is closed.
             let _ = writeln!(std::io::stderr(), "error: no runtime: {e}");
             return ExitCode::FAILURE;
         }

@@ -1,4 +1,4 @@
-//! Why a store could not be opened, and what to do about it.
+//! Errors of opening a store, with their remedies.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -8,118 +8,122 @@ use crate::blob::{is_full, is_read_only};
 use crate::identity::Mismatch;
 use crate::lock::Holder;
 
-/// Why a store could not be opened. Nothing in it was changed.
+/// Reason why a store could not be opened. Nothing was changed.
 #[derive(Debug, thiserror::Error)]
 pub enum OpenError {
-    /// Another process holds it.
+    /// Another process holds the store.
     #[error("store `{}` is in use by {holder}", dir.display())]
     Busy {
-        /// The store.
+        /// Folder of the store.
         dir: PathBuf,
-        /// Who.
+        /// The process that holds it.
         holder: Holder,
     },
-    /// Its database, its blobs and its folder do not belong together, or one of them is missing or has gone back.
+    /// Another process holds the store's blobs, which several folders can reach.
+    #[error("the blobs of store `{}` are in use by {by}, which keeps renewing `{marker}`", dir.display())]
+    Held {
+        dir: PathBuf,
+        /// Description of the process.
+        by: String,
+        /// The marker beside the blobs.
+        marker: String,
+    },
+    /// Database, blobs and folder do not belong together, or one of them is missing or too old.
     #[error("store `{}` is not whole: {mismatch}", dir.display())]
     Mismatch {
-        /// The store.
         dir: PathBuf,
-        /// What does not fit.
+        /// The mismatch.
         mismatch: Mismatch,
     },
-    /// Its blobs lie elsewhere than where it was said.
+    /// The blobs are in another place than the one given.
     #[error("the blobs of store `{}` are at `{place}`, not at `{asked}`", dir.display())]
     Elsewhere {
-        /// The store.
         dir: PathBuf,
-        /// Where they are.
+        /// Actual place of the blobs.
         place: Place,
-        /// Where they were said to be.
+        /// The given place.
         asked: Place,
     },
-    /// The place of its blobs cannot be used; the message says why and what to do.
+    /// The blobs' place cannot be used; the message has the cause and remedy.
     #[error("store `{}`: {message}", dir.display())]
     Blobs {
-        /// The store.
         dir: PathBuf,
-        /// What is wrong.
+        /// Cause and remedy.
         message: String,
     },
-    /// No store, and the folder is somebody else's.
-    #[error("there is no store in `{}`, and none is made among other files: it holds {found}", dir.display())]
+    /// The folder is not a store and has other files.
+    #[error("there is no store in `{}`, and the folder is not empty: it has {found}", dir.display())]
     NotEmpty {
-        /// The folder.
         dir: PathBuf,
-        /// Some of what lies in it.
+        /// Names of some of its files.
         found: String,
     },
-    /// There is none, and none was to be made.
+    /// The store does not exist and must not be created.
     #[error("there is no store in `{}`", .0.display())]
     NotAStore(PathBuf),
-    /// It cannot be written to.
+    /// The store is not writable.
     #[error("store is not writable: `{}`: {message}", path.display())]
     ReadOnly {
-        /// What was tried.
+        /// Path of the failed call.
         path: PathBuf,
-        /// What the system said.
+        /// Error of the operating system.
         message: String,
     },
-    /// No space.
+    /// The disk is full.
     #[error("no space for the store: `{}`: {message}", path.display())]
     Full {
-        /// What was tried.
+        /// Path of the failed call.
         path: PathBuf,
-        /// What the system said.
+        /// Error of the operating system.
         message: String,
     },
-    /// SQLite's locks do not hold there.
-    #[error("store `{}` lies on {kind}, where a database can lose committed data", dir.display())]
+    /// SQLite's locks do not work on this file system.
+    #[error("store `{}` is on {kind}, where a database can lose committed data", dir.display())]
     NetworkFilesystem {
-        /// The store.
         dir: PathBuf,
-        /// Which file system.
+        /// Name of the file system.
         kind: &'static str,
     },
     /// A newer build has changed the schema.
-    #[error("database `{}` has schema {found}, this build knows {known}", path.display())]
+    #[error("database `{}` has schema {found}, but this build reads up to {known}", path.display())]
     NewerSchema {
-        /// The database.
+        /// Path of the database.
         path: PathBuf,
-        /// Its schema.
+        /// Schema of the database.
         found: i64,
-        /// The newest that this build knows.
+        /// Newest schema of this build.
         known: i64,
     },
-    /// An older build made it, and a process that only reads does not change it.
-    #[error("database `{}` has schema {found}, this build reads {known}", path.display())]
+    /// An older build made the database, and a read-only process does not migrate it.
+    #[error("database `{}` has schema {found}, but this build reads {known}", path.display())]
     OlderSchema {
-        /// The database.
+        /// Path of the database.
         path: PathBuf,
-        /// Its schema.
+        /// Schema of the database.
         found: i64,
-        /// The one that this build reads.
+        /// The schema that this build reads.
         known: i64,
     },
-    /// It is not a database, or not one of ours.
+    /// The file is not a database, or not one of a store.
     #[error("database `{}` is damaged: {message}", path.display())]
     Damaged {
-        /// The database.
+        /// Path of the database.
         path: PathBuf,
-        /// What the database said.
+        /// Error of the database.
         message: String,
     },
-    /// Anything else.
+    /// Another error of the operating system.
     #[error("store: `{}`: {message}", path.display())]
     Other {
-        /// What was tried.
+        /// Path of the failed call.
         path: PathBuf,
-        /// What the system said.
+        /// Error of the operating system.
         message: String,
     },
 }
 
 impl OpenError {
-    /// What the user can do.
+    /// Returns the remedy for the user.
     pub fn hint(&self) -> String {
         match self {
             Self::Busy { holder: Holder { address: Some(address), .. }, .. } => {
@@ -128,23 +132,26 @@ impl OpenError {
             Self::Busy { holder, .. } => {
                 format!("wait for process {} to end, or choose another folder with `--store`", holder.pid)
             }
+            Self::Held { .. } => "nothing was changed: stop that process first and continue with the store that has the newer work; a \
+                                  copy of a store needs its own place for blobs: use `registry backup` and `registry restore`"
+                .into(),
             Self::Mismatch { mismatch, .. } => mismatch.hint().into(),
             Self::Elsewhere { asked, .. } => format!(
                 "leave `--blobs` out, or choose another folder with `--store`; if the blobs were moved, `registry adopt --blobs \
-                 {asked}` goes on with them there"
+                 {asked}` uses them there"
             ),
-            Self::Blobs { .. } => "nothing was changed; see to it and run the same command again".into(),
+            Self::Blobs { .. } => "nothing was changed; fix the problem and run the same command again".into(),
             Self::NotEmpty { .. } => "choose a folder that is empty or does not exist with `--store`".into(),
-            Self::NotAStore(_) => "`trainer run PIPELINE` makes one; name its folder with `--store`".into(),
+            Self::NotAStore(_) => "`trainer run PIPELINE` creates one; name its folder with `--store`".into(),
             Self::ReadOnly { .. } => "make the folder writable for this user, or choose another with `--store`".into(),
-            Self::Full { .. } => "`registry gc` removes what nothing needs, on a full disk too; or free some space otherwise".into(),
+            Self::Full { .. } => "`registry gc` removes unneeded blobs, even on a full disk; or free space in another way".into(),
             Self::NetworkFilesystem { .. } => {
-                "choose a folder on a local disk with `--store`; workers on other machines need none, they talk to the server".into()
+                "choose a folder on a local disk with `--store`; workers on other machines need no store; they use the server".into()
             }
             Self::NewerSchema { .. } => "use the newer build that wrote it, or choose another folder with `--store`".into(),
-            Self::OlderSchema { .. } => "a command that writes, such as `registry gc`, brings it up to date".into(),
+            Self::OlderSchema { .. } => "a command that writes, such as `registry gc`, migrates it".into(),
             Self::Damaged { .. } => "restore it from a backup, or choose another folder with `--store`".into(),
-            Self::Other { .. } => "look at the folder's permissions and disk, or choose another with `--store`".into(),
+            Self::Other { .. } => "check the folder's permissions and disk, or choose another with `--store`".into(),
         }
     }
 

@@ -1,4 +1,5 @@
-//! A few megabytes that are given up when the disk is full, so that the database can be opened to collect what nothing needs.
+//! A reserve of some megabytes that is released when the disk is full. The database can then be opened for a
+//! collection.
 
 use std::fs::{self, File};
 use std::io;
@@ -7,16 +8,16 @@ use std::path::{Path, PathBuf};
 
 use crate::blob::disk::free_bytes;
 
-/// Below this much free space nothing is opened for anything but collecting: the database's log would not fit.
+/// Free space below which a store is opened only for a collection, because the database's log would not fit.
 pub(crate) const OPEN_NEEDS_BYTES: u64 = 16 << 20;
-/// Enough for the database's log while a collection is under way.
+/// Size of the reserve: enough for the database's log during a collection.
 const BYTES: u64 = 4 << 20;
 
 fn path(dir: &Path) -> PathBuf {
     dir.join("reserve")
 }
 
-/// Makes the reserve if it is missing and there is space for it.
+/// Creates the reserve if it is missing and there is space for it.
 pub(crate) fn keep(dir: &Path) {
     let path = path(dir);
     if path.exists() || !free_bytes(dir).is_ok_and(|free| free >= OPEN_NEEDS_BYTES + BYTES) {
@@ -28,16 +29,16 @@ pub(crate) fn keep(dir: &Path) {
         Ok(())
     };
     if let Err(error) = make() {
-        // A file system without reservations; a full disk has to be freed by hand there.
+        // The file system has no reservations; a full disk must be freed by hand.
         tracing::debug!(%error, "no reserve for a full disk");
         let _ = fs::remove_file(&path);
     }
 }
 
-/// Gives the reserve up if the disk is full.
+/// Releases the reserve if the disk is full.
 pub(crate) fn release_if_full(dir: &Path) {
     if free_bytes(dir).is_ok_and(|free| free < OPEN_NEEDS_BYTES) {
-        // There may be none, or it was given up before.
+        // The reserve may be missing or already released.
         let _ = fs::remove_file(path(dir));
     }
 }

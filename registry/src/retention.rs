@@ -1,104 +1,164 @@
-//! What may go. Marks from roots, then sweeps what was not marked and is old enough.
+//! Garbage collection: marks from roots, then removes unmarked blobs that are old enough.
 //!
-//! Roots: every version (so whatever an alias points at), every stage result, every checkpoint that was not pruned, every
-//! shard of a run that may still need it, and every pin; and without a row what tasks that are held have uploaded, and what
-//! somebody is about to name ([`BlobStore::held`]). From a root the mark follows the
-//! manifest's files, digests in the manifest's own words (`meta`), and the lineage. A blob that was put within the grace
-//! period is never collected: the row that will name it may be on its way. A loss of power may take the note of what a
-//! held task had uploaded; so while a run is under way, blobs from before the store was opened have the usual grace however
-//! short a one was asked for.
+//! Roots with a row are every version (and thus every alias), every stage result, every checkpoint that was not pruned,
+//! every shard of a run that may need it, and every pin. Roots without a row are uploads of held tasks and blobs about
+//! to be named ([`BlobStore::held`]). From a root the mark follows the manifest's files, the digests in its `meta`, and
+//! the lineage.
 //!
-//! The writer goes on meanwhile. Marking reads one moment of the database; from just before that moment on the writer notes
-//! what new rows name (`Named`), and a blob is removed only while nobody can be noting it. A root whose manifest does not
-//! read stops the collection, for nobody can say what it needs; so does a database or a folder of blobs that is not the
-//! store's own any more.
+//! A blob within its grace period is never collected, because the row that names it may follow. A power loss may delete
+//! the record of a held task's uploads. While a run is under way, blobs from before the store was opened therefore have
+//! at least the usual grace period.
+//!
+//! Writes continue meanwhile. Marking reads one moment of the database; from just before it the writer records the
+//! names in new rows (`proofs`). Blobs are condemned in batches in the writer and then removed beside it. A root with
+//! an unreadable manifest stops the collection, because its references are unknown. So does a database or blob folder
+//! that no longer belongs to the store.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
 
 use checkpoint::BlobError;
+use futures::{StreamExt as _, TryStreamExt as _, stream};
+use protocol::artifact::mentioned;
 use protocol::{Digest, TaskId};
 use serde::{Deserialize, Serialize};
 
-use crate::blob::{BlobStore, ManifestError};
+use crate::blob::{BlobStore, Entry, ManifestError};
+use crate::calls::Calls;
 use crate::catalog::{Needs, Root};
 use crate::lock::CollectionLock;
-use crate::vouched::{Named, mentioned};
+use crate::proofs::Proofs;
 use crate::{QueryError, ReadStore, Store, WriteError, clock};
 
-/// How long a fresh blob is safe from collection: longer than any upload waits for its row.
+/// Grace period of a fresh blob: longer than any upload waits for its row.
 pub const GRACE_MS: i64 = 60 * 60 * 1000;
 
-/// What a collection removes, or would.
+/// Blobs that a collection removes, or would remove.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Plan {
-    /// Blobs that nothing needs, by name.
+    /// Unneeded blobs by digest.
     pub remove: Vec<Digest>,
-    /// Their bytes.
+    /// Total bytes of these blobs.
     pub bytes: u64,
-    /// Blobs that nothing needs but that are too fresh to go.
+    /// Number of unneeded blobs within their grace period.
     pub fresh: u64,
-    /// Blobs that stay because something needs them.
+    /// Number of blobs that are needed.
     pub kept: u64,
-    /// Shards of finished runs that are forgotten, by task.
+    /// Deleted shards of finished runs, by task.
     pub forget_shards: Vec<TaskId>,
 }
 
 impl ReadStore {
-    /// What [`Store::gc`] would remove.
+    /// Returns the plan that [`Store::gc`] would carry out.
     pub async fn gc_plan(&self, grace_ms: i64) -> Result<Plan, QueryError> {
-        let (rows, blobs) = (Rows::from(self.needs().await?), self.blobs().clone());
+        let rows = Rows::from(self.needs().await?);
         let ages = Ages { now_ms: clock::now_ms(), grace_ms, opened_ms: self.opened_ms(), live: rows.live };
-        blocking(move || plan(&blobs, &rows, &ages)).await
+        let (plan, candidates) = plan(&BlobCalls::of(self), &rows, &ages).await?;
+        let bytes = candidates.iter().map(|entry| entry.bytes).sum();
+        Ok(Plan { remove: candidates.iter().map(|entry| entry.digest).collect(), bytes, ..plan })
     }
 }
 
 impl Store {
-    /// Removes blobs that nothing needs and that were last put more than `grace_ms` ago; returns what went. Writes go on
-    /// meanwhile. Killed in between it has removed only what nothing needs; the next one goes on.
+    /// Removes unneeded blobs whose last put is more than `grace_ms` ago, and returns them. Writes continue meanwhile.
+    /// A killed collection has removed only unneeded blobs; the next one removes the rest.
     pub async fn gc(&self, grace_ms: i64) -> Result<Plan, WriteError> {
         let lock = CollectionLock::collect(self.dir()).await;
         let _alone = lock.map_err(|e| WriteError::Storage(format!("nothing was collected: no lock: {e}")))?;
         self.check_identity().await.map_err(|why| WriteError::Storage(format!("nothing was collected: {why}")))?;
         crate::reserve::release_if_full(self.dir());
-        let _noting = Noting(Arc::clone(self.named()));
+        let _recording = NameRecording(Arc::clone(self.proofs()));
         let forgotten = self.begin_collection().await?;
-        let (rows, blobs, named) = (Rows::from(self.needs().await?), self.blobs().clone(), Arc::clone(self.named()));
+        let rows = Rows::from(self.needs().await?);
         let ages = Ages { now_ms: clock::now_ms(), grace_ms, opened_ms: self.opened_ms(), live: rows.live };
-        let plan = blocking(move || {
-            let plan = plan(&blobs, &rows, &ages)?;
-            sweep(&blobs, &rows, &ages, &named, plan)
-        });
-        let plan = plan.await;
+        let place = BlobCalls::of(self);
+        let plan = match plan(&place, &rows, &ages).await {
+            Ok((plan, candidates)) => self.sweep(&place, &rows, &ages, plan, candidates).await,
+            Err(e) => Err(e.into()),
+        };
         crate::reserve::keep(self.dir());
         Ok(Plan { forget_shards: forgotten, ..plan? })
     }
-}
 
-async fn blocking<T: Send + 'static>(
-    work: impl FnOnce() -> Result<T, QueryError> + Send + 'static,
-) -> Result<T, QueryError> {
-    let ended = |e: tokio::task::JoinError| QueryError::Blob(format!("the collection ended early: {e}"));
-    tokio::task::spawn_blocking(work).await.map_err(ended)?
-}
-
-/// Ends the noting, however the collection ends.
-struct Noting(Arc<Named>);
-
-impl Drop for Noting {
-    fn drop(&mut self) {
-        self.0.end();
+    /// Removes the planned blobs, except blobs that were put again or named since.
+    async fn sweep(
+        &self,
+        place: &BlobCalls,
+        rows: &Rows,
+        ages: &Ages,
+        mut plan: Plan,
+        candidates: Vec<Entry>,
+    ) -> Result<Plan, WriteError> {
+        let mut kept = BTreeSet::new();
+        for batch in candidates.chunks(BATCH) {
+            // Follows the references of names in new rows.
+            mark(place, rows, |_| true, self.proofs().to_follow(), &mut kept).await?;
+            let batch = batch.iter().map(|entry| entry.digest).filter(|digest| !kept.contains(digest));
+            let condemned = Condemned(Arc::clone(self.proofs()), self.condemn(batch.collect()).await?);
+            let removing = stream::iter(condemned.1.clone()).map(|digest| {
+                let ages = *ages;
+                let is_young = move |put_ms| put_ms >= ages.before_ms(put_ms);
+                place.ask(move |blobs| blobs.remove_unless(digest, is_young))
+            });
+            let removed = removing.buffer_unordered(AT_ONCE).try_collect::<Vec<Option<Entry>>>().await;
+            drop(condemned);
+            for entry in removed.map_err(|e| WriteError::Storage(e.to_string()))?.into_iter().flatten() {
+                plan.remove.push(entry.digest);
+                plan.bytes += entry.bytes;
+            }
+        }
+        plan.remove.sort();
+        Ok(plan)
     }
 }
 
-/// What a collection has to know of the rows, as of one moment.
+/// Ends the recording when the collection ends or fails.
+struct NameRecording(Arc<Proofs>);
+
+impl Drop for NameRecording {
+    fn drop(&mut self) {
+        self.0.end_collection();
+    }
+}
+
+/// Ends the removal of blobs when it succeeds or fails.
+struct Condemned(Arc<Proofs>, Vec<Digest>);
+
+impl Drop for Condemned {
+    fn drop(&mut self) {
+        self.0.removed(&self.1);
+    }
+}
+
+/// The blobs' backend, with its limit of calls.
+pub(crate) struct BlobCalls {
+    blobs: BlobStore,
+    calls: Calls,
+}
+
+impl BlobCalls {
+    pub(crate) fn of(store: &ReadStore) -> Self {
+        Self { blobs: store.blobs().clone(), calls: store.calls().clone() }
+    }
+
+    async fn ask<T: Send + 'static>(&self, call: impl FnOnce(&BlobStore) -> T + Send + 'static) -> T {
+        let blobs = self.blobs.clone();
+        self.calls.run(move || call(&blobs)).await
+    }
+
+    async fn list(&self) -> Result<BTreeMap<Digest, Entry>, QueryError> {
+        self.ask(BlobStore::list).await.map_err(|e| QueryError::Blob(e.to_string()))
+    }
+}
+
+/// Roots and lineage for a collection, as of one moment.
 pub(crate) struct Rows {
     roots: BTreeMap<Digest, String>,
-    /// What each artifact was made of.
+    /// Artifacts that each artifact was made from.
     parents: HashMap<Digest, Vec<Digest>>,
-    /// Shards that go, by task.
+    /// Tasks whose shards are deleted.
     forget_shards: Vec<TaskId>,
-    /// Whether a run is under way.
+    /// True while a run is under way.
     live: bool,
 }
 
@@ -111,18 +171,19 @@ impl From<Needs> for Rows {
     }
 }
 
-/// How old a blob must be to go.
+/// Ages from which blobs may be collected.
+#[derive(Debug, Clone, Copy)]
 struct Ages {
     now_ms: i64,
     grace_ms: i64,
-    /// When this process opened the store.
+    /// Time at which this process opened the store.
     opened_ms: i64,
-    /// Whether a run is under way.
+    /// True while a run is under way.
     live: bool,
 }
 
 impl Ages {
-    /// A blob that was last put at `put_ms` goes if that is before this time.
+    /// Returns the time before which a blob with put time `put_ms` may be collected.
     fn before_ms(&self, put_ms: i64) -> i64 {
         let unknown = self.live && put_ms < self.opened_ms;
         let grace_ms = if unknown { self.grace_ms.max(GRACE_MS) } else { self.grace_ms };
@@ -130,97 +191,87 @@ impl Ages {
     }
 }
 
-/// Adds all that `queue` needs to `marked`. `is_there` says which digests are blobs.
-fn mark(
-    blobs: &BlobStore,
+/// Number of concurrent reads of manifests and removals of blobs.
+const AT_ONCE: usize = 16;
+/// Number of blobs removed before new rows are checked again.
+const BATCH: usize = 64;
+
+/// Adds everything reachable from `queue` to `marked`. `is_there` returns true for digests of stored blobs.
+async fn mark(
+    place: &BlobCalls,
     rows: &Rows,
     is_there: impl Fn(Digest) -> bool,
     mut queue: Vec<Digest>,
     marked: &mut BTreeSet<Digest>,
 ) -> Result<(), QueryError> {
-    while let Some(digest) = queue.pop() {
-        let root = rows.roots.get(&digest);
-        if !marked.insert(digest) || !(root.is_some() || is_there(digest)) {
-            continue;
-        }
-        queue.extend(rows.parents.get(&digest).into_iter().flatten());
-        match (blobs.manifest(digest), root) {
-            (Ok(manifest), _) => {
-                marked.extend(manifest.files.values().map(|file| file.digest));
-                mentioned(&manifest.meta, &mut queue);
+    while !queue.is_empty() {
+        queue.retain(|digest| marked.insert(*digest) && (rows.roots.contains_key(digest) || is_there(*digest)));
+        let parents = queue.iter().filter_map(|digest| rows.parents.get(digest)).flatten().copied();
+        let mut next: Vec<Digest> = parents.collect();
+        let read = |digest: Digest| place.ask(move |blobs| (digest, blobs.manifest(digest)));
+        let mut reading = stream::iter(queue).map(read).buffer_unordered(AT_ONCE);
+        while let Some((digest, read)) = reading.next().await {
+            match (read, rows.roots.get(&digest)) {
+                (Ok(manifest), _) => {
+                    marked.extend(manifest.files.values().map(|file| file.digest));
+                    mentioned(&manifest.meta, &mut next);
+                }
+                // A digest in `meta` that is not a manifest, or a blob removed since the listing.
+                (Err(ManifestError::NotAManifest { .. } | ManifestError::Blob(BlobError::NotFound(_))), None) => {}
+                (Err(e), why) => {
+                    let why = why.map_or_else(|| format!("artifact {digest}"), Clone::clone);
+                    return Err(QueryError::Blob(format!(
+                        "nothing was collected: cannot read the references of {why}: {e}"
+                    )));
+                }
             }
-            // Mentioned, but as a blob by itself; or gone since the listing.
-            (Err(ManifestError::NotAManifest { .. } | ManifestError::Blob(BlobError::NotFound(_))), None) => {}
-            (Err(e), why) => {
-                let why = why.map_or_else(|| format!("artifact {digest}"), Clone::clone);
-                return Err(QueryError::Blob(format!(
-                    "nothing was collected, for what {why} needs cannot be read: {e}"
-                )));
-            }
         }
+        drop(reading);
+        queue = next;
     }
     Ok(())
 }
 
-/// The blobs that the rows need, all of them there.
-pub(crate) fn needed(blobs: &BlobStore, rows: &Rows) -> Result<BTreeSet<Digest>, QueryError> {
-    for (root, why) in &rows.roots {
-        blobs.complete_manifest(*root).map_err(|e| QueryError::Blob(format!("{why}: {e}")))?;
-    }
-    let all = blobs.list().map_err(|e| QueryError::Blob(e.to_string()))?;
+/// Returns the blobs that the rows need, after checking that they exist.
+pub(crate) async fn needed(place: &BlobCalls, rows: &Rows) -> Result<BTreeSet<Digest>, QueryError> {
+    let check = |(root, why): (&Digest, &String)| {
+        let (root, why) = (*root, why.clone());
+        let checked = place.ask(move |blobs| blobs.complete_manifest(root));
+        async move { checked.await.map(|_| ()).map_err(|e| QueryError::Blob(format!("{why}: {e}"))) }
+    };
+    stream::iter(&rows.roots).map(check).buffered(AT_ONCE).try_collect::<()>().await?;
+    let all = place.list().await?;
     let mut marked = BTreeSet::new();
-    mark(blobs, rows, |digest| all.contains_key(&digest), rows.roots.keys().copied().collect(), &mut marked)?;
-    // What is mentioned need not be there; what roots list is, by now.
+    mark(place, rows, |digest| all.contains_key(&digest), rows.roots.keys().copied().collect(), &mut marked).await?;
+    // A digest in `meta` need not be a stored blob; blobs that roots list were checked above.
     marked.retain(|digest| all.contains_key(digest));
     Ok(marked)
 }
 
-fn plan(blobs: &BlobStore, rows: &Rows, ages: &Ages) -> Result<Plan, QueryError> {
-    let all = blobs.list().map_err(|e| QueryError::Blob(e.to_string()))?;
+/// Returns the plan and the blobs that may be removed.
+async fn plan(place: &BlobCalls, rows: &Rows, ages: &Ages) -> Result<(Plan, Vec<Entry>), QueryError> {
+    let all = place.list().await?;
     let mut marked = BTreeSet::new();
     let is_there = |digest| all.contains_key(&digest);
-    mark(blobs, rows, is_there, rows.roots.keys().copied().collect(), &mut marked)?;
-    // Nobody relies yet on what no row names: if it is damaged, that stops nothing.
-    let (damaged, held): (Vec<_>, Vec<_>) = blobs
-        .held()
-        .into_iter()
-        .partition(|digest| matches!(blobs.manifest(*digest), Err(ManifestError::Blob(BlobError::Corrupt { .. }))));
-    mark(blobs, rows, is_there, held, &mut marked)?;
+    mark(place, rows, is_there, rows.roots.keys().copied().collect(), &mut marked).await?;
+    // No row relies on these blobs yet, so a damaged one does not stop the collection.
+    let is_damaged = |blobs: &BlobStore, digest: &Digest| {
+        matches!(blobs.manifest(*digest), Err(ManifestError::Blob(BlobError::Corrupt { .. })))
+    };
+    let held = move |blobs: &BlobStore| blobs.held().into_iter().partition(|digest| is_damaged(blobs, digest));
+    let (damaged, held): (Vec<Digest>, Vec<Digest>) = place.ask(held).await;
+    mark(place, rows, is_there, held, &mut marked).await?;
     marked.extend(damaged);
     let mut plan = Plan { forget_shards: rows.forget_shards.clone(), ..Plan::default() };
-    for (digest, entry) in all {
-        if marked.contains(&digest) {
+    let mut candidates = Vec::new();
+    for entry in all.into_values() {
+        if marked.contains(&entry.digest) {
             plan.kept += 1;
         } else if entry.put_ms >= ages.before_ms(entry.put_ms) {
             plan.fresh += 1;
         } else {
-            plan.remove.push(digest);
-            plan.bytes += entry.bytes;
+            candidates.push(entry);
         }
     }
-    Ok(plan)
-}
-
-/// Blobs that are removed before new rows are looked at again.
-const BATCH: usize = 64;
-
-/// Removes what was planned, but what was put again or named since.
-fn sweep(blobs: &BlobStore, rows: &Rows, ages: &Ages, named: &Named, plan: Plan) -> Result<Plan, QueryError> {
-    let storage = |e: BlobError| QueryError::Storage(e.to_string());
-    let mut plan = Plan { bytes: 0, ..plan };
-    let mut kept = BTreeSet::new();
-    let candidates = std::mem::take(&mut plan.remove);
-    for batch in candidates.chunks(BATCH) {
-        // What new rows name has needs of its own.
-        mark(blobs, rows, |_| true, named.noted().into_iter().collect(), &mut kept)?;
-        for digest in batch.iter().filter(|digest| !kept.contains(digest)) {
-            let Some(entry) = blobs.entry(*digest).map_err(storage)? else { continue };
-            let remove = || blobs.remove_older(*digest, ages.before_ms(entry.put_ms));
-            if named.unless_named(*digest, remove).transpose().map_err(storage)? == Some(true) {
-                plan.remove.push(*digest);
-                plan.bytes += entry.bytes;
-            }
-        }
-    }
-    Ok(plan)
+    Ok((plan, candidates))
 }

@@ -1,4 +1,4 @@
-//! What a store is called, and what its catalog says of itself.
+//! Identity of a store, and its row in the catalog.
 
 use std::fmt;
 use std::fs::File;
@@ -13,14 +13,14 @@ use serde::{Deserialize, Serialize};
 pub struct StoreId(String);
 
 impl StoreId {
-    /// Another one each time.
+    /// Draws a new random name.
     pub(crate) fn random() -> io::Result<Self> {
         let mut bytes = [0_u8; 16];
         File::open("/dev/urandom")?.read_exact(&mut bytes)?;
         Ok(Self(bytes.iter().map(|byte| format!("{byte:02x}")).collect()))
     }
 
-    /// The digits.
+    /// Returns the digits.
     pub fn as_str(&self) -> &str {
         &self.0
     }
@@ -61,11 +61,10 @@ impl From<StoreId> for String {
 /// The store's row in its database.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Stored {
-    /// The store's name.
     pub id: StoreId,
-    /// How often it was opened for writing; a commit under an older number is refused.
+    /// Number of openings for writing; a commit under an older number is refused.
     pub epoch: u64,
-    /// Committed transactions.
+    /// Number of committed transactions.
     pub commits: u64,
 }
 

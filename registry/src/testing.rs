@@ -1,7 +1,10 @@
-//! Bundles that are whole, and the import of whatever bytes: what the tests of bundles and `fuzz/` run.
+//! Valid bundles, and the import of arbitrary bytes, for the tests of bundles and for `fuzz/`.
 //!
-//! Every file of a bundle is held against a digest, which hardly a changed file has. So changed bytes also come as the archive before its compression,
-//! and as a manifest whose digest the rest of the bundle is told: then it is what reads them that has to refuse them.
+//! Every file of a bundle is checked against a digest, so almost no changed file gets past that check. Changed bytes
+//! are therefore also used as the archive before compression, and as a manifest whose digest the rest of the bundle
+//! has. Then the parsers behind the check must refuse them.
+
+pub mod slow;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -24,15 +27,15 @@ use crate::store::Store;
 
 use crate::WriteError;
 
-/// An entry of an archive: its name, what it is, what it holds.
+/// An entry of an archive: name, type, content.
 pub type Entry = (String, EntryType, Vec<u8>);
 
-/// A version of a model of three parts.
+/// A version of a model with three parts.
 #[derive(Debug, Clone)]
 pub struct Whole {
-    /// What its bundle says of itself.
+    /// Head of its bundle.
     pub head: Head,
-    /// The model.
+    /// The model's manifest.
     pub manifest: Manifest,
     /// The files that the manifest lists, by their digests.
     pub files: BTreeMap<Digest, Vec<u8>>,
@@ -49,10 +52,10 @@ fn part(kind: ArtifactKind, meta: Value, weights: &[u8]) -> Manifest {
 }
 
 impl Whole {
-    /// One whose VAE has these bytes as its weights.
+    /// Makes a version whose VAE has these bytes as weights.
     ///
     /// # Panics
-    /// If it makes no model, which would be a fault here.
+    /// Panics if the parts form no model, which would be an error in this function.
     pub fn of(weights: Vec<u8>) -> Self {
         let other = b"some weights".to_vec();
         let vae = part(ArtifactKind::Vae, json!({"features": 263, "mean": [0.5], "std": [1.0]}), &weights);
@@ -73,10 +76,10 @@ impl Whole {
         Self { head, manifest, files }
     }
 
-    /// The entries of its bundle, in order, to be changed.
+    /// Returns the entries of its bundle in order, to be changed by a test.
     ///
     /// # Panics
-    /// If its head makes no JSON, which would be a fault here.
+    /// Panics if its head cannot be serialised, which would be an error in this function.
     pub fn entries(&self) -> Vec<Entry> {
         let head = serde_json::to_vec(&self.head).expect("a head is JSON");
         let file = |(name, entry): (&String, &FileEntry)| regular(name, self.files[&entry.digest].clone());
@@ -88,7 +91,7 @@ impl Whole {
         first.into_iter().chain(self.manifest.files.iter().map(file)).collect()
     }
 
-    /// The entries with other bytes as the model's manifest, which the head knows.
+    /// Returns the entries with other bytes as the model's manifest, and their digest in the head.
     fn with_manifest(&self, manifest: Vec<u8>) -> Vec<Entry> {
         let mut changed = self.clone();
         changed.head.artifact = Digest::of(&manifest);
@@ -97,7 +100,7 @@ impl Whole {
         entries
     }
 
-    /// The entries with other bytes as the manifest of its denoiser, which the model's knows.
+    /// Returns the entries with other bytes as the denoiser's manifest, and their digest in the model's.
     fn with_denoiser(&self, part: Vec<u8>) -> Vec<Entry> {
         let mut changed = self.clone();
         changed.manifest.meta["parts"]["denoiser"] = json!(Digest::of(&part));
@@ -108,12 +111,12 @@ impl Whole {
     }
 }
 
-/// A file of an archive.
+/// Makes an archive entry of a regular file.
 pub fn regular(name: &str, content: Vec<u8>) -> Entry {
     (name.to_owned(), EntryType::Regular, content)
 }
 
-/// An archive of entries whose names nobody checks.
+/// Makes an archive of entries without checking their names.
 pub fn archive(entries: &[Entry]) -> Vec<u8> {
     let mut tar = Vec::new();
     for (name, kind, content) in entries {
@@ -130,31 +133,31 @@ pub fn archive(entries: &[Entry]) -> Vec<u8> {
     tar
 }
 
-/// The same compressed.
+/// Compresses an archive.
 ///
 /// # Panics
-/// If there is no memory for it.
+/// Panics if memory is exhausted.
 pub fn compressed(archive: &[u8]) -> Vec<u8> {
     zstd::encode_all(archive, 1).expect("in memory")
 }
 
-/// What bytes for [`bundle`] are.
+/// Interpretation of the bytes for [`bundle`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Form {
-    /// A file.
+    /// The bytes of a whole bundle.
     File,
-    /// An archive that is not compressed yet.
+    /// An archive to be compressed.
     Archive,
-    /// The manifest of the model, in a bundle whose head knows it.
+    /// The model's manifest, in a bundle whose head has its digest.
     Manifest,
-    /// The manifest of the denoiser, in a bundle whose model knows it.
+    /// The denoiser's manifest, in a bundle whose model has its digest.
     Denoiser,
 }
 
 impl Form {
     const ALL: [Self; 4] = [Self::File, Self::Archive, Self::Manifest, Self::Denoiser];
 
-    /// Bytes of this form behind a byte that says so.
+    /// Puts the byte of this form before the bytes.
     pub fn marked(self, bytes: &[u8]) -> Vec<u8> {
         [&[self as u8], bytes].concat()
     }
@@ -170,7 +173,7 @@ impl Form {
     }
 }
 
-/// Takes files into memory, and holds who gives them to what is promised.
+/// A sink in memory that asserts the guarantees of [`Sink`]'s caller.
 #[derive(Debug, Default)]
 struct Held {
     open: Option<(Digest, u64, Vec<u8>)>,
@@ -202,7 +205,7 @@ impl Sink for Held {
 }
 
 impl Held {
-    /// That all of an accepted bundle was given; and that it can be shown, and exported again.
+    /// Asserts that all files of an accepted bundle were passed, and that it can be shown and exported again.
     fn expect_whole(&self, found: &Bundle) {
         let manifest = &found.manifest;
         assert_eq!(self.files.get(&manifest.digest()), Some(&manifest.to_bytes()));
@@ -231,7 +234,7 @@ impl Held {
     }
 }
 
-/// A store of this process, and the file that is imported.
+/// A store of this process, and the path of the imported file.
 struct World {
     runtime: Runtime,
     store: Store,
@@ -248,10 +251,10 @@ fn world() -> &'static World {
     })
 }
 
-/// Imports bytes, of which the first says what [`Form`] the others are, into a store of this process; whether they were accepted.
+/// Imports bytes into a store of this process; the first byte is their [`Form`]. Returns true if they were accepted.
 ///
 /// # Panics
-/// If they break a promise.
+/// Panics if a guarantee is broken.
 pub fn bundle(bytes: &[u8]) -> bool {
     let Some((form, bytes)) = bytes.split_first() else { return false };
     let file = Form::ALL[usize::from(*form) % Form::ALL.len()].file(bytes);
@@ -273,7 +276,7 @@ pub fn bundle(bytes: &[u8]) -> bool {
             assert!(read.is_err(), "one reading accepts it and another does not");
             false
         }
-        // The store has its own rules for what a version may be.
+        // The store has its own rules for versions.
         Err(ImportError::Write(WriteError::Conflict(_) | WriteError::NotFound(_))) => false,
         Err(other) => panic!("{other}"),
     }

@@ -1,41 +1,50 @@
-//! What may be written, as data. One call of [`Store::write`](crate::Store::write) is one transaction: all of it or none.
+//! Writes as data. One call of [`Store::write`](crate::Store::write) is one transaction: all of it or none.
 //!
-//! A write that carries a [`Grant`] is checked against the task's fence inside that transaction, so that no code path can
-//! forget it; an older fence refuses the whole transaction with [`WriteError::StaleFence`](crate::WriteError::StaleFence).
+//! The transaction checks every write with a [`Grant`] against the task's fence, so that no code path can omit the
+//! check. An older fence refuses the whole transaction with [`WriteError::StaleFence`](crate::WriteError::StaleFence).
 
 use std::collections::BTreeMap;
 
 use protocol::message::{Grant, MetricRow};
-use protocol::{Alias, Digest, Fence, ModelName, RunId, StageName, TaskId};
+use protocol::{Alias, Digest, Fence, Group, ModelName, Owner, RunId, StageName, TaskId};
 use serde_json::Value;
+
+use crate::history::HistoryEntry;
 
 /// One row or change.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Write {
     /// Appends the facts of one decision of the coordinator; recovery applies them in order.
     Facts {
-        /// The decision's number: one more than that of the decision before. A number that is taken is refused, so that of two
-        /// coordinators on one store only one goes on.
+        /// The decision's number, one more than the one before. A number that exists is refused, so that only one of
+        /// two coordinators on a store can continue.
         seq: u64,
-        /// JSON; what it says is the coordinator's business.
+        /// JSON that only the coordinator interprets.
         facts: String,
     },
-    /// The coordinator's state after decision `seq`. Older snapshots and the facts that it stands for go.
-    Snapshot {
-        /// The newest decision that it holds.
+    /// Parts of the snapshot of decision `seq`. They have no effect until that snapshot is written.
+    SnapshotParts {
+        /// Number of the snapshot's decision.
         seq: u64,
-        /// JSON.
+        /// Parts that changed since the previous snapshot, by name, as JSON; `None` deletes a part.
+        parts: Vec<(String, Option<String>)>,
+    },
+    /// The coordinator's state after decision `seq`, except for its parts. Deletes the covered facts and replaced
+    /// parts.
+    Snapshot {
+        /// The newest decision that the snapshot covers.
+        seq: u64,
+        /// The state as JSON.
         state: String,
     },
-    /// Sets a task's fence; it must be larger than the one stored.
+    /// Sets a task's fence; it must be larger than the stored one.
     Fence {
         task: TaskId,
-        /// Its new fence.
+        /// The new fence.
         fence: Fence,
     },
-    /// A run that was submitted, and its pipeline.
+    /// A submitted run with its pipeline.
     Run {
-        /// Which.
         run: RunId,
         /// The validated pipeline.
         pipeline: Value,
@@ -43,99 +52,112 @@ pub enum Write {
         source: String,
         /// `running`, `paused`, `finished`, `failed`, `cancelled`.
         state: String,
-        /// Unique when given.
+        /// Unique if given.
         idempotency_key: Option<String>,
     },
-    /// A run that goes on in another state.
-    RunState {
-        /// Which.
+    /// The group that owns a run.
+    RunOwner {
         run: RunId,
-        /// As above.
+        /// The owning group.
+        owner: Group,
+    },
+    /// Records the owner of a new model. If an existing model is not under the owner's control, the whole transaction
+    /// is refused.
+    ModelOwner {
+        model: ModelName,
+        /// Owner of the token that registers the model.
+        owner: Owner,
+    },
+    /// Changes the state of a run.
+    RunState {
+        run: RunId,
+        /// The new state, as in [`Write::Run`].
         state: String,
     },
-    /// A run that ended, and with it all that is asked about it from now on: the coordinator forgets it.
+    /// Ends a run and stores everything that later queries need, because the coordinator forgets the run.
     RunEnded {
-        /// Which.
         run: RunId,
-        /// As above.
+        /// The final state, as in [`Write::Run`].
         state: String,
         /// The run as clients see it, as JSON.
         view: String,
-        /// The run as the coordinator takes it up again, as JSON.
+        /// The run as the coordinator resumes it, as JSON.
         archive: String,
     },
-    /// What there is of a stage's value that nobody waits for any more: tries, shards, checkpoints. `None`: there is nothing, or
-    /// somebody has taken it up.
+    /// Archives an unfinished execution that no run needs: attempts, shards, checkpoints. `None` deletes it, because it
+    /// has no data or a run has resumed it.
     Archive {
         /// The stage's key.
         key: Digest,
-        /// Whose tasks they are: under these names its logs and values are stored.
+        /// The run of its tasks; logs and metrics are stored under this run and `stage`.
         run: RunId,
-        /// As above.
+        /// The stage of its tasks.
         stage: StageName,
-        /// JSON.
+        /// The execution as JSON.
         execution: Option<String>,
     },
-    /// Values by step; stored once per (task, attempt, key, step) however often they are sent.
+    /// Events for human readers. They change nothing else.
+    History(Vec<HistoryEntry>),
+    /// Values by step, stored once per (task, attempt, key, step) even if sent several times.
     Metrics {
-        /// Checked.
+        /// Grant whose fence is checked.
         grant: Grant,
         rows: Vec<MetricRow>,
     },
-    /// Log lines; stored once per (task, attempt, worker, line number).
+    /// Log lines, stored once per (task, attempt, worker, line number).
     Logs {
-        /// Checked.
+        /// Grant whose fence is checked.
         grant: Grant,
         /// Number of the first line.
         first: u64,
         lines: Vec<String>,
     },
-    /// Makes a manifest whose blobs are stored the task's newest checkpoint.
+    /// Makes a manifest, whose blobs are stored, the task's newest checkpoint.
     Checkpoint {
-        /// Checked.
+        /// Grant whose fence is checked.
         grant: Grant,
-        /// Steps applied.
+        /// Number of applied steps.
         step: u64,
         manifest: Digest,
-        /// Values that retention may rank by.
+        /// Values by which retention may rank checkpoints.
         metrics: BTreeMap<String, f64>,
     },
-    /// One shard's artifact.
+    /// The artifact of one shard.
     Shard {
-        /// Checked.
+        /// Grant whose fence is checked.
         grant: Grant,
         /// The artifact.
         output: Digest,
     },
-    /// A stage's value under its key: from here on the stage is cached. The first writer of a key wins; a second one with
-    /// another output is refused as [`WriteError::Conflict`].
+    /// A stage's value under its key; the stage is cached from then on. The first writer of a key wins; another output
+    /// is refused as [`WriteError::Conflict`].
     StageResult {
-        /// Checked when a worker made it; `None` when the coordinator did.
+        /// Grant of a worker, whose fence is checked; `None` for a value of the coordinator.
         grant: Option<Grant>,
         /// The stage's key.
         key: Digest,
-        /// Which run made it.
+        /// The run that computed it.
         run: RunId,
-        /// Which stage.
+        /// The stage that computed it.
         stage: StageName,
         kind: String,
         /// Outputs by name.
         outputs: BTreeMap<String, Digest>,
-        /// Final values.
+        /// Final metrics by name.
         metrics: BTreeMap<String, f64>,
-        /// The artifacts it was made of: lineage edges.
+        /// Artifacts that it was made from, stored as lineage.
         inputs: BTreeMap<String, Digest>,
-        /// Seconds of work.
+        /// Working time in seconds.
         wall_s: f64,
     },
-    /// A model version. Registering the same artifact for the same model again adds its metrics and makes no new version.
+    /// A model version. Registering the same artifact again only adds its metrics.
     Version {
         model: ModelName,
-        /// What is registered: a manifest of kind `model`.
+        /// Digest of a manifest of kind `model`.
         artifact: Digest,
         /// Metrics by name.
         metrics: BTreeMap<String, f64>,
-        /// Where it came from: run, stage, stage key.
+        /// Origin: run, stage, stage key.
         source: Value,
     },
     /// Moves an alias to the version of `artifact`, and logs it.
@@ -144,17 +166,41 @@ pub enum Write {
         alias: Alias,
         /// The registered artifact.
         artifact: Digest,
-        /// Gates as written; evaluated on stored metrics inside the transaction.
+        /// Gates as written, checked on stored metrics inside the transaction.
         require: Vec<String>,
-        /// Why.
+        /// Reason for the log.
         reason: String,
-        /// Who.
+        /// Name of the caller.
         actor: String,
     },
 }
 
 impl Write {
-    /// The grant that vouches for it; the store checks its fence. Who adds a write decides here whether it needs one.
+    /// Returns the artifacts that the write names, which must be proven whole.
+    pub(crate) fn artifacts(&self) -> Vec<Digest> {
+        match self {
+            Self::Checkpoint { manifest, .. } => vec![*manifest],
+            Self::Shard { output, .. } => vec![*output],
+            Self::StageResult { outputs, .. } => outputs.values().copied().collect(),
+            Self::Version { artifact, .. } => vec![*artifact],
+            Self::Facts { .. }
+            | Self::SnapshotParts { .. }
+            | Self::Snapshot { .. }
+            | Self::Fence { .. }
+            | Self::Run { .. }
+            | Self::RunOwner { .. }
+            | Self::ModelOwner { .. }
+            | Self::RunState { .. }
+            | Self::RunEnded { .. }
+            | Self::Archive { .. }
+            | Self::History(_)
+            | Self::Metrics { .. }
+            | Self::Logs { .. }
+            | Self::Promote { .. } => Vec::new(),
+        }
+    }
+
+    /// Returns the grant whose fence the store checks. A new kind of write must decide here if it needs one.
     pub(crate) fn grant(&self) -> Option<&Grant> {
         match self {
             Self::Metrics { grant, .. }
@@ -163,22 +209,26 @@ impl Write {
             | Self::Shard { grant, .. } => Some(grant),
             Self::StageResult { grant, .. } => grant.as_ref(),
             Self::Facts { .. }
+            | Self::SnapshotParts { .. }
             | Self::Snapshot { .. }
             | Self::Fence { .. }
             | Self::Run { .. }
+            | Self::RunOwner { .. }
+            | Self::ModelOwner { .. }
             | Self::RunState { .. }
             | Self::RunEnded { .. }
             | Self::Archive { .. }
+            | Self::History(_)
             | Self::Version { .. }
             | Self::Promote { .. } => None,
         }
     }
 }
 
-/// What is said of two checkpoints of one step that differ.
+/// Message about two different checkpoints of one step.
 pub fn two_states(task: &TaskId, step: u64, stored: &str, now: &str) -> String {
     format!(
-        "task `{task}` has checkpoint {stored} at step {step}; now it is {now}: the same step was computed twice with \
-         different results, which should be impossible"
+        "task `{task}` has checkpoint {stored} at step {step}, but this attempt made {now}: the same step was computed twice \
+         with different results, which is a bug"
     )
 }

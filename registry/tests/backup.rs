@@ -1,9 +1,10 @@
-//! Backups are of one moment, whole, and made while the store is in use; what is restored is the store that was backed up.
+//! Tests of backups: consistent, complete, made while the store is in use, and restored to the same store.
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
 mod common;
 
 use std::fs;
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
@@ -36,9 +37,16 @@ async fn a_backup_of_a_store_in_use_is_restored_as_it_was_at_that_moment() {
     let first = add(&store, "first").await;
     store.blobs().put(b"nobody needs this").unwrap();
 
-    // By a process of its own, while this one holds the store.
+    // The recorded check of a file is valid until its times or link count change.
+    let is_as = || {
+        let file = fs::metadata(blob(&dir, Digest::of(b"first"))).unwrap();
+        (file.nlink(), file.ctime(), file.ctime_nsec())
+    };
+    let before = is_as();
+    // Made by a separate process while this one holds the store.
     let made = registry(&["backup", "--store"], &[&dir, &backup]);
     assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
+    assert_eq!((before.0, is_as()), (1, before));
     let later = add(&store, "later").await;
     let restored = registry(&["restore", "--to"], &[&back, &backup]);
     assert!(restored.status.success(), "{}", String::from_utf8_lossy(&restored.stderr));
@@ -51,7 +59,7 @@ async fn a_backup_of_a_store_in_use_is_restored_as_it_was_at_that_moment() {
     assert_eq!(artifacts(copy.versions(&"m".into()).await.unwrap()), [first]);
     copy.write(vec![note("goes on")]).await.unwrap();
 
-    // The second one into the same folder brings what is new.
+    // A second backup into the same folder adds new blobs.
     store.backup(&backup).await.unwrap();
     let again = root.path().join("again");
     let summary = restore(&backup, &again, None).await.unwrap();
@@ -69,8 +77,6 @@ async fn nothing_is_restored_of_a_backup_that_is_not_whole() {
     store.backup(&backup).await.unwrap();
     let whole = |digest: Digest| blob(&backup, digest);
     let rotten = whole(Digest::of(b"weights"));
-    // A new file, for the store has the same one.
-    fs::remove_file(&rotten).unwrap();
     for content in [Some(&b"weightz"[..]), None] {
         match content {
             Some(content) => fs::write(&rotten, content).unwrap(),
@@ -80,7 +86,7 @@ async fn nothing_is_restored_of_a_backup_that_is_not_whole() {
         assert!(matches!(refused, BackupError::Damaged(_) | BackupError::Disk { .. }), "{refused}");
         assert!(!back.exists(), "no store appears before all of it was verified");
     }
-    // Made again, it is whole again.
+    // A repeated backup is whole again.
     store.backup(&backup).await.unwrap();
     restore(&backup, &back, None).await.unwrap();
     assert!(matches!(restore(&backup, &back, None).await, Err(BackupError::Folder(_))), "a store is not overwritten");

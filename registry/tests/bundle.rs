@@ -1,4 +1,4 @@
-//! Bundles that are whole, and each way in which one is not.
+//! Tests of valid bundles and of every kind of invalid one.
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
 use std::collections::BTreeMap;
@@ -18,7 +18,7 @@ use tar::{EntryType, Header};
 const HEAD: &str = "bundle.json";
 const CARD: &str = "card.md";
 
-/// What is exported: the VAE's weights are too many for one piece.
+/// An exported version whose VAE has more weights than fit in one piece.
 fn whole() -> Whole {
     Whole::of(vec![7; 100_000])
 }
@@ -61,7 +61,7 @@ fn exported(whole: &Whole) -> Vec<u8> {
     writer.finish().unwrap()
 }
 
-/// Takes files into memory.
+/// A sink that keeps files in memory.
 #[derive(Default)]
 struct Kept {
     open: Vec<u8>,
@@ -106,7 +106,7 @@ fn what_is_written_is_read() {
     {
         assert!(card.contains(part), "`{part}` is missing in\n{card}");
     }
-    // A reader that gives a byte at a time, and one packed by other hands.
+    // A reader that returns one byte at a time, and a bundle packed by another program.
     struct Slow<'a>(&'a [u8]);
     impl Read for Slow<'_> {
         fn read(&mut self, out: &mut [u8]) -> io::Result<usize> {
@@ -129,7 +129,7 @@ fn every_cut_and_every_changed_byte_is_found() {
     for at in (0..bytes.len()).step_by(11) {
         let mut changed = bytes.clone();
         changed[at] ^= 0x10;
-        // A few bits of the compression's own frame say nothing.
+        // A few bits of the compression's frame carry no information.
         if let Ok(found) = read(&changed[..], &mut ()) {
             assert_eq!(found.manifest, whole().manifest);
             unharmed += 1;
@@ -148,20 +148,20 @@ fn entries_that_would_do_harm_are_refused() {
         (file("vae/../../x", regular, b"x"), "`..`"),
         (file("/etc/passwd", regular, b"x"), "absolute"),
         (file("C:\\x", regular, b"x"), "absolute"),
-        (file("vae//x", regular, b"x"), "not one of a file within"),
-        (file("./card.md", regular, b"x"), "not one of a file within"),
-        (file("vae/\u{7}x", regular, b"x"), "not one of a file within"),
+        (file("vae//x", regular, b"x"), "not a plain path"),
+        (file("./card.md", regular, b"x"), "not a plain path"),
+        (file("vae/\u{7}x", regular, b"x"), "not a plain path"),
         (file("vae/link", EntryType::Symlink, b""), "a link"),
         (file("vae/link", EntryType::Link, b""), "a link"),
         (file("vae", EntryType::Directory, b""), "a folder"),
         (file("vae/pipe", EntryType::Fifo, b""), "neither file nor folder"),
         (file("././@LongLink", EntryType::GNULongName, &[b'a'; 4096]), "an extension"),
         (file("pax", EntryType::XHeader, b"12 path=../x\n"), "an extension"),
-        (file("unknown.bin", regular, b"x"), "knows no such file"),
+        (file("unknown.bin", regular, b"x"), "does not list it"),
         (file("vae/model.safetensors", regular, b"x"), "it has 1 bytes"),
         (file("vae/model.safetensors", regular, &[8; 100_000]), "its bytes hash to"),
     ] {
-        // In the place of the card, before the files.
+        // Replaces the card, before the files.
         let mut entries = whole.entries();
         let name = entry.0.clone();
         entries[2] = entry;
@@ -171,7 +171,7 @@ fn entries_that_would_do_harm_are_refused() {
     }
     let mut twice = whole.entries();
     twice.push(twice[4].clone());
-    assert!(refused(&packed(&twice)).contains("stands twice"));
+    assert!(refused(&packed(&twice)).contains("appears twice"));
     let mut order = whole.entries();
     order.swap(0, 1);
     assert!(refused(&packed(&order)).contains("expected `bundle.json`"));
@@ -198,11 +198,11 @@ fn heads_and_manifests_that_this_build_does_not_read_are_refused() {
     };
     let newer = refused(&with(&|head| *head = json!({"format": 2, "other": true})));
     assert!(newer.contains("format 2") && newer.contains("newer build"), "{newer}");
-    assert!(refused(&with(&|head| head["model"] = json!("../x"))).contains("no name of a model"));
+    assert!(refused(&with(&|head| head["model"] = json!("../x"))).contains("not a model name"));
     assert!(refused(&with(&|head| head["artifact"] = json!(Digest::of(b"x")))).contains("`bundle.json` says"));
-    assert!(refused(&with(&|head| head["metrics"] = json!("many"))).contains("does not read"));
+    assert!(refused(&with(&|head| head["metrics"] = json!("many"))).contains("cannot be parsed"));
 
-    // Manifests, with a head that knows them.
+    // Manifests, with their digest in the head.
     let with = |change: &dyn Fn(&mut Manifest), raw: &dyn Fn(String) -> String| {
         let mut entries = whole.entries();
         let mut manifest = whole.manifest.clone();
@@ -215,15 +215,15 @@ fn heads_and_manifests_that_this_build_does_not_read_are_refused() {
     let same = |text: String| text;
     let unknown = with(&|_| {}, &|text| text.replace("\"kind\":\"model\"", "\"kind\":\"hologram\""));
     assert!(unknown.contains("hologram"), "{unknown}");
-    assert!(with(&|m| m.kind = ArtifactKind::Vae, &same).contains("is no model"));
+    assert!(with(&|m| m.kind = ArtifactKind::Vae, &same).contains("is not a model"));
     assert!(with(&|m| m.format = 9, &same).contains("format 9"));
     assert!(with(&|_| {}, &|text| format!("{text} ")).contains("canonical JSON"));
     let entry = |bytes| FileEntry { digest: Digest::of(b"x"), bytes };
     let lists = |name: &'static str, bytes: u64| with(&move |m| _ = m.files.insert(name.into(), entry(bytes)), &same);
     assert!(lists("../x", 1).contains("`..`"));
-    assert!(lists("card.md", 1).contains("a name of the bundle itself"));
+    assert!(lists("card.md", 1).contains("reserved for the bundle"));
     assert!(lists("vae/huge", u64::MAX).contains("expected at most"));
-    // Announced and never there; and there, but of no part.
+    // A file that is listed but missing, and one that exists but belongs to no part.
     assert!(lists("vae/zzz", 1).contains("`vae/zzz`"));
     assert!(with(&|m| _ = m.files.remove("vae/manifest.json"), &same).contains("lists no `vae/manifest.json`"));
     let mut entries = whole.entries();
@@ -241,7 +241,7 @@ fn bombs_are_left_at_the_first_byte_too_many() {
     assert!(refused(b"").contains("fewer than 4"));
     let nothing = zstd::encode_all(&b""[..], 1).unwrap();
     assert!(refused(&nothing).contains("has no `bundle.json`"));
-    // A quarter of a gibibyte of zeros in some kilobytes, each where it would be unpacked.
+    // 256 MiB of zeros in some kilobytes, at each place where they would be unpacked.
     let zeros = |count: u64| io::repeat(0).take(count);
     let bomb = |before: &[u8], size: u64| {
         let mut encoder = zstd::Encoder::new(Vec::new(), 1).unwrap();
@@ -259,20 +259,20 @@ fn bombs_are_left_at_the_first_byte_too_many() {
     let size = 256 << 20;
     let large = refused(&bomb(&header(HEAD, size), size));
     assert!(large.contains("expected at most"), "{large}");
-    assert!(refused(&bomb(b"", size)).contains("behind the end of the archive"));
-    // A frame that asks for a window of 128 MiB.
+    assert!(refused(&bomb(b"", size)).contains("data follows the end of the archive"));
+    // A frame that requires a window of 128 MiB.
     let mut encoder = zstd::Encoder::new(Vec::new(), 1).unwrap();
     encoder.set_parameter(zstd::zstd_safe::CParameter::WindowLog(27)).unwrap();
     encoder.set_parameter(zstd::zstd_safe::CParameter::EnableLongDistanceMatching(true)).unwrap();
     encoder.write_all(&header(HEAD, 10)).unwrap();
     let window = refused(&encoder.finish().unwrap());
     assert!(window.contains("cannot be unpacked"), "{window}");
-    // Behind a whole archive.
+    // After a valid archive.
     let mut behind = zstd::decode_all(&exported(&whole())[..]).unwrap();
     behind.extend(std::iter::repeat_n(0, 10 * 512));
     assert!(read(&zstd::encode_all(&behind[..], 1).unwrap()[..], &mut ()).is_ok(), "tar's own padding");
     behind.push(1);
-    assert!(refused(&zstd::encode_all(&behind[..], 1).unwrap()).contains("behind the end"));
+    assert!(refused(&zstd::encode_all(&behind[..], 1).unwrap()).contains("follows the end"));
 }
 
 #[tokio::test]

@@ -1,4 +1,4 @@
-//! Versions, aliases, gates, history.
+//! Tests of versions, aliases, gates and history.
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
 mod common;

@@ -1,4 +1,4 @@
-//! What every catalog must do, as functions over [`Catalog`] alone, and the catalogs that do it.
+//! Conformance tests of catalogs, as functions over [`Catalog`], and the catalogs that must pass them.
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
 mod common;
@@ -10,21 +10,23 @@ use std::sync::Arc;
 use common::{artifact, fence, grant, metrics, result, rows, version};
 use futures::future::join_all;
 use protocol::stage::Keep;
-use protocol::{Alias, ArtifactKind, Digest, ModelName, RunId, StageName, TaskId};
+use protocol::{Alias, ArtifactKind, Digest, FileEntry, Manifest, ModelName, RunId, StageName, TaskId};
 use registry::catalog::{Catalog, Done, Order, PromoteOrder, Records, RollbackOrder, Which};
+use registry::testing::slow::SlowBucket;
 use registry::versions::Action;
-use registry::{BlobStore, Expect, Pick, QueryError, Store, Write, WriteError};
+use registry::{BlobStore, Expect, Page, Pick, QueryError, Store, Write, WriteError};
 use serde_json::json;
 use tempfile::TempDir;
 
-/// A catalog of its own, and how it is opened.
+/// Place of a catalog, with its way of opening.
 trait Place {
-    /// Opens it for writing, as a process does that knows of no other: whatever is open stays so.
+    /// Opens the catalog for writing, as a process without knowledge of others does; open handles stay open.
     fn open(&self) -> impl Future<Output = Opened>;
 }
 
 struct Opened {
     store: Store,
+    bucket: SlowBucket,
 }
 
 impl Opened {
@@ -41,27 +43,31 @@ impl Opened {
     }
 
     async fn write(&self, writes: Vec<Write>) -> Result<(), WriteError> {
-        self.catalog().commit(Order::Write(writes)).await.map(|_| ())
+        self.store.write(writes).await
     }
 }
 
-/// SQLite in a store's folder.
-struct Sqlite(TempDir);
+/// SQLite in a store's folder, with blobs in a bucket.
+struct Sqlite(TempDir, SlowBucket);
 
 impl Place for Sqlite {
     async fn open(&self) -> Opened {
-        // Another file under the lock's name keeps the operating system's lock out of the way: the epoch alone has to do.
+        // A new file under the lock's name bypasses the operating system's lock, so that only the epoch protects the
+        // store.
         let _ = fs::remove_file(self.0.path().join("lock"));
-        Opened { store: common::open(self.0.path()).await }
+        let blobs = self.1.place("p", self.0.path());
+        Opened { store: common::open_over(self.0.path(), blobs).await, bucket: self.1.clone() }
     }
 }
 
 macro_rules! conformance {
     ($($name:ident),+ $(,)?) => {
         mod sqlite {
+            use super::SlowBucket;
+
             $(#[tokio::test]
             async fn $name() {
-                super::$name(&super::Sqlite(tempfile::tempdir().unwrap())).await;
+                super::$name(&super::Sqlite(tempfile::tempdir().unwrap(), SlowBucket::default())).await;
             })+
         }
     };
@@ -73,10 +79,14 @@ conformance![
     the_last_to_open_is_the_only_one_that_writes,
     what_was_acknowledged_is_there_for_who_opens_next,
     facts_are_numbered_and_go_behind_a_snapshot,
+    a_snapshot_is_its_parts_as_they_were_last_written,
     a_write_carries_the_newest_fence,
     values_and_lines_that_come_twice_count_once,
     the_newest_attempt_takes_over_from_its_first_step,
     a_row_names_only_what_is_whole,
+    a_commit_waits_for_no_place_of_blobs,
+    what_a_collection_condemns_is_proven_anew,
+    what_a_row_has_named_is_known_to_be_present,
     a_step_has_one_state_and_a_policy_says_which_stay,
     the_first_value_of_a_key_stands,
     a_key_of_a_submission_is_one_runs,
@@ -161,7 +171,7 @@ async fn an_order_is_all_or_nothing_and_fails_alone(place: &impl Place) {
     let opened = place.open().await;
     opened.write(vec![fence("r/s", 2)]).await.unwrap();
     let stale = Write::Metrics { grant: grant("r/s", 1), rows: rows(0..3, 1.0) };
-    // Together, so that they may come into one transaction.
+    // Concurrent, so that they may share a transaction.
     let (one, refused, other) = tokio::join!(
         opened.write(vec![run("a", None)]),
         opened.write(vec![run("b", None), stale, run("c", None)]),
@@ -213,6 +223,33 @@ async fn facts_are_numbered_and_go_behind_a_snapshot(place: &impl Place) {
     assert!(opened.write(vec![facts(2)]).await.is_err(), "what a snapshot stands for is taken");
 }
 
+async fn a_snapshot_is_its_parts_as_they_were_last_written(place: &impl Place) {
+    let opened = place.open().await;
+    opened.write((1..=9).map(facts).collect()).await.unwrap();
+    let text = |text: &str| Some(json!(text).to_string());
+    let parts = |seq, parts: &[(&str, Option<String>)]| {
+        let parts = parts.iter().map(|(part, state)| ((*part).to_owned(), state.clone())).collect();
+        Write::SnapshotParts { seq, parts }
+    };
+    let whole = |seq| Write::Snapshot { seq, state: json!(seq).to_string() };
+    opened.write(vec![parts(2, &[("a", text("a2")), ("b", text("b2")), ("c", text("c2"))]), whole(2)]).await.unwrap();
+    // An incomplete snapshot has no effect.
+    opened.write(vec![parts(4, &[("a", text("a4")), ("b", None), ("d", text("d4"))])]).await.unwrap();
+    let read = async |opened: &Opened| opened.records().recovery().await.unwrap().parts;
+    let known = |parts: &[(&str, &str)]| {
+        parts.iter().map(|(part, state)| ((*part).to_owned(), json!(state).to_string())).collect::<BTreeMap<_, _>>()
+    };
+    assert_eq!(read(&opened).await, known(&[("a", "a2"), ("b", "b2"), ("c", "c2")]));
+    // Its parts have no effect later either.
+    opened.write(vec![parts(6, &[("c", None), ("e", text("e6"))])]).await.unwrap();
+    opened.write(vec![whole(6)]).await.unwrap();
+    assert_eq!(read(&opened).await, known(&[("a", "a2"), ("b", "b2"), ("e", "e6")]));
+    opened.write(vec![parts(8, &[("a", text("a8"))]), whole(8)]).await.unwrap();
+    assert_eq!(read(&opened).await, known(&[("a", "a8"), ("b", "b2"), ("e", "e6")]));
+    let recovery = opened.records().recovery().await.unwrap();
+    assert_eq!((recovery.snapshot, recovery.facts.len()), (Some((8, "8".to_owned())), 1));
+}
+
 async fn a_write_carries_the_newest_fence(place: &impl Place) {
     let opened = place.open().await;
     let write = |f| vec![Write::Metrics { grant: grant("r/s", f), rows: rows(0..1, f as f64) }];
@@ -243,13 +280,18 @@ async fn values_and_lines_that_come_twice_count_once(place: &impl Place) {
     let more = Write::Metrics { grant: grant("r/s", 1), rows: rows(5..12, 0.7) };
     opened.write(vec![more, lines(1, &["b", "c"])]).await.unwrap();
     let (records, run, stage) = (opened.records(), RunId::new("r"), StageName::new("s"));
-    let curves = records.metrics(&run, &stage, None, 0).await.unwrap();
+    let curves = records.points(&run, &stage, None, Page::ALL).await.unwrap();
     let values: Vec<_> = curves["loss"].points.iter().map(|point| (point.step, point.value)).collect();
     let expected: Vec<_> = (0..12).map(|step| (step, if step < 10 { 0.5 } else { 0.7 })).collect();
     assert_eq!(values, expected);
-    assert!(records.metrics(&run, &stage, Some(&["other".into()]), 0).await.unwrap().is_empty());
+    assert!(records.points(&run, &stage, Some(&["other".into()]), Page::ALL).await.unwrap().is_empty());
     let lines = records.logs(&run, None, 0, 10).await.unwrap();
     assert_eq!(lines.iter().map(|line| line.text.as_str()).collect::<Vec<_>>(), ["a", "b", "c"]);
+    for count in 0..=lines.len() {
+        let last = records.last_logs(&run, None, u32::try_from(count).unwrap()).await.unwrap();
+        assert_eq!(last, lines[lines.len() - count..], "the newest {count}");
+    }
+    assert!(records.last_logs(&run, Some(&"other".into()), 10).await.unwrap().is_empty());
     let rest = records.logs(&run, Some(&stage), lines[0].id, 1).await.unwrap();
     assert_eq!(rest, lines[1..2]);
     assert!(records.logs(&run, Some(&"other".into()), 0, 10).await.unwrap().is_empty());
@@ -261,10 +303,9 @@ async fn the_newest_attempt_takes_over_from_its_first_step(place: &impl Place) {
         let values = Write::Metrics { grant: grant("r/s", attempt), rows: rows(steps, attempt as f64) };
         opened.write(vec![fence("r/s", attempt), values]).await.unwrap();
     }
-    let curves = opened.records().metrics(&"r".into(), &"s".into(), Some(&["loss".into()]), 0).await.unwrap();
+    let curves = opened.records().points(&"r".into(), &"s".into(), Some(&["loss".into()]), Page::ALL).await.unwrap();
     let values: Vec<_> = curves["loss"].points.iter().map(|point| point.value).collect();
     assert_eq!(values, [1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 2.0, 3.0, 3.0, 3.0, 3.0, 3.0]);
-    assert_eq!(curves["loss"].total, 12);
 }
 
 async fn a_row_names_only_what_is_whole(place: &impl Place) {
@@ -290,6 +331,109 @@ async fn a_row_names_only_what_is_whole(place: &impl Place) {
     assert!(opened.records().models().await.unwrap().is_empty());
 }
 
+/// A commit that sent a request would wait for the bucket.
+async fn a_commit_waits_for_no_place_of_blobs(place: &impl Place) {
+    let opened = place.open().await;
+    opened.write(vec![fence("r/s", 1)]).await.unwrap();
+    let made = artifact(opened.blobs(), ArtifactKind::Model, "made");
+    let names = || {
+        let grant = || grant("r/s", 1);
+        [
+            Order::Write(vec![Write::Checkpoint { grant: grant(), step: 1, manifest: made, metrics: BTreeMap::new() }]),
+            Order::Write(vec![Write::Shard { grant: grant(), output: made }]),
+            Order::Write(vec![result("key", made)]),
+            Order::Write(vec![version("m", made, 0.5)]),
+            Order::Pin { digest: made, reason: Some("a test".into()) },
+        ]
+    };
+    for order in names() {
+        let refused = opened.catalog().commit(order).await;
+        assert!(matches!(refused, Err(WriteError::Unproven { artifact }) if artifact == made), "{refused:?}");
+    }
+    assert!(opened.records().needs().await.unwrap().roots.is_empty());
+
+    let proof = opened.store.prove(made).await.unwrap();
+    opened.bucket.silence(true);
+    let before = opened.bucket.requests();
+    let others = [
+        promote(Pick::Number(1), None, &[]),
+        Order::Promote(PromoteOrder {
+            model: "m".into(),
+            alias: Alias::new("staging"),
+            to: Which::Artifact(made),
+            expect: None,
+            require: Vec::new(),
+            reason: "a test".into(),
+            actor: "tester".into(),
+        }),
+        Order::BeginCollection,
+        Order::Condemn(vec![made, Digest::of(b"other")]),
+        Order::PruneCheckpoints { task: "r/s".into(), keep: Keep::default(), at_end: false },
+        Order::Pin { digest: made, reason: None },
+    ];
+    for order in names().into_iter().chain(others) {
+        let what = format!("{order:?}");
+        let committing = tokio::time::timeout(std::time::Duration::from_secs(20), opened.catalog().commit(order));
+        committing.await.unwrap_or_else(|_| panic!("waits for the bucket: {what}")).unwrap();
+    }
+    assert!(opened.bucket.requests() <= before + 4, "the lease alone asks");
+    drop(proof);
+    opened.bucket.silence(false);
+}
+
+async fn what_a_collection_condemns_is_proven_anew(place: &impl Place) {
+    let opened = place.open().await;
+    let commit = async |order| opened.catalog().commit(order).await;
+    let made = artifact(opened.blobs(), ArtifactKind::Vae, "made");
+    let file = Digest::of(b"made");
+    let proof = opened.store.prove(made).await.unwrap();
+    commit(Order::BeginCollection).await.unwrap();
+    match commit(Order::Condemn(vec![file])).await.unwrap() {
+        Done::Condemned(taken) => assert_eq!(taken, [file]),
+        done => panic!("{done:?}"),
+    }
+    let named = || Order::Write(vec![result("key", made)]);
+    assert!(matches!(commit(named()).await, Err(WriteError::Unproven { .. })), "its file is about to go");
+    assert!(opened.records().needs().await.unwrap().roots.is_empty());
+    drop(proof);
+
+    // A row that comes first keeps the blobs, the digests in the manifest's `meta` and the inputs.
+    let other = artifact(opened.blobs(), ArtifactKind::Vae, "other");
+    let _proof = opened.store.prove(other).await.unwrap();
+    commit(Order::Write(vec![result("other", other)])).await.unwrap();
+    let needed = vec![other, Digest::of(b"other"), Digest::of(b"data")];
+    match commit(Order::Condemn(needed)).await.unwrap() {
+        Done::Condemned(taken) => assert!(taken.is_empty(), "{taken:?}"),
+        done => panic!("{done:?}"),
+    }
+}
+
+async fn what_a_row_has_named_is_known_to_be_present(place: &impl Place) {
+    const FILES: usize = 40;
+    let opened = place.open().await;
+    let mut manifest = Manifest::new(ArtifactKind::Vae, json!({}));
+    for i in 0..FILES {
+        let digest = opened.blobs().put(format!("file {i}").as_bytes()).unwrap();
+        manifest.files.insert(i.to_string(), FileEntry { digest, bytes: format!("file {i}").len() as u64 });
+    }
+    let made = opened.blobs().put(&manifest.to_bytes()).unwrap();
+    let listed: Vec<Digest> = manifest.files.values().map(|file| file.digest).collect();
+    let all = [&[made, Digest::of(b"never put")], &listed[..]].concat();
+    assert!(opened.records().present(&all).await.unwrap().is_empty());
+    opened.write(vec![result("key", made)]).await.unwrap();
+    drop(opened);
+    let opened = place.open().await;
+    let known = opened.records().present(&all).await.unwrap();
+    assert_eq!((known.len(), known.get(&Digest::of(b"file 0"))), (FILES + 1, Some(&6)));
+    // The manifest is read again, but its files are not requested.
+    let before = opened.bucket.requests();
+    drop(opened.store.prove(made).await.unwrap());
+    let asked = opened.bucket.requests() - before;
+    assert!(asked < FILES as u64 / 2, "{asked}");
+    opened.catalog().commit(Order::Condemn(all.clone())).await.unwrap();
+    assert!(opened.records().present(&all).await.unwrap().is_empty(), "nobody relies on it any more");
+}
+
 async fn a_step_has_one_state_and_a_policy_says_which_stay(place: &impl Place) {
     let opened = place.open().await;
     opened.write(vec![fence("r/s", 1)]).await.unwrap();
@@ -310,7 +454,7 @@ async fn a_step_has_one_state_and_a_policy_says_which_stay(place: &impl Place) {
     assert_eq!(steps().await, [4, 3, 2, 1]);
     assert_eq!(records.latest_checkpoint(&task).await.unwrap().unwrap().step, 4);
     let keep: Keep = serde_json::from_value(json!({"last": 2})).unwrap();
-    match opened.catalog().commit(Order::PruneCheckpoints { task: task.clone(), keep }).await.unwrap() {
+    match opened.catalog().commit(Order::PruneCheckpoints { task: task.clone(), keep, at_end: false }).await.unwrap() {
         Done::Pruned(gone) => assert_eq!(gone.len(), 2),
         done => panic!("{done:?}"),
     }
@@ -352,9 +496,9 @@ async fn a_run_that_ended_answers_from_its_view_until_it_is_forgotten(place: &im
     let refused = opened.catalog().commit(Order::Forget("a".into())).await;
     assert!(matches!(refused, Err(WriteError::Conflict(_))), "it is running");
     opened.write(vec![ended("a", "finished"), ended("b", "failed")]).await.unwrap();
-    let views = records.ended_views(10).await.unwrap();
+    let views = records.ended_views(None, 10).await.unwrap();
     assert_eq!(views.iter().map(|(run, _)| run.as_str()).collect::<Vec<_>>(), ["a", "b"]);
-    assert_eq!(records.ended_views(1).await.unwrap()[0].0.as_str(), "b", "of more than asked for the newest");
+    assert_eq!(records.ended_views(None, 1).await.unwrap()[0].0.as_str(), "b", "of more than asked for the newest");
     assert!(records.ended(&"a".into()).await.unwrap().unwrap().archive.contains("archived"));
     assert_eq!(records.ended_before(i64::MAX).await.unwrap().len(), 2);
     assert!(records.ended_before(0).await.unwrap().is_empty());
@@ -406,7 +550,7 @@ async fn an_alias_moves_by_compare_and_swap_and_its_log_grows(place: &impl Place
     assert_eq!(moved(&opened, promote(Pick::Number(1), Some(Expect::None), &[])).await.unwrap(), (None, 1));
     let late = moved(&opened, promote(Pick::Number(2), Some(Expect::None), &[])).await;
     assert!(matches!(late, Err(WriteError::Conflict(_))));
-    // Of many that expect the same, one moves.
+    // Of many moves with the same expectation, one succeeds.
     let all = join_all((0..8).map(|i| moved(&opened, promote(Pick::Number(2 + i % 2), Some(Expect::Version(1)), &[]))));
     let winners = all.await.into_iter().filter(|result| result.as_ref().is_ok_and(|m| m.0 == Some(1))).count();
     assert_eq!(winners, 1);
@@ -487,7 +631,7 @@ async fn needs_name_every_row_that_names_a_blob(place: &impl Place) {
         ])
         .await
         .unwrap();
-    opened.catalog().commit(Order::Pin { digest: pinned, reason: Some("kept".into()) }).await.unwrap();
+    opened.store.pin(pinned, "kept").await.unwrap();
     let needs = opened.records().needs().await.unwrap();
     let found: BTreeSet<_> = needs.roots.iter().map(|root| root.digest).collect();
     assert_eq!(found, [checkpoint, shard, value, model, pinned].into());

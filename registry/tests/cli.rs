@@ -1,4 +1,4 @@
-//! The binary: what it prints, how it exits, and how it asks the holder of a store.
+//! Tests of the binary: its output, its exit codes, and its requests to the holder of a store.
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
 mod common;
@@ -54,9 +54,9 @@ async fn models_are_compared_and_ranked_in_tables_to_paste() {
     assert!(kit.contains("MotionPCM, 1 step [MotionPCM] & $0.031$ & $0.433^{\\pm0.007}$"), "{kit}");
 
     let absent = registry(store, &["compare", "quickstart:1", "quickstart:9"]);
-    assert_eq!(code(&absent), 3, "{}", stderr(&absent));
+    assert_eq!(code(&absent), 7, "{}", stderr(&absent));
     let absent = registry(store, &["leaderboard", "nobody"]);
-    assert_eq!(code(&absent), 3);
+    assert_eq!(code(&absent), 7);
     assert!(stderr(&absent).contains("nobody"), "{}", stderr(&absent));
 }
 
@@ -73,7 +73,7 @@ async fn a_promotion_from_the_first_gate_to_the_rollback() {
     assert_eq!(code(&refused), 10);
     assert_eq!(
         stderr(&refused),
-        "error: quickstart:2 may not become `prod`: `latent_fid<=0.1`: latent_fid is 0.2, bound 0.1: it misses by 0.1\n\n\
+        "error: quickstart:2 cannot be promoted to `prod`: `latent_fid<=0.1`: latent_fid is 0.2, bound 0.1: it misses by 0.1\n\n\
          hint: nothing was changed; `registry show MODEL` lists every version with its metrics\n"
     );
     assert!(stdout(&registry(store, &["history", "quickstart"])).contains("no alias of `quickstart` has moved yet"));
@@ -114,19 +114,19 @@ async fn a_promotion_from_the_first_gate_to_the_rollback() {
 async fn what_is_wrong_has_a_code_and_a_hint() {
     let dir = tempfile::tempdir().unwrap();
     let missing = registry(&dir.path().join("nothing"), &["list"]);
-    assert_eq!(code(&missing), 3);
+    assert_eq!(code(&missing), 7);
     assert!(stderr(&missing).contains("there is no store") && stderr(&missing).contains("\n\nhint: "));
     assert!(!dir.path().join("nothing").exists());
 
     with_models(dir.path()).await;
     for (args, expected) in [
-        (&["show", "other"][..], 3),
-        (&["show", "quickstart:9"], 3),
+        (&["show", "other"][..], 7),
+        (&["show", "quickstart:9"], 7),
         (&["show", "not a name"], 2),
         (&["promote", "quickstart", "--to", "prod", "--reason", "r"], 2),
         (&["promote", "quickstart:1", "--to", "prod", "--reason", "r", "--require", "latent_fid"], 2),
         (&["promote", "quickstart:1", "--to", "prod"], 2),
-        (&["rollback", "quickstart", "--alias", "prod"], 3),
+        (&["rollback", "quickstart", "--alias", "prod"], 7),
         (&["no-such-verb"], 2),
     ] {
         let output = registry(dir.path(), args);
@@ -150,7 +150,7 @@ fn walk(dir: &Path) -> Vec<std::path::PathBuf> {
     entries.flat_map(|path| if path.is_dir() { walk(&path) } else { vec![path] }).collect()
 }
 
-/// One request of a server that hosts the commands as the coordinator does.
+/// Answers one request like a server that hosts the commands.
 fn serve_once(listener: &TcpListener, answer: impl FnOnce(registry::cli::Command) -> registry::cli::Answer) {
     let (stream, _) = listener.accept().unwrap();
     let mut reader = BufReader::new(stream);
@@ -189,7 +189,7 @@ async fn a_store_that_is_held_is_asked_through_its_holder() {
     store.set_address(format!("http://{}", listener.local_addr().unwrap())).unwrap();
     let path = dir.path().to_owned();
     let client = std::thread::spawn(move || {
-        // What only reads needs no holder.
+        // Read-only commands need no holder.
         let promote = ["promote", "quickstart:1", "--to", "prod", "--reason", "r", "--require", "latent_fid<=0.1"];
         (registry(&path, &["list"]), registry(&path, &promote))
     });

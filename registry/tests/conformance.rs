@@ -1,4 +1,4 @@
-//! What every blob backend must do, as plain functions, and the backends that do it.
+//! Conformance tests of blob backends, as plain functions, and the backends that must pass them.
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
 #[path = "conformance/bucket.rs"]
@@ -35,7 +35,7 @@ fn what_was_put_is_read(store: &BlobStore) {
     }
 }
 
-/// Large enough to go to an object store in several parts.
+/// Large enough for several parts in an object store.
 fn large_blobs_come_and_go_in_parts(store: &BlobStore) {
     let bytes: Vec<u8> = (0..20 << 20).map(|i: u32| i.to_le_bytes()[(i % 4) as usize]).collect();
     let digest = store.put_pieces(&[&bytes[..5], &bytes[5..9 << 20], &bytes[9 << 20..]]).unwrap();
@@ -115,7 +115,7 @@ fn a_cut_upload_goes_on(store: &BlobStore) {
     assert!(!store.exists(digest).unwrap(), "nothing is shown before all of it is there");
     assert_eq!(store.staged(&grant, digest).unwrap(), 60_000);
 
-    // Of the next generation of the same gang, and of somebody else.
+    // A later fence of the same gang, and another worker.
     let next = common::grant("r/s", 2);
     assert_eq!(store.staged(&next, digest).unwrap(), 60_000);
     let other = protocol::message::Grant { worker: "other".into(), ..grant.clone() };
@@ -132,7 +132,7 @@ fn a_cut_upload_goes_on(store: &BlobStore) {
     store.let_go(IDLE, |_| false);
     assert!(store.held().is_empty());
 
-    // More bytes than were announced, and other bytes, are refused and forgotten.
+    // Too many bytes and wrong bytes are refused and deleted.
     let mut arriving = store.take_up(&grant, Digest::of(b"abc"), 0, 3).unwrap();
     assert!(matches!(arriving.write(b"abcd"), Err(BlobError::Refused(_))));
     drop(arriving);
@@ -159,7 +159,7 @@ fn a_backend_moves_the_time_and_removes(backend: &dyn Backend) {
     assert!(touched.put_ms > first.put_ms);
     assert_eq!(backend.stat(digest).unwrap().unwrap(), touched);
 
-    // A name that is taken is not given again.
+    // An existing name is not overwritten.
     assert!(!put(b"something else"));
     let mut read = String::new();
     backend.read(digest, 0).unwrap().read_to_string(&mut read).unwrap();
@@ -189,7 +189,7 @@ fn a_marker_is_compared_and_set(backend: &dyn Backend) {
     assert!(backend.strays().unwrap().is_empty() && backend.aside().unwrap().is_empty());
 }
 
-/// Not asked of the server of the tests, which looks and writes in two steps.
+/// Not run on the test's server, which checks and writes in two steps.
 fn a_marker_is_taken_by_one_of_many(backend: &dyn Backend) {
     assert!(backend.set_marker(None, "two").unwrap());
     let set: usize = std::thread::scope(|scope| {
@@ -200,7 +200,7 @@ fn a_marker_is_taken_by_one_of_many(backend: &dyn Backend) {
     assert_eq!(set, 1, "one of eight that take it at once");
 }
 
-/// `damage` puts bytes in the place of a blob behind the store's back.
+/// Tests detection and repair. `damage` replaces the bytes of a blob without the store's knowledge.
 fn damage_is_noticed_and_mended(store: &BlobStore, damage: &dyn Fn(Digest, &[u8])) {
     let good = vec![5; 3 << 20];
     let digest = store.put(&good).unwrap();
@@ -208,14 +208,14 @@ fn damage_is_noticed_and_mended(store: &BlobStore, damage: &dyn Fn(Digest, &[u8]
     bad[1 << 20] ^= 1;
     damage(digest, &bad);
 
-    // Read whole, in parts, and by a manifest; the last part is never handed out.
+    // Read whole, in parts, and through a manifest; the last part is never returned.
     assert!(matches!(store.get(digest), Err(BlobError::Corrupt { expected, .. }) if expected == digest));
     let mut manifest = Manifest::new(ArtifactKind::Vae, json!({}));
     manifest.files.insert("weights".into(), FileEntry { digest, bytes: good.len() as u64 });
     let manifest = store.put(&manifest.to_bytes()).unwrap();
     assert!(store.complete_manifest(manifest).is_ok(), "lengths say nothing");
     assert!(matches!(store.whole_manifest(manifest), Err(ManifestError::Blob(BlobError::Corrupt { .. }))));
-    // Other bytes: a bucket's times are whole seconds, and what is known to be damaged is not read again.
+    // Other bytes: a bucket's times have whole seconds, and a blob known to be damaged is not read again.
     bad[1 << 20] ^= 3;
     damage(digest, &bad);
     let mut reader = store.read(digest).unwrap();
@@ -230,13 +230,13 @@ fn damage_is_noticed_and_mended(store: &BlobStore, damage: &dyn Fn(Digest, &[u8]
     assert!(matches!(store.read_from(digest, 10), Err(BlobError::Corrupt { .. })));
     assert!(matches!(Blobs::open(store, digest), Err(BlobError::Corrupt { .. })));
 
-    // The good bytes take its place, and the bad ones are kept for somebody to look at.
+    // The good bytes replace the bad ones, which are kept for inspection.
     store.put(&good).unwrap();
     assert!(store.get(digest).unwrap() == good);
     assert!(store.whole_manifest(manifest).is_ok());
     assert_eq!(store.aside().unwrap().len(), 1);
 
-    // The same for a cut blob, and for an upload.
+    // The same for a truncated blob, and for an upload.
     damage(digest, &good[..10]);
     let grant = common::grant("r/s", 1);
     let mut arriving = store.take_up(&grant, digest, 0, good.len() as u64).unwrap();
@@ -287,7 +287,7 @@ fn folder() {
     damage_is_noticed_and_mended(&store, &|digest, bytes| change(&blob_path(&path, digest), bytes));
 }
 
-/// The suite over prefixes of an object store.
+/// Runs the suite over prefixes of an object store.
 fn objects(store: &Arc<dyn ObjectStore>) {
     let dir = tempfile::tempdir().unwrap();
     let next = std::sync::atomic::AtomicU32::new(0);
@@ -316,7 +316,7 @@ fn objects_in_memory() {
     a_marker_is_taken_by_one_of_many(&Objects::open(Arc::new(remote), dir.path()).unwrap());
 }
 
-/// A server that does not keep to conditions, as some did until lately.
+/// A server that ignores conditions, as some did until recently.
 #[derive(Debug)]
 struct Careless(InMemory);
 
@@ -387,7 +387,7 @@ fn blob_path(dir: &Path, digest: Digest) -> PathBuf {
     dir.join("blobs/sha256").join(&digest.hex()[..2]).join(&digest.hex()[2..])
 }
 
-/// Writes a file, and waits until its time shows that: the clock of a file system may tick slowly.
+/// Writes a file until its modification time changes, because a file system's clock may tick slowly.
 fn change(path: &Path, bytes: &[u8]) {
     let before = std::fs::metadata(path).unwrap().modified().unwrap();
     while {
@@ -396,7 +396,7 @@ fn change(path: &Path, bytes: &[u8]) {
     } {}
 }
 
-/// Another process goes on with an upload whose holder still has its task, and keeps what that task has stored.
+/// Another process continues an upload whose owner still has its task, and keeps the blobs of that task.
 #[test]
 fn a_folder_goes_on_with_uploads_after_a_restart() {
     let dir = tempfile::tempdir().unwrap();
@@ -406,7 +406,7 @@ fn a_folder_goes_on_with_uploads_after_a_restart() {
     let store = open();
     let mut arriving = store.take_up(&grant, digest, 0, total).unwrap();
     arriving.write(&bytes[..2 << 20]).unwrap();
-    // As `kill -9` does: nothing is put back, nothing is cleared.
+    // As after `kill -9`: nothing is cleaned up.
     std::mem::forget(arriving);
     let store = open();
     let other = protocol::message::Grant { worker: "other".into(), ..grant.clone() };
@@ -423,7 +423,7 @@ fn a_folder_goes_on_with_uploads_after_a_restart() {
     store.let_go(IDLE, |_| false);
     assert!(store.held().is_empty() && open().held().is_empty());
 
-    // What arrived is damaged: noticed at the end, and begun anew.
+    // The received bytes were damaged: the end of the upload detects it and the upload starts again.
     let other = Digest::of(b"another upload");
     store.take_up(&grant, other, 0, 14).unwrap().write(b"another").unwrap();
     let part = std::fs::read_dir(dir.path().join("staging")).unwrap().next().unwrap().unwrap().path();
@@ -458,7 +458,7 @@ fn uploads_that_nobody_asks_for_after_a_restart_go_in_the_end() {
     assert_eq!(parts(), 0);
 }
 
-/// A kernel refuses to sync a pipe and the folder of processes; who does not ask it is not refused.
+/// The kernel refuses to sync a pipe and the folder of processes, so an error proves that the call was made.
 #[cfg(target_os = "linux")]
 #[test]
 fn p7_syncs_reach_the_operating_system() {
@@ -471,14 +471,14 @@ fn p7_syncs_reach_the_operating_system() {
     Os.sync_dir(dir.path()).unwrap();
 }
 
-/// What was hashed is not hashed again by the next process, unless it was written to.
+/// A verified blob is not hashed again by the next process, unless it was written since.
 #[test]
 fn a_folder_remembers_what_was_verified() {
     let dir = tempfile::tempdir().unwrap();
     let digest = BlobStore::open_folder(dir.path()).unwrap().put(&[1; 100]).unwrap();
     let path = blob_path(dir.path(), digest);
     let store = BlobStore::open_folder(dir.path()).unwrap();
-    // Unreadable: only a blob that is remembered passes.
+    // The path is renamed twice, which changes the stamp.
     std::fs::rename(&path, dir.path().join("kept")).unwrap();
     std::fs::rename(dir.path().join("kept"), &path).unwrap();
     let renamed = store.verify(digest).unwrap();
@@ -510,7 +510,7 @@ fn a_folder_forgets_what_a_dead_process_staged_and_leaves_strangers_alone() {
     assert_eq!(strays.len(), 6, "{strays:?}");
     assert_eq!(store.get(digest).unwrap(), b"a blob");
 
-    // Under the name of a blob: neither followed nor waited for, and no obstacle.
+    // Under a blob's name a link is not followed, a pipe does not block, and neither prevents a put.
     let (piped, linked) = (Digest::of(b"piped"), Digest::of(b"linked"));
     for digest in [piped, linked] {
         std::fs::create_dir_all(blob_path(dir.path(), digest).parent().unwrap()).unwrap();
@@ -527,7 +527,7 @@ fn a_folder_forgets_what_a_dead_process_staged_and_leaves_strangers_alone() {
     assert_eq!((store.get(piped).unwrap(), store.get(linked).unwrap()), (b"piped".to_vec(), b"linked".to_vec()));
     assert_eq!(store.aside().unwrap().len(), 2);
 
-    // A link in the place of one of the store's own folders of blobs.
+    // A link in place of one of the store's blob folders.
     let (other, away) = ((0..).map(|i: u32| i.to_le_bytes()), dir.path().join("away"));
     std::fs::create_dir(&away).unwrap();
     let free =
@@ -567,7 +567,7 @@ fn what_is_stored_outlives_a_loss_of_power() {
     };
     assert_eq!(store.get(second).unwrap(), b"put again");
 
-    // What was put aside does not come back under its name.
+    // A damaged blob that was put aside does not reappear under its name.
     change(&blob_path(dir.path(), first), b"St0red");
     store.put(b"stored").unwrap();
     power.lose();

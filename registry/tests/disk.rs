@@ -1,5 +1,5 @@
-//! A disk that fills up, and one that cannot be written to. They are mounted for the test; where that is not allowed it says
-//! so and passes.
+//! Tests on a full disk and on a read-only one. The test mounts them; where mounting is not allowed, it reports that
+//! and passes.
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
 mod common;
@@ -28,7 +28,7 @@ async fn p7_a_full_disk_is_a_storage_error_loses_nothing_and_can_be_collected() 
     };
     assert!(matches!(&error, BlobError::Storage(m) if m.contains("registry gc")), "{error}");
 
-    // Somebody else fills the rest, so that the database cannot grow either.
+    // Other data fills the rest, so that the database cannot grow either.
     let ballast = disk.join("ballast");
     let mut size = 1 << 20;
     let mut file = std::fs::File::create(&ballast).unwrap();
@@ -45,7 +45,7 @@ async fn p7_a_full_disk_is_a_storage_error_loses_nothing_and_can_be_collected() 
     let error = Store::open(&dir, Holder::this_process("t")).await.unwrap_err();
     assert!(matches!(error, OpenError::Full { .. }), "{error}");
     assert!(error.hint().contains("`registry gc`"));
-    // The advice works while the disk is as full as it was.
+    // The advice works on the full disk.
     let mut gc = std::process::Command::new(env!("CARGO_BIN_EXE_registry"));
     let gc = gc.arg("--store").arg(&dir).args(["gc", "--grace", "0"]).output().unwrap();
     assert!(gc.status.success(), "{}", String::from_utf8_lossy(&gc.stderr));

@@ -1,6 +1,8 @@
-//! Bundles on changed files, for a time, and on files that were made to do harm; see `hostile::fuzz` for the rules and for what to do with what is found.
+//! Fuzzing of bundles for a limited time, and tests of malicious files; `hostile::fuzz` has the rules and the treatment
+//! of findings.
 //!
-//! The window of the decompressor, 32 MiB at most, is memory of a library in C, which is not counted here; a frame that asks for more is refused below.
+//! The decompressor's window of at most 32 MiB is allocated by a C library and not counted here; frames with a larger
+//! window are refused below.
 
 use std::alloc::System;
 use std::io::{self, Read as _, Write as _};
@@ -17,7 +19,7 @@ use tar::{EntryType, Header};
 #[global_allocator]
 static MEMORY: Cap<System> = Cap::new(System, usize::MAX);
 
-/// Bytes that a bomb makes of some kilobytes: more than may be allocated.
+/// Uncompressed size of a bomb of some kilobytes: more than the allowed allocation.
 const BOMB: u64 = 128 << 20;
 
 fn whole() -> Whole {
@@ -36,7 +38,7 @@ fn seeds() -> Vec<Vec<u8>> {
     ]
 }
 
-/// Zeros behind some bytes, compressed as they come.
+/// Compresses some bytes followed by zeros.
 fn bomb(before: &[u8]) -> Vec<u8> {
     let mut encoder = zstd::Encoder::new(Vec::new(), 1).expect("in memory");
     encoder.write_all(before).expect("in memory");
@@ -53,7 +55,7 @@ fn header(name: &str, kind: EntryType, size: u64) -> Vec<u8> {
     header.as_bytes().to_vec()
 }
 
-/// A frame whose window is 128 MiB.
+/// Makes a frame with a window of 128 MiB.
 fn wide_window() -> Vec<u8> {
     let mut encoder = zstd::Encoder::new(Vec::new(), 1).expect("in memory");
     encoder.set_parameter(zstd::zstd_safe::CParameter::WindowLog(27)).expect("a window");
@@ -62,7 +64,7 @@ fn wide_window() -> Vec<u8> {
     encoder.finish().expect("in memory")
 }
 
-/// Bundles that lead out of their folder, hold more than they say, or say more than there is.
+/// Malicious bundles: paths outside the folder, more content than announced, or less.
 fn made_to_do_harm() -> Vec<Named> {
     let whole = whole();
     let entries = |change: &dyn Fn(&mut Vec<Entry>)| {
@@ -70,11 +72,11 @@ fn made_to_do_harm() -> Vec<Named> {
         change(&mut entries);
         Form::Archive.marked(&archive(&entries))
     };
-    // In the place of the card, before the files.
+    // Replaces the card, before the files.
     let third = |name: &str, kind: EntryType, content: &[u8]| {
         entries(&|all: &mut Vec<Entry>| all[2] = (name.to_owned(), kind, content.to_vec()))
     };
-    // Entries before one whose header says how long it is.
+    // Entries before one with a forged length in its header.
     let before = |count: usize| {
         let all = archive(&whole.entries()[..count]);
         all[..all.len() - 1024].to_vec()

@@ -1,4 +1,4 @@
-//! A store whose database or blobs are missing, replaced or of yesterday is noticed, named, and neither opened, collected nor
+//! A store with a missing, replaced or outdated database or blobs is detected and named. It is not opened, collected or
 //! checked as a new one.
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
@@ -17,7 +17,7 @@ fn holder() -> Holder {
     Holder::this_process("test")
 }
 
-/// A store with a model of one file, closed.
+/// Makes and closes a store with a model of one file.
 async fn made(dir: &Path) {
     let store = open(dir).await;
     let model = artifact(store.blobs(), ArtifactKind::Model, "weights");
@@ -49,7 +49,7 @@ async fn mismatch(dir: &Path) -> Mismatch {
     }
 }
 
-/// `fsck` and `gc` of the binary, which must refuse and touch nothing.
+/// Runs the binary's `fsck` and `gc`, which must refuse and change nothing.
 fn refused_by_the_commands(dir: &Path, says: &str) {
     let before = blobs(dir);
     for args in [&["fsck"][..], &["gc", "--grace", "0"], &["gc", "--dry-run"]] {
@@ -61,7 +61,7 @@ fn refused_by_the_commands(dir: &Path, says: &str) {
     assert_eq!(blobs(dir), before, "nothing may be added or removed");
 }
 
-/// Copies a folder, as a crash would leave it: without closing what is open.
+/// Copies a folder as after a crash, without closing open files.
 fn copied(from: &Path, to: &Path) {
     fs::create_dir_all(to).unwrap();
     for entry in fs::read_dir(from).unwrap() {
@@ -69,7 +69,7 @@ fn copied(from: &Path, to: &Path) {
         let to = to.join(entry.file_name());
         match entry.path().is_dir() {
             true => copied(&entry.path(), &to),
-            // A witness that was on its way has got its name meanwhile.
+            // A witness that was being written has been renamed meanwhile.
             false => assert!(fs::copy(entry.path(), to).is_ok() || !entry.path().exists()),
         }
     }
@@ -89,11 +89,11 @@ async fn an_emptied_or_missing_database_beside_blobs_is_no_new_store() {
     assert!(matches!(mismatch(&dir).await, Mismatch::NoDatabase { .. }));
     refused_by_the_commands(&dir, "the database");
 
-    // Neither the marker nor the witness has to be there for blobs to count.
+    // Blobs alone are evidence, without marker and witness.
     fs::remove_file(dir.join("witness")).unwrap();
     fs::remove_file(dir.join("blobs/IDENTITY")).unwrap();
     refused_by_the_commands(&dir, "there are blobs in");
-    // A log without its database is no new store either.
+    // A log without its database is not a new store either.
     fs::remove_dir_all(dir.join("blobs")).unwrap();
     fs::write(dir.join("stride.db-wal"), b"frames").unwrap();
     assert!(matches!(mismatch(&dir).await, Mismatch::NoDatabase { .. }));
@@ -107,17 +107,17 @@ async fn a_lost_log_is_noticed() {
     let store = open(&live).await;
     let model = artifact(store.blobs(), ArtifactKind::Model, "weights");
     store.write(vec![version("m", model, 0.1)]).await.unwrap();
-    // Everything but the first page is still in the log.
+    // All pages except the first are still in the log.
     copied(&live, &young);
     fs::remove_file(young.join("stride.db-wal")).unwrap();
     assert!(matches!(mismatch(&young).await, Mismatch::NoDatabase { .. }));
     refused_by_the_commands(&young, "the database");
 
-    // The log has been brought over to the database several times, and begun anew.
+    // The log has been checkpointed several times and restarted.
     for i in 0..40 {
         store.write(vec![note("x".repeat(1 << 20)), note(i)]).await.unwrap();
     }
-    // The first of these may begin a new log; the second is taken up once the witness knows.
+    // The first of these may restart the log; the second is written after the witness knows.
     for last in ["a new log", "known"] {
         store.write(vec![note(last)]).await.unwrap();
     }
@@ -128,7 +128,7 @@ async fn a_lost_log_is_noticed() {
     fs::remove_file(grown.join("stride.db-wal")).unwrap();
     let lost = mismatch(&grown).await;
     assert!(matches!(&lost, Mismatch::WentBack { found, known, .. } if found < known), "{lost}");
-    refused_by_the_commands(&grown, "has gone back");
+    refused_by_the_commands(&grown, "has lost transactions");
 
     let adopted = loop {
         match Store::adopt(&grown, None, holder()).await {
@@ -151,7 +151,7 @@ async fn an_older_database_in_the_place_of_a_newer_one_is_noticed() {
     open(&dir).await.write(vec![note("newer")]).await.unwrap();
     fs::write(dir.join("stride.db"), old).unwrap();
     assert!(matches!(mismatch(&dir).await, Mismatch::WentBack { .. }));
-    refused_by_the_commands(&dir, "has gone back");
+    refused_by_the_commands(&dir, "has lost transactions");
 }
 
 #[tokio::test]
@@ -181,7 +181,7 @@ async fn parts_of_two_stores_are_not_opened_together() {
     made(&other).await;
     fs::copy(other.join("stride.db"), one.join("stride.db")).unwrap();
     assert!(matches!(mismatch(&one).await, Mismatch::Mixed { .. }));
-    refused_by_the_commands(&one, "of store");
+    refused_by_the_commands(&one, "belongs to store");
     let refused = Store::adopt(&one, None, holder()).await.unwrap_err();
     assert!(matches!(refused, OpenError::Mismatch { mismatch: Mismatch::Mixed { .. }, .. }), "{refused}");
 }
@@ -214,20 +214,21 @@ async fn no_store_is_made_among_other_files() {
     assert!(matches!(&refused, OpenError::NotEmpty { found, .. } if found == "`thesis.tex`"), "{refused}");
     assert!(refused.hint().contains("empty"));
     assert_eq!(blobs(dir.path()), [home.join("thesis.tex")], "nothing was made");
-    // A store that is there does not mind what lies beside it.
+    // An existing store tolerates other files beside it.
     let store = dir.path().join("store");
     drop(open(&store).await);
     fs::write(store.join("notes.txt"), b"text").unwrap();
     drop(open(&store).await);
 }
 
-/// A process that opened a store before cannot write to it any more, even if the file lock did not keep the second one out.
+/// A process that opened a store earlier can no longer write to it, even if the file lock did not exclude the second
+/// one.
 #[tokio::test]
 async fn the_second_to_open_fences_the_first() {
     let dir = tempfile::tempdir().unwrap();
     let first = open(dir.path()).await;
     first.write(vec![note("first")]).await.unwrap();
-    // Another file under the lock's name: the second one locks that.
+    // A new file under the lock's name, which the second one locks.
     fs::remove_file(dir.path().join("lock")).unwrap();
     let second = open(dir.path()).await;
     second.write(vec![note("second")]).await.unwrap();

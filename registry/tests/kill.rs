@@ -1,7 +1,7 @@
-//! `kill -9` at every fail point: nothing half written is ever visible, nothing acknowledged is lost, and the same work
-//! done again gives the same digests.
+//! `kill -9` at every fail point: partial writes are never visible, acknowledged data is never lost, and repeated work
+//! gives the same digests.
 //!
-//! The test runs itself as a child process that saves checkpoints, and tells by a file what was acknowledged.
+//! The test runs itself as a child process that saves checkpoints and records in a file what was acknowledged.
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
 mod common;
@@ -39,7 +39,7 @@ fn child() {
             .await
             .unwrap();
         for step in from + 1..=STEPS {
-            // Shares a part with every other checkpoint, as frozen weights are shared.
+            // Shares a blob with every other checkpoint, like frozen weights.
             store.blobs().put(b"frozen").unwrap();
             let manifest = artifact(store.blobs(), ArtifactKind::Checkpoint, &"x".repeat(100_000 + step as usize));
             let write = Write::Checkpoint { grant: grant("r/s", granted), step, manifest, metrics: metrics(&[]) };
@@ -81,7 +81,7 @@ async fn a_kill_at_any_point_leaves_a_whole_store_that_goes_on_to_the_same_end()
     assert_eq!(expected.len() as u64, STEPS);
 
     for point in failpoints::ALL {
-        // The first time of all, in the middle of the first checkpoint, and some checkpoints later.
+        // At the very first pass, during the first checkpoint, and some checkpoints later.
         for nth in [1, 2, 3, 6] {
             let dir = tempfile::tempdir().unwrap();
             let fail_at = format!("{point}@{nth}");

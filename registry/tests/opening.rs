@@ -1,4 +1,4 @@
-//! Opening a store: who may, what is refused and why, and reading beside its holder.
+//! Tests of opening a store: exclusion, refusals and their reasons, and reading beside the holder.
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
 mod common;
@@ -81,7 +81,7 @@ async fn p16_a_newer_schema_is_refused() {
     assert!(matches!(error, OpenError::NewerSchema { found: 9999, .. }), "{error}");
 }
 
-/// A folder that the kernel refuses to write to, even for root.
+/// A folder that the kernel protects from writing.
 #[cfg(target_os = "linux")]
 #[tokio::test]
 async fn a_read_only_place_is_refused_as_such() {
@@ -98,7 +98,7 @@ async fn a_read_only_place_is_refused_as_such() {
     assert!(matches!(error, OpenError::ReadOnly { .. }), "{error}");
 }
 
-/// Readers need nobody to let them in, hold nobody up, and leave no trace.
+/// Readers need no holder, block no writer and leave no trace.
 #[tokio::test]
 async fn a_store_is_read_while_it_is_held_and_without_a_trace_while_it_is_not() {
     let dir = tempfile::tempdir().unwrap();
@@ -118,7 +118,7 @@ async fn a_store_is_read_while_it_is_held_and_without_a_trace_while_it_is_not() 
     assert!(held.stage_result(Digest::of(b"later")).await.unwrap().is_some(), "what was committed since is seen");
     held.close().await;
     drop(store);
-    // Reads once more until the writer's last connection has taken its log with it.
+    // Waits until the writer's last connection has removed its log.
     while dir.path().join("stride.db-wal").exists() {
         tokio::task::yield_now().await;
     }

@@ -1,4 +1,4 @@
-//! The database outlives a loss of power with all that was acknowledged.
+//! The database survives a power loss with all acknowledged data.
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
 mod common;
@@ -22,7 +22,7 @@ fn run(number: u32) -> Write {
     }
 }
 
-/// Writers that go on while the power fails again and again, through several cycles of the database's log. Sampled: 12 moments.
+/// Writers continue through repeated power losses and several cycles of the database's log. Sampled: 12 moments.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn p2_what_the_database_has_acknowledged_outlives_a_loss_of_power() {
     stand_between();
@@ -47,7 +47,7 @@ async fn p2_what_the_database_has_acknowledged_outlives_a_loss_of_power() {
         while acknowledged.lock().unwrap().len() < moment * 10 {
             tokio::task::yield_now().await;
         }
-        // Before the power fails: whatever is acknowledged meanwhile need not be there.
+        // Taken before the power loss; later acknowledgements need not survive.
         let expected = acknowledged.lock().unwrap().clone();
         let after = tempfile::tempdir().unwrap();
         lose_power(&path, after.path());

@@ -1,4 +1,4 @@
-//! What is pruned, collected and forgotten, and what stays.
+//! Tests of pruning, collection and deletion, and of the data that stays.
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
 mod common;
@@ -28,10 +28,10 @@ async fn checkpoints_are_pruned_by_policy_and_only_the_unneeded_is_collected() {
     store.blobs().put(b"nobody needs this").unwrap();
 
     let joint = Keep { latest: 1, best: 1, metric: "joint".into(), ..Keep::default() };
-    let refused = store.prune_checkpoints(&task, joint).await.unwrap_err().to_string();
+    let refused = store.prune_checkpoints(&task, joint, false).await.unwrap_err().to_string();
     assert!(refused.contains("`joint`") && refused.contains("there is: loss"), "{refused}");
     assert_eq!(store.checkpoints(&task).await.unwrap().len(), 5, "nothing is lost by a metric that nobody saved");
-    let gone = store.prune_checkpoints(&task, Keep { best: 1, ..Keep::default() }).await.unwrap();
+    let gone = store.prune_checkpoints(&task, Keep { best: 1, ..Keep::default() }, false).await.unwrap();
     assert_eq!(gone.len(), 2);
     let steps: Vec<_> = store.checkpoints(&task).await.unwrap().iter().map(|c| c.step).collect();
     assert_eq!(steps, [5, 4, 2], "the two newest and the best; what is no number is never best");
@@ -44,10 +44,27 @@ async fn checkpoints_are_pruned_by_policy_and_only_the_unneeded_is_collected() {
         let metrics = metrics(&[("loss", loss)]);
         store.write(vec![Write::Checkpoint { grant: grant("r/t", 1), step, manifest, metrics }]).await.unwrap();
     }
-    store.prune_checkpoints(&other, largest).await.unwrap();
+    store.prune_checkpoints(&other, largest, false).await.unwrap();
     let steps: Vec<_> = store.checkpoints(&other).await.unwrap().iter().map(|c| c.step).collect();
     assert_eq!(steps, [5, 1], "the newest and the largest");
-    store.prune_checkpoints(&other, Keep { latest: 1, ..Keep::default() }).await.unwrap();
+    store.prune_checkpoints(&other, Keep { latest: 1, ..Keep::default() }, false).await.unwrap();
+
+    let ended = TaskId::new("r/u");
+    store.write(vec![fence("r/u", 1)]).await.unwrap();
+    for step in 1..=3 {
+        let manifest = store.checkpoints(&task).await.unwrap()[0].manifest;
+        store
+            .write(vec![Write::Checkpoint { grant: grant("r/u", 1), step, manifest, metrics: metrics(&[]) }])
+            .await
+            .unwrap();
+    }
+    let two = Keep { ended: 2, ..Keep::default() };
+    assert_eq!(store.prune_checkpoints(&ended, two, true).await.unwrap().len(), 1, "two were asked for");
+    assert_eq!(
+        store.prune_checkpoints(&ended, Keep::default(), true).await.unwrap().len(),
+        2,
+        "none is kept by default"
+    );
 
     assert!(store.gc(60_000).await.unwrap().remove.is_empty(), "all is fresh");
     let plan = store.gc_plan(-1000).await.unwrap();
@@ -112,7 +129,7 @@ fn put_before(dir: &std::path::Path, digest: Digest, minutes: u64) {
     file.set_times(std::fs::FileTimes::new().set_modified(at)).unwrap();
 }
 
-/// A coordinator that was restarted does not know what a worker that still holds its task had uploaded.
+/// A restarted coordinator does not know the uploads of a worker that still holds its task.
 #[tokio::test]
 async fn no_grace_does_not_reach_behind_a_restart_while_a_run_is_under_way() {
     let dir = tempfile::tempdir().unwrap();
@@ -136,8 +153,8 @@ async fn no_grace_does_not_reach_behind_a_restart_while_a_run_is_under_way() {
     assert_eq!(store.gc(0).await.unwrap().remove, [uploaded]);
 }
 
-/// What a held task has uploaded and what somebody is about to name stay without any grace, in the plan as in the collection; in
-/// that of another process as well, as far as it can know.
+/// Uploads of a held task and blobs about to be named stay without any grace period, in the plan and in the collection.
+/// Another process's plan keeps the ones it knows of.
 #[tokio::test]
 async fn what_no_row_names_yet_stays_as_long_as_somebody_may_name_it() {
     let dir = tempfile::tempdir().unwrap();
@@ -145,7 +162,7 @@ async fn what_no_row_names_yet_stays_as_long_as_somebody_may_name_it() {
     let uploaded = artifact(store.blobs(), ArtifactKind::Vae, "uploaded");
     let garbage = store.blobs().put(b"garbage").unwrap();
     let bundle = Manifest::new(ArtifactKind::Model, json!({"vae": uploaded})).to_bytes();
-    // The manifest alone is held: what it lists is needed as well.
+    // Only the manifest is held; the blobs that it lists are needed as well.
     store.blobs().hold(&"r/s".into(), uploaded);
     let protected = store.blobs().protect(Digest::of(&bundle));
     let again = store.blobs().protect(Digest::of(&bundle));
@@ -164,7 +181,7 @@ async fn what_no_row_names_yet_stays_as_long_as_somebody_may_name_it() {
     assert_eq!(store.gc(-1000).await.unwrap().remove.len(), 3);
 }
 
-/// The writer of a blob has time to name it, however often a collection comes in between.
+/// The writer of a blob has time to name it, even if collections run in between.
 #[tokio::test]
 async fn a_fresh_blob_outlives_a_collection_with_the_usual_grace() {
     let dir = tempfile::tempdir().unwrap();
@@ -178,7 +195,7 @@ async fn a_fresh_blob_outlives_a_collection_with_the_usual_grace() {
     assert!(store.gc(registry::retention::GRACE_MS).await.unwrap().remove.is_empty());
 }
 
-/// Rows that come to name an old blob while it is about to go keep it; the others go, and no write waits for the end.
+/// Rows that name an old blob during a collection keep it; other blobs are removed, and no write waits for the end.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn writes_go_on_while_garbage_is_collected_and_what_they_name_stays() {
     let dir = tempfile::tempdir().unwrap();
@@ -205,7 +222,7 @@ async fn writes_go_on_while_garbage_is_collected_and_what_they_name_stays() {
     assert!(store.fsck().await.unwrap().problems.is_empty());
 }
 
-/// A run with a stage `made` and a stage `spare`, each with a value, a checkpoint, a curve and a log.
+/// Makes a run with stages `made` and `spare`, each with a value, a checkpoint, a curve and a log.
 async fn finished_run(store: &Store, run: &str, state: &str) -> (Digest, Digest) {
     let stage = |name: &str| {
         let output = artifact(store.blobs(), ArtifactKind::Model, &format!("{run} {name}"));
@@ -277,7 +294,7 @@ async fn what_other_runs_need_of_a_forgotten_run_stays_until_they_go_too() {
     let dir = tempfile::tempdir().unwrap();
     let store = open(dir.path()).await;
     let (made, spare) = finished_run(&store, "first", "finished").await;
-    // Another run has the first one's value `made`; a third one is under way and has stages of both names.
+    // Another run has the value of `made`; a third one is running and has stages of both names.
     let run = |run: &str, stages| Write::Run {
         run: run.into(),
         pipeline: json!({ "stages": stages }),
@@ -309,7 +326,7 @@ async fn what_other_runs_need_of_a_forgotten_run_stays_until_they_go_too() {
     assert!(store.blobs().list().unwrap().is_empty());
 }
 
-/// A sweep's trials but the best, and work that came to nothing, can go while their run stays.
+/// A sweep's trials other than the best, and work without a value, can be deleted while their run stays.
 #[tokio::test]
 async fn leftovers_of_ended_runs_go_and_what_their_stages_gave_stays() {
     let dir = tempfile::tempdir().unwrap();
@@ -336,7 +353,7 @@ async fn leftovers_of_ended_runs_go_and_what_their_stages_gave_stays() {
     let checkpoint =
         Write::Checkpoint { grant: grant("r/late", 1), step: 3, manifest: saved, metrics: BTreeMap::new() };
     store.write(vec![fence("r/late", 1), checkpoint]).await.unwrap();
-    // The swept stage has the value of trial 1, and the key of that trial.
+    // The swept stage has the value and the key of trial 1.
     let key = |name: &str| Digest::of(name.as_bytes());
     let mut stages: Vec<_> = names.iter().map(|name| json!({"name": name, "key": key(name), "of": "pcm"})).collect();
     stages.push(json!({"name": "pcm", "key": key("pcm.t01.r0")}));

@@ -1,4 +1,4 @@
-//! Fences, exactly-once, group commit, what a row may name.
+//! Tests of fences, exactly-once, group commit, and the artifacts that a row may name.
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
 mod common;
@@ -9,7 +9,7 @@ use common::{artifact, fence, grant, metrics, open, result, rows};
 use proptest::prelude::*;
 use protocol::message::MetricRow;
 use protocol::{ArtifactKind, Digest, Fence, RunId, StageName, TaskId};
-use registry::{Write, WriteError};
+use registry::{Page, Write, WriteError};
 use serde_json::json;
 
 #[tokio::test]
@@ -32,10 +32,10 @@ async fn an_old_fence_refuses_the_whole_call_and_not_its_neighbours() {
     }
     stored.unwrap();
     assert_eq!(common::notes(&store).await, [json!("from the neighbour")]);
-    assert!(store.metrics(&"r".into(), &"vae".into(), None, 0).await.unwrap().is_empty());
+    assert!(store.points(&"r".into(), &"vae".into(), None, Page::ALL).await.unwrap().is_empty());
 }
 
-/// Every kind of write that carries a grant, under the newest fence, an older one, and one that was never granted.
+/// Every kind of write with a grant, under the newest fence, an older one, and one that was never granted.
 #[tokio::test]
 async fn p2_every_kind_of_write_is_refused_under_an_old_fence() {
     let dir = tempfile::tempdir().unwrap();
@@ -68,7 +68,7 @@ async fn p2_every_kind_of_write_is_refused_under_an_old_fence() {
     }
     assert!(taken.is_empty(), "{taken:#?}");
     let (run, stage) = (RunId::new("r"), StageName::new("s"));
-    assert!(store.metrics(&run, &stage, None, 0).await.unwrap().is_empty());
+    assert!(store.points(&run, &stage, None, Page::ALL).await.unwrap().is_empty());
     assert!(store.logs(&run, None, 0, 10).await.unwrap().is_empty());
     assert!(store.checkpoints(&TaskId::new("r/s")).await.unwrap().is_empty());
     assert!(store.shards(&run).await.unwrap().is_empty());
@@ -101,9 +101,8 @@ enum Step {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(24))]
 
-    /// However grants and writes interleave, and no matter who writes late: what is stored was written under the fence that was
-    /// the newest at that point of the one order in which the store took them. Sampled:
-    /// 24 random interleavings of up to 40 grants and writes.
+    /// For any interleaving of grants and late writes, a stored write has the fence that was the newest at its place in
+    /// the store's order. Sampled: 24 random interleavings of up to 40 grants and writes.
     #[test]
     fn p2_an_old_fence_never_gets_in(steps in prop::collection::vec(
         prop_oneof![Just(Step::Grant), (0_u64..3).prop_map(|back| Step::Write { back })], 1..40
@@ -131,7 +130,7 @@ proptest! {
                 if i % 3 == 0 { tokio::task::yield_now().await; }
             }
             for write in pending { let _ = write.await.unwrap(); }
-            // The facts are that one order; a grant may itself have come late and been refused.
+            // The facts record that order; a grant may have come late and been refused.
             let mut current = 0;
             for event in common::notes(&store).await {
                 if let Some(granted) = event["granted"].as_u64() {
@@ -159,7 +158,7 @@ async fn p9_metrics_and_logs_that_are_sent_twice_are_stored_once_and_a_later_att
     store.write(vec![Write::Metrics { grant: grant("r/vae", 2), rows: rows(5..7, 2.0) }]).await.unwrap();
 
     let (run, stage) = (RunId::new("r"), StageName::new("vae"));
-    let curves = store.metrics(&run, &stage, Some(&["loss".into()]), 0).await.unwrap();
+    let curves = store.points(&run, &stage, Some(&["loss".into()]), Page::ALL).await.unwrap();
     let seen: Vec<_> = curves["loss"].points.iter().map(|p| (p.step, p.value)).collect();
     assert_eq!(seen, [(0, 1.0), (1, 1.0), (2, 1.0), (3, 1.0), (4, 1.0), (5, 2.0), (6, 2.0)]);
     let lines = store.logs(&run, Some(&stage), 0, 100).await.unwrap();
@@ -179,6 +178,9 @@ async fn a_row_may_not_name_what_is_not_there() {
     let whole = artifact(store.blobs(), ArtifactKind::Checkpoint, "content");
     let content = Digest::of(b"content").hex();
     std::fs::remove_file(dir.path().join("blobs/sha256").join(&content[..2]).join(&content[2..])).unwrap();
+    // By another process, which has not just stored it itself.
+    drop(store);
+    let store = open(dir.path()).await;
     let incomplete = store.write(vec![checkpoint(whole)]).await.unwrap_err();
     assert!(incomplete.to_string().contains("lists `content`"), "{incomplete}");
 

@@ -1,4 +1,4 @@
-//! Cargo looks at build dependencies only where there is a build script.
+//! Exists because Cargo resolves build dependencies only for a package with a build script.
 
 fn main() {
     println!("cargo:rerun-if-changed=build.rs");

@@ -1,4 +1,4 @@
-//! Another user of the machine, and the documented server.
+//! Access of another user of the machine, and access to the documented server.
 
 use std::fs;
 use std::io::{Read, Write};
@@ -13,7 +13,7 @@ use cluster_tests::{Bench, Running, wait_for};
 use nix::sys::signal::Signal;
 
 const TRAINER: &str = env!("CARGO_BIN_EXE_trainer");
-/// `nobody`.
+/// The user `nobody`.
 const OTHER: u32 = 65534;
 
 fn files(dir: &Path) -> Vec<PathBuf> {
@@ -21,7 +21,7 @@ fn files(dir: &Path) -> Vec<PathBuf> {
     entries.flat_map(|path| if path.is_dir() { [files(&path), vec![path]].concat() } else { vec![path] }).collect()
 }
 
-/// A program run as another user; what it printed if it succeeded.
+/// Runs a program as another user and returns its output, or `None` if it fails.
 fn as_other(program: &str, arguments: &[&str]) -> Option<String> {
     let output = Command::new(program).args(arguments).uid(OTHER).gid(OTHER).output().expect("the program starts");
     output.status.success().then(|| String::from_utf8_lossy(&output.stdout).into_owned())
@@ -38,13 +38,13 @@ fn ask(address: &str, method: &str, path: &str, more: &str) -> Option<u16> {
     std::str::from_utf8(answer.get(9..12)?).ok()?.parse().ok()
 }
 
-/// A `trainer run` with workers, whose store lies where everybody may look.
+/// Starts `trainer run` with workers, in a folder that every user may read.
 fn running() -> (Bench, Running, String) {
     let bench = Bench::new(TRAINER);
     fs::set_permissions(bench.path(), fs::Permissions::from_mode(0o755)).expect("our own folder");
     let config = Bench::config("smoke.yaml");
     let mut command = bench.command(&["run", &config, "--set", "stages.vae.steps=100000", "--workers", "2"]);
-    // As on most machines: what is made is readable by all unless its maker takes care.
+    // As on most machines: new files are readable by all users unless the program restricts them.
     command.env_remove("STRIDE_TOKEN");
     let mut run = Running::start(command);
     let address = wait_for("workers that train", || {
@@ -62,7 +62,7 @@ fn another_user_gets_nothing_from_a_run() {
     let (bench, run, address) = running();
     let secret = fs::read_to_string(bench.store().join("token")).expect("this user's token");
 
-    // Without the token, every call is refused, and what the token is cannot be seen.
+    // Without the token every call is refused, and no answer reveals the token.
     let routes = coordinator::shell::routes();
     for route in &routes {
         let path = route.path.replace("{run}", "r").replace("{worker}", "w1").replace("{action}", "cancel");
@@ -83,7 +83,7 @@ fn another_user_gets_nothing_from_a_run() {
     let all = files(&bench.store());
     assert!(all.iter().any(|path| path.ends_with("stride.db")) && all.len() > 5, "{all:?}");
     for path in all.iter().chain([&bench.store()]) {
-        // Files come and go while it runs.
+        // Files come and go during the run.
         let Ok(metadata) = fs::symlink_metadata(path) else { continue };
         let mode = metadata.permissions().mode();
         assert_eq!(mode & 0o077, 0, "{} has mode {mode:o}", path.display());
@@ -106,4 +106,40 @@ fn another_user_gets_nothing_from_a_run() {
     run.signal(Signal::SIGINT);
     run.wait();
     assert!(!bench.store().join("token").exists(), "the token goes with its run");
+}
+
+/// `kill -HUP` makes the server read the token file again; a broken file changes nothing.
+#[test]
+fn a_token_is_revoked_without_a_restart() {
+    let bench = Bench::new(TRAINER);
+    let (tokens, log) = (bench.path().join("tokens"), bench.path().join("serve.log"));
+    let write = |text: &str| {
+        fs::write(&tokens, text).expect("written");
+        fs::set_permissions(&tokens, fs::Permissions::from_mode(0o600)).expect("ours");
+    };
+    let lines = ["alice read 0123456789abcdef-alice", "bob read 0123456789abcdef-bob"];
+    write(&lines.join("\n"));
+    let serve = ["serve", "--bind", "127.0.0.1:0", "--token-file", "tokens"];
+    let mut server = Running::logged(bench.command(&serve).env_remove("STRIDE_TOKEN"), &log);
+    let said = || fs::read_to_string(&log).unwrap_or_default();
+    let address = wait_for("the server to listen", || {
+        assert!(server.alive(), "{}", said());
+        Some(said().split_once("listening on http://")?.1.split_once(' ')?.0.to_owned())
+    });
+    let may = |name: &str| {
+        ask(&address, "GET", "/v1/runs", &format!("authorization: Bearer 0123456789abcdef-{name}\r\n")) == Some(200)
+    };
+    assert!(may("alice") && may("bob"));
+    write(&format!("{}\nbob nonsense 0123456789abcdef-bob\n", lines[0]));
+    server.signal(Signal::SIGHUP);
+    wait_for("the server to name the mistake", || said().contains("`nonsense` is not a scope").then_some(()));
+    assert!(may("alice") && may("bob"), "the table stays as it was");
+    write(lines[0]);
+    server.signal(Signal::SIGHUP);
+    wait_for("the line to be gone", || (!may("bob")).then_some(()));
+    assert!(may("alice"));
+    server.signal(Signal::SIGTERM);
+    assert_eq!(server.wait().code, Some(0));
+    let audit = bench.run(&["registry", "audit"]).expect_code(0).stdout;
+    assert!(audit.contains("alice") && audit.contains("401"), "{audit}");
 }

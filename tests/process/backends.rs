@@ -1,5 +1,5 @@
-//! Every kind that trains, on another backend than the one that all else is tested on: `STRIDE_TEST_BACKEND`, or ndarray, which every test
-//! build has. `tests/gpu.sh` does it on accelerators.
+//! Every kind that trains, on another backend than the other tests: `STRIDE_TEST_BACKEND`, or ndarray, which every test
+//! build has. `tests/gpu.sh` runs this on accelerators.
 
 use std::collections::BTreeSet;
 use std::time::Duration;
@@ -10,7 +10,7 @@ use protocol::stage::StageSettings;
 use serde_json::Value;
 
 const TRAINER: &str = env!("CARGO_BIN_EXE_trainer");
-/// What a loss or a gradient's norm may be off, relative to its size: backends sum in other orders, and what a stage reads was trained on
+/// Relative tolerance of a loss or a gradient norm. Backends sum in other orders, and inputs of a stage were trained on
 /// the same backend.
 const TOLERANCE: f64 = 1e-4;
 
@@ -18,7 +18,7 @@ fn other() -> String {
     std::env::var("STRIDE_TEST_BACKEND").unwrap_or_else(|_| "ndarray".to_owned())
 }
 
-/// Software Vulkan compiles and tunes kernels for minutes before a kind's first step.
+/// Time limit of a run. Software Vulkan compiles and tunes kernels for minutes before a kind's first step.
 fn patience() -> Duration {
     PATIENCE * if std::env::var_os("STRIDE_TEST_BACKEND").is_some() { 24 } else { 1 }
 }
@@ -27,7 +27,7 @@ fn config() -> std::path::PathBuf {
     Bench::repository().join("tests/process/kinds.yaml")
 }
 
-/// One worker of a backend runs every kind; its run, and the stages that trained.
+/// Runs every kind with one worker of a backend. Returns the cluster, the run and its view.
 fn run(backend: &str, sets: &[&str]) -> (Cluster, String, Value) {
     let mut cluster = Cluster::start(TRAINER);
     cluster.join_by("w1", &[], &["--backend", backend]);
@@ -65,7 +65,8 @@ fn every_kind_trains_on_another_backend_as_on_flex() {
     assert!(all_off[0].0 < TOLERANCE, "{:?}", all_off[0]);
 }
 
-/// How far a stage's values on one cluster are from those on another, the furthest first: relative to their size, and what it is about.
+/// Errors of a stage's values on one cluster against another, largest first, each with a description. Errors are
+/// relative to the size of the value.
 fn off(stage: &str, found: (&Cluster, &str), expected: (&Cluster, &str)) -> Vec<(f64, String)> {
     let (found, expected) = (found.0.metrics(found.1, stage), expected.0.metrics(expected.1, stage));
     assert_eq!(found.keys().collect::<Vec<_>>(), expected.keys().collect::<Vec<_>>(), "{stage}");
@@ -81,8 +82,9 @@ fn off(stage: &str, found: (&Cluster, &str), expected: (&Cluster, &str)) -> Vec<
     off
 }
 
-/// A worker is killed after a checkpoint; what it goes on to is what one that was not killed has. The same bits on a backend of the CPU: that
-/// is what keys rest on. An accelerator's picks its kernels by timing them, in each process anew, and so rounds otherwise in another process.
+/// A worker is killed after a checkpoint, and its successor reaches the state of an undisturbed run. On a CPU backend
+/// the bits are equal, which keys depend on. An accelerator's backend picks its kernels by timing in each process, so
+/// another process rounds differently.
 #[test]
 fn p5_a_kill_on_another_backend_changes_no_byte() {
     let sets = ["--set", "stages.vae.steps=6", "--until", "vae"];
@@ -106,8 +108,8 @@ fn p5_a_kill_on_another_backend_changes_no_byte() {
     }
 }
 
-/// The smoke pipeline, whose rate is an ordinary one: what differs in the last bits grows from step to step. Sampled: its first stage; all of
-/// it with `STRIDE_TEST_BACKEND`.
+/// The smoke pipeline has an ordinary learning rate, so differences in the last bits grow from step to step. Sampled:
+/// its first stage; all stages with `STRIDE_TEST_BACKEND`.
 #[test]
 fn the_smoke_pipeline_on_another_backend() {
     let last = if std::env::var_os("STRIDE_TEST_BACKEND").is_some() { "release" } else { "vae" };

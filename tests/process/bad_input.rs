@@ -1,4 +1,4 @@
-//! Bad input: a message with file, line or field and what to do, exit 2, and the store untouched.
+//! Bad input: a message with file, line or field and advice, exit code 2, and an untouched store.
 
 use std::fs;
 use std::path::Path;
@@ -46,7 +46,75 @@ fn p11_a_pipeline_with_mistakes() {
     refused(&bench, &["run", &path, "--set", "stages.nobody.lr=1"], &["nobody"]);
 }
 
-/// Stages of tokens that do not fit each other are found before the first of them trains.
+/// A path that is no pipeline file: the message names its type and suggests a file.
+#[test]
+fn what_is_no_pipeline_is_named_with_what_was_meant() {
+    let bench = Bench::new(TRAINER);
+    let at = |name: &str| bench.path().join(name);
+    fs::create_dir(at("empty")).expect("a folder");
+    fs::create_dir(at("some")).expect("a folder");
+    fs::copy(Bench::config("smoke.yaml"), at("some/smoke.yaml")).expect("copied");
+    assert!(Command::new("mkfifo").arg(at("pipe")).status().expect("mkfifo runs").success());
+    refused(&bench, &["run", "empty"], &["`empty`: it is a folder; expected a file", "hint: name a pipeline's file"]);
+    refused(&bench, &["run", "some"], &["hint: name one of its pipelines: some/smoke.yaml"]);
+    refused(&bench, &["run", "some/smok.yaml"], &["there is no such file", "did you mean `some/smoke.yaml`?"]);
+    refused(&bench, &["run", "pipe"], &["`pipe`: it is a named pipe; expected a file"]);
+    refused(&bench, &["data", "inspect", "none.bvh"], &["none.bvh: there is no such file"]);
+}
+
+#[test]
+fn another_format_of_the_dataset_needs_no_other_change() {
+    let bench = Bench::new(TRAINER);
+    let config = Bench::config("humanml3d-mini.yaml");
+    let said = bench.run(&["config", "show", &config, "--set", "dataset.format=synthetic"]).expect_code(0);
+    assert!(said.stdout.contains("data.synthetic"), "{}", said.stdout);
+    let wrong = ["--set", "dataset.format=synthetic", "--set", "dataset.path=x"];
+    let said = bench.run(&[&["plan", "--no-time", &config][..], &wrong].concat()).expect_code(2);
+    assert!(said.stderr.contains("unknown key `path`"), "what the command line itself says is held against it");
+}
+
+/// Command lines that probably contain a mistake.
+#[test]
+fn a_command_line_that_is_probably_not_meant_is_refused_with_what_to_write() {
+    let bench = Bench::new(TRAINER);
+    fn generate<'a>(more: &[&'a str]) -> Vec<&'a str> {
+        [&["generate", "--model", "x@y", "-o", "x.npy"][..], more].concat()
+    }
+    refused(
+        &bench,
+        &generate(&["a", "person", "walks"]),
+        &["`a person walks` without quotes is 3 sentences", "hint: for one motion"],
+    );
+    refused(&bench, &generate(&["a person walks", "--guidance", "-3"]), &["--guidance", "expected 0 or more"]);
+    refused(&bench, &generate(&["a person walks", "--seconds", "-4"]), &["expected more than 0"]);
+    // Accepted as intended; the remaining error is the missing store.
+    for fine in [&["a person walks", "jumps"][..], &["jumps"], &["a person walks", "--seconds", "4s"]] {
+        refused(&bench, &generate(fine), &["there is no store"]);
+    }
+}
+
+/// The exit codes in `--help` and those of actual commands.
+#[test]
+fn exit_codes_have_one_meaning_each() {
+    let bench = Bench::new(TRAINER);
+    let help = bench.run(&["--help"]).expect_code(0).stdout;
+    for line in ["  3  a fault of this program", "  7  there is no such run, stage or model", "130  interrupted"] {
+        assert!(help.contains(line), "`{line}` is missing in:\n{help}");
+    }
+    let config = Bench::config("smoke.yaml");
+    bench.run(&["run", &config, "--until", "dataset", "--workers", "1"]).expect_code(0);
+    for missing in [
+        &["status", "nothing-1"][..],
+        &["logs", "nothing-1"],
+        &["generate", "a jump", "--model", "nothing@best", "-o", "x.npy"],
+        &["registry", "show", "nothing"],
+        &["registry", "history", "nothing"],
+    ] {
+        bench.run(missing).expect_code(7);
+    }
+}
+
+/// Token stages that do not fit each other are found before the first of them trains.
 #[test]
 fn p11_tokens_and_decoders_that_do_not_fit() {
     let bench = Bench::new(TRAINER);
@@ -82,7 +150,7 @@ stages:
     }
 }
 
-/// A folder in the published layout with three good clips.
+/// Creates a folder in the published layout with three valid clips.
 pub(crate) fn folder(path: &Path) {
     let source = fixtures::data("humanml3d-mini").expect("the caller has checked that real motion is there");
     for sub in ["new_joint_vecs", "texts"] {
@@ -143,13 +211,13 @@ fn a_broken_dataset_folder_is_named_file_by_file() {
     fs::write(&clip, &narrow).expect("written");
     run(&data, &[&first, "263", "251"]);
 
-    // A pipe in a file's place is named, not waited for.
+    // A pipe in place of a file is reported, not waited for.
     fs::remove_file(&clip).expect("removed");
     assert!(Command::new("mkfifo").arg(&clip).status().expect("mkfifo runs").success());
     run(&data, &[&format!("{first}.npy: is a named pipe; expected a file")]);
     fs::remove_file(&clip).expect("removed");
 
-    // What a file holds does not reach the terminal as it is.
+    // Content of a file reaches the terminal only escaped.
     fs::write(&clip, &good).expect("written");
     let list = fs::read_to_string(data.join("val.txt")).expect("a list");
     fs::write(data.join("val.txt"), "\u{1b}[2J\u{1b}]0;title\u{7}\n").expect("written");

@@ -1,4 +1,4 @@
-//! A store whose blobs lie in a bucket: a run gives what it gives in a folder, and what stands in the way is said.
+//! A store with its blobs in a bucket. A run gives the same results as in a folder, and problems are reported.
 
 use std::fs;
 
@@ -22,20 +22,24 @@ fn a_run_on_a_bucket_that_is_killed_and_goes_on_gives_the_digests_of_a_folder() 
     let config = Bench::config("smoke.yaml");
     let arguments = [&["run", &config, "--blobs", &url][..], &until].concat();
 
-    // An object is there, and nobody has been told.
+    // Kill the process after an object is uploaded but before it is recorded.
     let mut command = bench.command(&arguments);
     command.env("STRIDE_FAILPOINT", "blob::after_rename@12");
     let killed = Running::start(command).wait();
     assert_eq!(killed.code, None, "the point was not reached:\n{}", killed.stderr);
     bench.run(&["registry", "fsck"]).expect_code(0);
 
-    // The store remembers where its blobs are.
+    let interrupted = bench.run(&["status", "--all", "-o", "json"]).expect_code(0).json()["runs"][0].clone();
+    let done = interrupted["stages"].as_array().expect("stages").iter().filter(|stage| stage["state"] == "ran");
+    assert!(done.count() > 0, "{interrupted:#}");
+
+    // The store remembers where its blobs are, and the same run continues.
     let report = bench.pipeline("smoke.yaml", &until);
     assert_eq!(digests(&report), digests(&reference));
-    assert!(states(&report).values().any(|state| state == "cached"), "what was done before the kill is done");
+    assert_eq!(report["run"], interrupted["run"]);
     bench.run(&["registry", "fsck"]).expect_code(0);
     assert!(bucket.objects().join("runs/first/sha256").is_dir() && !bench.store().join("blobs/sha256").exists());
-    // The killed process was about to remove one, which goes once its worker has not come back for it for ten minutes.
+    // The killed process left at most one part. It is removed once its worker has been absent for ten minutes.
     assert!(fs::read_dir(bench.store().join("staging")).expect("a folder").count() <= 1, "nothing is kept twice");
 
     let again = bench.pipeline("smoke.yaml", &until);
@@ -43,7 +47,8 @@ fn a_run_on_a_bucket_that_is_killed_and_goes_on_gives_the_digests_of_a_folder() 
     bench.run(&["registry", "fsck"]).expect_code(0);
 }
 
-/// Sampled: nothing; two quickstarts with `STRIDE_LONG_TESTS=1`, of the optimised build that `TRAINER=path` names, if it does.
+/// Sampled: nothing; two quickstarts with `STRIDE_LONG_TESTS=1`. They use the optimised build that `TRAINER=path`
+/// names, if it is set.
 #[test]
 fn the_quickstart_on_a_bucket_gives_the_digests_of_a_folder() {
     if std::env::var_os("STRIDE_LONG_TESTS").is_none() {
@@ -84,7 +89,7 @@ fn what_is_wrong_with_a_bucket_is_said() {
     assert!(away.stderr.contains("that the server runs"), "{}", away.stderr);
 }
 
-/// The commands of `ops/README.md`, with a bucket, folders and a pipeline of ours in place of those that it names.
+/// The commands of `ops/README.md`, with our own bucket, folders and pipeline.
 #[test]
 fn the_commands_that_are_documented() {
     let bucket = Bucket::start();
@@ -123,7 +128,7 @@ fn the_commands_that_are_documented() {
         ran += 1;
     }
     assert_eq!(ran, 6, "each command, and no other");
-    // What came back from the backup is all that was there.
+    // The restored backup is complete.
     bench.run(&["registry", "fsck", "--store", "elsewhere"]).expect_code(0);
     let again =
         bench.run(&["run", &Bench::config("smoke.yaml"), "--until", "vae", "--store", "elsewhere", "-o", "json"]);
@@ -131,7 +136,7 @@ fn the_commands_that_are_documented() {
     assert!(states(&again).values().all(|state| matches!(state.as_str(), "cached" | "skipped")), "{again:#}");
 }
 
-/// Two folders and one bucket: only the one that was opened last may go on, until somebody says which it is.
+/// Two folders share one bucket. Only the one that was opened last may continue, until the user chooses one.
 #[test]
 fn a_copy_of_the_folder_does_not_share_the_bucket() {
     let bucket = Bucket::start();

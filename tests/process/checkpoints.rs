@@ -1,4 +1,5 @@
-//! Checkpoints that are large beside everything else: what they cost in memory, and what is left of an upload when the coordinator dies.
+//! Checkpoints that are large compared with everything else: their memory use, and interrupted uploads after the
+//! coordinator's death.
 
 use std::fs;
 use std::path::PathBuf;
@@ -14,7 +15,8 @@ fn config() -> PathBuf {
     Bench::repository().join("configs/smoke.yaml")
 }
 
-/// The VAE of the smoke pipeline in another size, in as few steps as show it: one, a checkpoint, and another.
+/// Settings of the smoke pipeline's VAE in another size, with the fewest steps that show the behaviour: one, a
+/// checkpoint, and another.
 fn large_vae(network: &str, workers: u8) -> Vec<String> {
     let sets = [
         format!("network={{width: {network}, heads: 4, dropout: 0.1}}"),
@@ -33,21 +35,22 @@ fn words(arguments: &[String]) -> Vec<&str> {
     arguments.iter().map(String::as_str).collect()
 }
 
-/// The most memory that a process has had resident, in bytes; `None` once it is gone.
+/// Peak resident memory of a process in bytes; `None` once it is gone.
 fn peak(pid: u32) -> Option<u64> {
     let status = fs::read_to_string(format!("/proc/{pid}/status")).ok()?;
     let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"))?;
     Some(line.trim().strip_suffix(" kB")?.parse::<u64>().expect("a number") << 10)
 }
 
-/// The length of the largest blob: a state.
+/// Size of the largest blob, which is a state.
 fn largest_blob(cluster: &Cluster) -> u64 {
     let shelves = fs::read_dir(cluster.bench().store().join("blobs/sha256")).expect("blobs").flatten();
     let blobs = shelves.flat_map(|shelf| fs::read_dir(shelf.path()).expect("a shelf").flatten());
     blobs.map(|blob| blob.metadata().expect("a blob").len()).max().expect("there are some")
 }
 
-/// What a worker said when it met its gang: whether it took over a peer's state, and its peak in bytes by then.
+/// Log of a worker's first meeting with its gang: true if it adopted a peer's state, and its peak memory in bytes by
+/// then.
 fn met(cluster: &Cluster, name: &str) -> Option<(bool, u64)> {
     let said = cluster.said(name);
     let line = said.lines().find(|line| line.contains("met the gang"))?;
@@ -55,8 +58,8 @@ fn met(cluster: &Cluster, name: &str) -> Option<(bool, u64)> {
     Some((line.contains("adopts=true"), mib * MIB))
 }
 
-/// A gang of two trains, saves and loses both its members in its last save; two others take over what it saved, publish it, and never
-/// train. `network` is the size of the VAE that this is about.
+/// A gang of two trains, saves and loses both its members in its last save. Two others take over the saved state,
+/// publish it, and never train. `network` is the size of the VAE.
 fn a_checkpoint_of(network: &str) {
     let mut cluster = Cluster::start(TRAINER);
     let idle = |cluster: &Cluster, name: &str| {
@@ -97,7 +100,7 @@ fn a_checkpoint_of(network: &str) {
         "rank 0 alone reads the checkpoint: {taken:?}"
     );
 
-    // Parameters, two moments and an average are saved; a network has its parameters besides.
+    // A checkpoint holds parameters, two moments and an average; the network holds its parameters once more.
     let (network, most) = (state / 4, 300 * MIB * state / (1600 * MIB));
     let over = |peak: u64, held: u64| peak.saturating_sub(held) / MIB;
     let served = peak(coordinator).expect("it runs");
@@ -124,7 +127,7 @@ fn a_checkpoint_of(network: &str) {
     cluster.fsck();
 }
 
-/// Sampled: a quarter of a gigabyte; 1.6 GB, and 300 MB beyond them, with `STRIDE_LONG_TESTS=1`.
+/// Sampled: a quarter of a gigabyte; with `STRIDE_LONG_TESTS=1`, 1.6 GB with a margin of 300 MB.
 #[test]
 fn a_checkpoint_is_in_memory_once() {
     a_checkpoint_of("512, layers: 3, feed_forward: 1024");
@@ -135,8 +138,8 @@ fn a_checkpoint_is_in_memory_once() {
     }
 }
 
-/// The coordinator is killed while a checkpoint arrives: when it is back the upload goes on from what had arrived, by the same worker in the
-/// same attempt.
+/// The coordinator is killed while a checkpoint arrives. After its restart, the same worker continues the upload in the
+/// same attempt from the bytes that had arrived.
 #[test]
 fn an_upload_goes_on_where_it_was_when_the_coordinator_was_killed() {
     let sets = large_vae("384, layers: 3, feed_forward: 512", 1);
@@ -151,7 +154,7 @@ fn an_upload_goes_on_where_it_was_when_the_coordinator_was_killed() {
     cluster.join("w1");
     let run = cluster.submit(&config(), &words(&sets));
     let staging = cluster.bench().store().join("staging");
-    // The state is by far the largest thing that is uploaded.
+    // The state is by far the largest upload.
     let arrived = || {
         let parts = fs::read_dir(&staging).ok()?.flatten();
         parts.filter_map(|part| Some(part.metadata().ok()?.len())).max()

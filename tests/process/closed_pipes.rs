@@ -1,4 +1,5 @@
-//! Readers that leave: `| head -3`, a closed terminal. Nothing hangs, nothing panics, and the exit code says what happened.
+//! Closed outputs, such as `| head -3` or a closed terminal. Commands neither hang nor panic, and the exit code reports
+//! the result.
 
 use std::io::{BufRead as _, BufReader, pipe};
 use std::process::{Child, ExitStatus, Stdio};
@@ -7,7 +8,7 @@ use cluster_tests::{Bench, wait_for};
 
 const TRAINER: &str = env!("CARGO_BIN_EXE_trainer");
 
-/// A command that does not outlive its test.
+/// A command that ends with its test.
 struct Ends(Child);
 
 impl Ends {
@@ -18,13 +19,13 @@ impl Ends {
 
 impl Drop for Ends {
     fn drop(&mut self) {
-        // It has ended, unless the test failed.
+        // Already ended, unless the test failed.
         let _ = self.0.kill();
         let _ = self.0.wait();
     }
 }
 
-/// Runs a command whose both outputs have lost their reader before it starts.
+/// Runs a command with both outputs closed before it starts.
 #[track_caller]
 fn unread(bench: &Bench, arguments: &[&str]) -> Option<i32> {
     let (reader, writer) = pipe().expect("a pipe");
@@ -38,7 +39,7 @@ fn unread(bench: &Bench, arguments: &[&str]) -> Option<i32> {
 fn a_command_that_nobody_reads_ends_with_its_code() {
     let bench = Bench::new(TRAINER);
     let config = Bench::config("smoke.yaml");
-    // The coordinator logs that the gate refuses, which is where a run whose reader had left stood for ever.
+    // The coordinator logs that the gate refuses. At this point a run with closed outputs once hung for ever.
     let run = ["run", &config, "--set", "release.promote.require=[\"latent_fid <= -1\"]"];
     let mut command = bench.command(&run);
     let mut child = Ends(command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("the trainer starts"));

@@ -1,18 +1,19 @@
-//! A coordinator and workers as processes of their own: what is promised when one of them stops, hangs or dies.
+//! A coordinator and workers as separate processes: the guarantees when one of them stops, hangs or dies.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 
-use cluster_tests::cluster::{Cluster, TOKEN, stage_of};
+use cluster_tests::cluster::{Cluster, TOKEN, WORKER_TOKEN, stage_of};
 use cluster_tests::network::{Network, SlowLine};
 use cluster_tests::{Bench, Running, digests, wait_for};
 use nix::sys::signal::Signal;
+use protocol::proof::{GRANT_HEADER, SECRET_HEADER};
 use serde_json::{Value, json};
 
 const TRAINER: &str = env!("CARGO_BIN_EXE_trainer");
-/// A stage that takes some seconds, and the one before it.
+/// A stage of several seconds, and the one before it.
 const VAE: [&str; 8] = [
     "--set",
     "stages.vae.steps=400",
@@ -30,7 +31,7 @@ fn config() -> PathBuf {
 
 type Curves = BTreeMap<String, Vec<(u64, f64)>>;
 
-/// The undisturbed run of one worker: digests and every recorded value.
+/// The undisturbed run of one worker: digests and all recorded values.
 fn reference() -> &'static (Value, Curves) {
     static REFERENCE: OnceLock<(Value, Curves)> = OnceLock::new();
     REFERENCE.get_or_init(|| undisturbed(&VAE))
@@ -45,7 +46,7 @@ fn undisturbed(sets: &[&str]) -> (Value, Curves) {
     (view, curves)
 }
 
-/// The same values at the same steps, each once, none missing; and the same digests.
+/// Checks that each value was recorded exactly once at the same step, and that the digests are equal.
 #[track_caller]
 fn equals_reference(cluster: &Cluster, run: &str, view: &Value) {
     equals(cluster, run, view, reference());
@@ -64,7 +65,7 @@ fn equals(cluster: &Cluster, run: &str, view: &Value, (expected, curves): &(Valu
     }
 }
 
-/// The coordinator is killed in the middle of a training stage of two workers and is away for `down`.
+/// Kills the coordinator in the middle of a training stage of two workers and restarts it after `down`.
 fn coordinator_away(down: Duration) {
     let mut cluster = Cluster::start(TRAINER);
     for name in ["w1", "w2"] {
@@ -102,7 +103,7 @@ fn coordinator_away(down: Duration) {
     cluster.fsck();
 }
 
-/// Sampled: one kill and a restart at once.
+/// Sampled: one kill and an immediate restart.
 #[test]
 fn p4_the_coordinator_is_killed_and_back_at_once() {
     coordinator_away(Duration::ZERO);
@@ -119,8 +120,8 @@ fn p4_the_coordinator_is_killed_and_away_for_a_while() {
     }
 }
 
-/// One of three workers is cut off from everybody for `how_long`, in the middle of a training stage. The others go on after its lease; it
-/// comes back by itself. With `sets` under which the stage outlasts the cut, it comes back into the gang.
+/// Cuts one of three workers off the network for `how_long`, in the middle of a training stage. The others continue
+/// after its lease, and it comes back by itself. If the stage outlasts the cut, because of `sets`, it rejoins the gang.
 fn network_cut(how_long: Duration, sets: &[&str], expected: &(Value, Curves), outlasts: bool) {
     let Some(network) = Network::new(3) else { return };
     let mut cluster = Cluster::listen(TRAINER, network.coordinator());
@@ -152,7 +153,7 @@ fn network_cut(how_long: Duration, sets: &[&str], expected: &(Value, Curves), ou
         (!is_in(&stage, "w3")).then_some(stage)
     });
     let noticed = cut.elapsed();
-    // Nothing is mended before they have gone on, however long that takes on a busy machine.
+    // The cut lasts until the others have continued, however long that takes on a busy machine.
     cluster.wait_step(&run, "vae", done(&without) + 10);
     let stepped = cut.elapsed();
     wait_for("the cut to be over", || (cut.elapsed() >= how_long).then_some(()));
@@ -199,7 +200,7 @@ fn network_cut(how_long: Duration, sets: &[&str], expected: &(Value, Curves), ou
     cluster.fsck();
 }
 
-/// Sampled: a cut just longer than the lease; 30 s, in a stage that is not over by then, with `STRIDE_LONG_TESTS=1`.
+/// Sampled: a cut just longer than the lease; with `STRIDE_LONG_TESTS=1`, 30 s in a stage that outlasts it.
 #[test]
 fn p4_a_worker_that_is_cut_off_is_gone_without_and_comes_back_by_itself() {
     network_cut(Duration::from_secs(19), &VAE, reference(), false);
@@ -207,7 +208,7 @@ fn p4_a_worker_that_is_cut_off_is_gone_without_and_comes_back_by_itself() {
         fixtures::skip("a network cut of 30 s (set STRIDE_LONG_TESTS=1)");
         return;
     }
-    // Long enough for a gang of three, whatever this machine does in a second.
+    // Enough steps for a gang of three on any machine.
     let seconds = stage_of(&reference().0, "vae")["wall_s"].as_f64().expect("a time");
     let steps = format!("stages.vae.steps={}", (400.0 / seconds * 90.0).clamp(800.0, 20_000.0).round());
     let mut sets = VAE;
@@ -215,25 +216,27 @@ fn p4_a_worker_that_is_cut_off_is_gone_without_and_comes_back_by_itself() {
     network_cut(Duration::from_secs(30), &sets, &undisturbed(&sets), true);
 }
 
-/// One worker, stopped past its lease in the middle of a training stage. Every kind of write is tried in its name, by the
-/// test and then by the worker itself.
+/// One worker is stopped past its lease in the middle of a training stage. The test tries every kind of write in its
+/// name, and then the worker itself does.
 #[test]
 fn p2_a_worker_that_slept_past_its_lease_writes_nothing() {
     let mut cluster = Cluster::start(TRAINER);
-    cluster.join("a");
+    let secret = "the-secret-of-worker-a-known-to-this-test";
+    cluster.join_by("a", &["env".to_owned(), format!("STRIDE_WORKER_SECRET={secret}")], &[]);
     let sets = [&VAE[..], &["--set", "stages.vae.workers={min: 1, max: 1}"]].concat();
     let run = cluster.submit(&config(), &sets);
     cluster.wait_step(&run, "vae", 20);
-    // What the worker holds, as it would be told itself.
+    // The worker's grant, as a poll returns it.
     let workers = cluster.get("/v1/workers").expect("the coordinator is there");
-    let orders = cluster
-        .post(
-            "/v1/workers/a/poll",
-            &json!({"incarnation": workers[0]["incarnation"], "doing": [], "ready": [], "version": 0}),
-        )
-        .expect("answered");
+    let post = |cluster: &Cluster, secret: &str, path: &str, body: &Value| {
+        let headers = [("content-type", "application/json"), (SECRET_HEADER, secret)];
+        cluster.call_as(WORKER_TOKEN, "POST", path, &headers, body.to_string().as_bytes()).expect("answered")
+    };
+    let poll = json!({"incarnation": workers[0]["incarnation"], "doing": [], "ready": [], "version": 0});
+    let orders = post(&cluster, secret, "/v1/workers/a/poll", &poll);
     let grant = orders.body["assignments"][0]["grant"].clone();
     assert_eq!(grant["worker"], "a", "{:?}", orders.body);
+    let secret = orders.body["assignments"][0]["secret"].as_str().expect("the grant's secret").to_owned();
     cluster.signal("a", Signal::SIGSTOP);
     let stopped = Instant::now();
     cluster.join("b");
@@ -247,7 +250,7 @@ fn p2_a_worker_that_slept_past_its_lease_writes_nothing() {
     assert_eq!(taken["attempt"], 2);
     cluster.wait_step(&run, "vae", 30);
 
-    // In the old grant's name, every kind of write there is.
+    // Try every kind of write under the old grant.
     let row = json!({"step": 7, "key": "forged", "value": 1.0});
     let manifest =
         stage_of(&cluster.view(&run), "dataset")["outputs"].as_object().expect("outputs").values().next().cloned();
@@ -266,15 +269,18 @@ fn p2_a_worker_that_slept_past_its_lease_writes_nothing() {
         ),
     ];
     for (path, body) in &writes {
-        let reply = cluster.post(path, body).expect("answered");
+        let reply = post(&cluster, &secret, path, body);
         assert_eq!((reply.status, reply.body["code"].as_str()), (409, Some("stale-fence")), "{path}: {:?}", reply.body);
+        let forged = post(&cluster, "", path, body);
+        assert_eq!((forged.status, forged.body["code"].as_str()), (403, Some("unproven")), "{path}: {:?}", forged.body);
     }
     let forged = format!("forged by {}", std::process::id());
     let reply = cluster
-        .call(
+        .call_as(
+            WORKER_TOKEN,
             "PUT",
             &format!("/v1/blobs/sha256:{}", "0".repeat(64)),
-            &[("x-stride-grant", &grant.to_string())],
+            &[(GRANT_HEADER, &grant.to_string()), (SECRET_HEADER, &secret)],
             forged.as_bytes(),
         )
         .expect("answered");
@@ -315,7 +321,7 @@ fn p9_values_are_stored_once_though_rank_0_is_killed() {
     equals_reference(&cluster, &run, &view);
 }
 
-/// Sampled: the lines of a training stage of two workers, one of which is killed.
+/// Sampled: the lines of a training stage of two workers; one of them is killed.
 #[test]
 fn p13_lines_are_kept_in_order_though_their_worker_is_killed() {
     let mut cluster = Cluster::start(TRAINER);
@@ -339,8 +345,8 @@ fn p13_lines_are_kept_in_order_though_their_worker_is_killed() {
     );
 }
 
-/// Sampled: a training stage of two workers is paused (and the coordinator killed right after it said yes), taken up and
-/// cancelled; SIGTERM to a worker that trains alone.
+/// Sampled: a training stage of two workers is paused, resumed and cancelled; the coordinator is killed right after it
+/// acknowledged the pause. Also SIGTERM to a worker that trains alone.
 #[test]
 fn p14_pause_resume_cancel_and_sigterm_end_with_saved_work() {
     let mut cluster = Cluster::start(TRAINER);
@@ -370,11 +376,11 @@ fn p14_pause_resume_cancel_and_sigterm_end_with_saved_work() {
     cluster.wait_step(&run, "vae", 61);
     assert!(at(&cluster) >= 60, "from the checkpoint, not from nothing");
 
-    // One leaves in good order: exit 0, at once; the other goes on with what it had.
+    // One worker leaves in good order with exit code 0; the other continues with its state.
     cluster.signal("w2", Signal::SIGTERM);
     assert_eq!(cluster.ended("w2"), Some(0));
     let before = at(&cluster);
-    // The last one leaves: it saves, and the next one to come goes on.
+    // The last worker leaves after saving, and its successor continues.
     cluster.signal("w1", Signal::SIGTERM);
     assert_eq!(cluster.ended("w1"), Some(0));
     cluster.join("w3");
@@ -395,8 +401,8 @@ fn p14_pause_resume_cancel_and_sigterm_end_with_saved_work() {
     assert_eq!(cluster.wait_end(&second)["state"], "cancelled");
 }
 
-/// 12 kills, at the third to eighth commit of a coordinator and on both sides of it, under clients that submit without a
-/// pause. A client that was not answered asks again with the same key.
+/// 12 kills, at the third to eighth commit of a coordinator, before and after it, while clients submit without a pause.
+/// A client without an answer retries with the same key.
 #[test]
 fn p1_what_a_submission_was_answered_survives_and_counts_once() {
     let bench = Bench::new(TRAINER).with_token(TOKEN);
@@ -423,7 +429,7 @@ fn p1_what_a_submission_was_answered_survives_and_counts_once() {
                     assert!(before.is_none_or(|before| before == run), "one key gave two runs");
                     (next, answered) = (next + 1, answered + 1);
                 }
-                // Not there yet, or not any more.
+                // The coordinator is not running yet, or not any more.
                 Some(6) => {}
                 code => panic!("exit code {code:?}: {}", said.stderr),
             }
@@ -436,7 +442,7 @@ fn p1_what_a_submission_was_answered_survives_and_counts_once() {
     for run in known.values() {
         assert_eq!(stored.iter().filter(|stored| *stored == run).count(), 1, "{run} in {stored:?}");
     }
-    // What nobody was told may be stored once: the one whose answer the last kill cut off.
+    // One more run may be stored: the one whose answer the last kill cut off.
     assert!(stored.len() <= known.len() + 1, "{} keys gave {} runs", known.len(), stored.len());
     assert!(known.len() >= 12, "{known:?}");
 }
@@ -461,7 +467,8 @@ fn p16_of_16_first_starts_one_has_the_store_and_15_say_who() {
     bench.run(&["registry", "fsck"]).expect_code(0);
 }
 
-/// A learning rate under which the loss is no number after some steps: said once, with the step, and not tried again.
+/// A learning rate under which the loss becomes infinite or NaN after some steps. The failure is reported once, with
+/// the step, and not retried.
 #[test]
 fn p15_a_loss_that_is_no_number_is_final() {
     let bench = Bench::new(TRAINER);
@@ -478,13 +485,13 @@ fn p15_a_loss_that_is_no_number_is_final() {
     assert_eq!(begins, 1, "tried once:\n{begun}");
 }
 
-/// What makes a worker die the `nth` time it gets to a fail point.
+/// Environment in which a worker dies at the `nth` hit of a fail point.
 fn dies_at(point: &str, nth: u32) -> [String; 2] {
     ["env".to_owned(), format!("STRIDE_WORKER_FAILPOINT={point}@{nth}")]
 }
 
-/// Sampled: a stage of two workers that saves nothing before its end. Rank 0 dies when it commits the last step, and, in another run,
-/// before it reports the end. The other worker still has the state.
+/// Sampled: a stage of two workers that saves only at its end. Rank 0 dies when it commits the last step, and, in
+/// another run, before it reports the end. The other worker still has the state.
 #[test]
 fn p4_rank_0_dies_in_its_last_save_and_no_step_is_computed_again() {
     let sets = [
@@ -500,11 +507,11 @@ fn p4_rank_0_dies_in_its_last_save_and_no_step_is_computed_again() {
     let expected = undisturbed(&sets);
     for point in ["checkpoint::before_commit", "outcome::before_report"] {
         let mut cluster = Cluster::start(TRAINER);
-        // It makes the dataset first, and reports that.
+        // Its first report is that of the dataset.
         let nth = if point.starts_with("outcome") { 2 } else { 1 };
         cluster.join_by("w1", &dies_at(point, nth), &[]);
         let run = cluster.submit(&config(), &sets);
-        // Its own word: what it has done is seen at the coordinator only every now and then.
+        // Check the worker's own log, because the coordinator learns of progress only now and then.
         wait_for("the first worker to train", || cluster.said("w1").contains("met the gang").then_some(()));
         cluster.join("w2");
         wait_for("the second worker to take over the state", || {
@@ -524,7 +531,7 @@ fn p4_rank_0_dies_in_its_last_save_and_no_step_is_computed_again() {
     }
 }
 
-/// Sampled: a worker that trains alone, and cannot save because the coordinator is dead.
+/// Sampled: a worker that trains alone and cannot save because the coordinator is dead.
 #[test]
 fn a_worker_leaves_in_time_though_the_coordinator_is_gone() {
     let mut cluster = Cluster::start(TRAINER);
@@ -538,7 +545,7 @@ fn a_worker_leaves_in_time_though_the_coordinator_is_gone() {
     let took = asked.elapsed();
     eprintln!("a worker without a coordinator left after {took:.1?}");
     assert!(took < Duration::from_secs(10), "it took {took:?}");
-    // What was acknowledged is there.
+    // Acknowledged work is stored.
     cluster.serve();
     cluster.join("w2");
     let view = cluster.wait_end(&run);
@@ -546,8 +553,8 @@ fn a_worker_leaves_in_time_though_the_coordinator_is_gone() {
     equals_reference(&cluster, &run, &view);
 }
 
-/// Sampled: a worker whose downloads come at 8 kB a second joins while another trains alone. It becomes a member once it has what it
-/// needs, and until then nobody waits for it.
+/// Sampled: a worker with downloads at 8 kB a second joins while another trains alone. It becomes a member once it has
+/// its inputs, and until then it delays no other worker.
 #[test]
 fn p4_a_slow_joiner_holds_nobody_up() {
     let sets = [
@@ -581,6 +588,61 @@ fn p4_a_slow_joiner_holds_nobody_up() {
         assert!(cluster.stage(&run, "vae")["state"] == "running", "the stage was over too early to tell");
         cluster.said("w2").contains("adopts=true").then_some(())
     });
+    let view = cluster.wait_end(&run);
+    assert_eq!(stage_of(&view, "vae")["attempt"], 1);
+    cluster.fsck();
+}
+
+/// Sampled: a worker whose peer port refuses connections trains alone, without a checkpoint. Another one joins the
+/// cluster, and the first keeps its steps and its rate.
+#[test]
+fn p20_a_worker_that_refuses_its_peers_keeps_its_steps_and_its_rate() {
+    let sets = [
+        "--set",
+        "stages.vae.steps=1500",
+        "--set",
+        "stages.vae.windows.until=1",
+        "--set",
+        "stages.vae.checkpoint.every=0",
+        "--until",
+        "vae",
+    ];
+    let mut cluster = Cluster::start(TRAINER);
+    // It listens on the other address family only.
+    let port = Cluster::free_address().port();
+    cluster.join_by("w1", &[], &["--peer-address", &format!("[::1]:{port}")]);
+    let run = cluster.submit(&config(), &sets);
+    let at = |cluster: &Cluster| {
+        let stage = cluster.stage(&run, "vae");
+        (stage["progress"]["done"].as_u64().unwrap_or_default(), stage["attempt"].clone(), stage["workers"].clone())
+    };
+    // Steps per period; the count never decreases.
+    let rate = |cluster: &Cluster, seconds: u64| {
+        let (begun, first) = (Instant::now(), at(cluster).0);
+        let mut last = first;
+        while begun.elapsed() < Duration::from_secs(seconds) {
+            let (done, attempt, _) = at(cluster);
+            assert!(
+                done >= last && attempt == 1,
+                "step {last} became {done} in attempt {attempt}\n{}",
+                cluster.everything()
+            );
+            last = done;
+            std::thread::sleep(Duration::from_millis(100));
+        }
+        (last - first) as f64 / begun.elapsed().as_secs_f64()
+    };
+    cluster.wait_step(&run, "vae", 50);
+    let alone = rate(&cluster, 8);
+    cluster.join("w2");
+    wait_for("the second worker to be there", || {
+        let workers = cluster.get("/v1/workers")?;
+        workers.as_array()?.iter().any(|worker| worker["worker"] == "w2").then_some(())
+    });
+    let beside = rate(&cluster, 15);
+    eprintln!("{alone:.1} steps a second alone, {beside:.1} beside a worker that cannot reach it");
+    assert!(beside >= 0.8 * alone, "{beside:.1} steps a second, {alone:.1} alone\n{}", cluster.everything());
+    assert_eq!(at(&cluster).2, json!(["w1"]));
     let view = cluster.wait_end(&run);
     assert_eq!(stage_of(&view, "vae")["attempt"], 1);
     cluster.fsck();

@@ -1,4 +1,4 @@
-//! A blob that is damaged while a run goes on.
+//! A blob that is damaged during a run.
 
 use std::fs;
 
@@ -9,7 +9,8 @@ use serde_json::Value;
 
 const TRAINER: &str = env!("CARGO_BIN_EXE_trainer");
 
-/// What reads it says so and waits, what gave it is computed again with the same bytes, and the run goes on.
+/// The stage that reads it reports the damage and waits. The stage that produced it is computed again with the same
+/// bytes, and the run continues.
 #[test]
 fn what_a_stage_reads_is_made_again_within_the_run() {
     let until = ["--until", "lcm"];

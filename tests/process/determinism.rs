@@ -1,4 +1,4 @@
-//! Promises 1 and 4: a stage's value hangs neither on the number of workers nor on who died when.
+//! Promises 1 and 4: a stage's result depends neither on the number of workers nor on deaths of workers.
 
 use std::sync::OnceLock;
 
@@ -8,7 +8,7 @@ use serde_json::Value;
 
 const TRAINER: &str = env!("CARGO_BIN_EXE_trainer");
 const CONFIG: &str = "smoke.yaml";
-/// Long enough that a kill lands inside each training stage.
+/// Long enough that a kill hits the middle of each training stage.
 const LONGER: [&str; 8] = [
     "--set",
     "stages.vae.steps=300",
@@ -22,7 +22,7 @@ const LONGER: [&str; 8] = [
 /// The stages that train, in order.
 const TRAINING: [&str; 4] = ["vae", "mld", "lcm", "pcm"];
 
-/// The undisturbed run of one worker that all others are compared with.
+/// The undisturbed run of one worker, with which all others are compared.
 fn reference() -> &'static Value {
     static REFERENCE: OnceLock<Value> = OnceLock::new();
     REFERENCE.get_or_init(|| longer(&Bench::new(TRAINER), "1"))
@@ -37,7 +37,7 @@ fn start(bench: &Bench, workers: &str) -> Running {
     bench.spawn(&[&["run", &config, "-o", "json", "--workers", workers][..], &LONGER[..]].concat())
 }
 
-/// Waits until a worker has begun `stage`, which its log says at once.
+/// Waits until a worker has begun `stage`, which its log shows at once.
 pub(crate) fn begins(bench: &Bench, stage: &str) {
     let begun = format!("/{stage} attempt=");
     wait_for(&format!("stage {stage} to begin"), || {
@@ -66,7 +66,8 @@ fn p12_a_second_run_is_cached_and_fast() {
         assert_eq!(state, "cached", "stage {stage}");
     }
     assert_eq!(digests(&report), digests(&first));
-    // The promise is 2 s for a release build on an idle machine; an unoptimised one beside other tests gets five times that.
+    // The promise is 2 s for a release build on an idle machine; an unoptimised one beside other tests gets five times
+    // that.
     assert!(again.took.as_secs_f64() < 10.0, "a cached run took {:?}", again.took);
 }
 

@@ -1,5 +1,5 @@
-//! README's cluster and the units of `ops/`, run as they stand: with a folder of ours in place of the machine's root, this
-//! machine in place of `coordinator`, a free port, and a smaller pipeline.
+//! Runs README's cluster and the units of `ops/` unchanged except for a few replacements: our own folder for the
+//! machine's root, this machine for `coordinator`, a free port, and a smaller pipeline.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -7,12 +7,13 @@ use std::net::TcpListener;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
-use cluster_tests::documented::{shell_lines, words};
+use cluster_tests::documented::{self, shell_lines, words};
 use cluster_tests::{Bench, PATIENCE, Running, wait_for};
 
 const TRAINER: &str = env!("CARGO_BIN_EXE_trainer");
 
-/// `registry`, which is built beside the trainer; `trainer registry`, which is the same, where it is not.
+/// Creates a folder with `trainer` and `registry`. If `registry` is not built beside the trainer, it runs the
+/// equivalent `trainer registry`.
 fn programs(dir: &Path) -> PathBuf {
     let bin = dir.join("bin");
     fs::create_dir_all(&bin).expect("a folder");
@@ -33,7 +34,7 @@ fn free_port() -> String {
     listener.local_addr().expect("bound").port().to_string()
 }
 
-/// The commands of README's "More machines", with what differs here replaced.
+/// The commands of README's "More machines", with the replacements of this test.
 fn readme(port: &str) -> Vec<String> {
     let lines =
         shell_lines(&Bench::repository().join("README.md"), Some("<!-- run by tests/process/documented.rs -->"));
@@ -103,7 +104,7 @@ fn the_cluster_of_the_readme() {
     assert!(dir.join("model/manifest.json").exists(), "the client has the files");
 }
 
-/// A unit's keys, each with its last value.
+/// The keys of a unit, each with its last value.
 fn unit(name: &str) -> (String, BTreeMap<String, String>) {
     let text = fs::read_to_string(Bench::repository().join("ops").join(name)).expect("a unit");
     let pairs = text.lines().filter(|line| !line.starts_with('#')).filter_map(|line| line.split_once('='));
@@ -119,13 +120,13 @@ fn the_units_of_systemd() {
     let bench = Bench::new(TRAINER);
     let dir = bench.path();
     let root = dir.join("root");
-    for folder in ["etc/stride", "var/lib/stride", "usr/local"] {
+    for folder in ["etc/stride", "var/lib/stride", "var/cache", "srv/data", "usr/local"] {
         fs::create_dir_all(root.join(folder)).expect("a folder");
     }
     let bin = programs(dir);
     std::os::unix::fs::symlink(bin, root.join("usr/local/bin")).expect("a link");
     let port = free_port();
-    // Tokens and certificate as README makes them, at the places where the units look.
+    // Create tokens and certificate as in README, at the paths that the units use.
     for line in readme(&port).iter().take_while(|line| !line.starts_with("trainer")) {
         let etc = root.join("etc/stride");
         let mut command = bash(dir, "umask 077", line);
@@ -137,10 +138,10 @@ fn the_units_of_systemd() {
     }
     let here = |text: &str| {
         let mut text = text.replace("coordinator", "localhost").replace("7700", &port);
-        for folder in ["/usr/local/bin/", "/var/lib/stride", "/etc/stride"] {
+        for folder in ["/usr/local/bin/", "/var/lib/stride", "/srv/data", "/etc/stride"] {
             text = text.replace(folder, &format!("{}{folder}", root.display()));
         }
-        text.replace("%H-%i", "here-1")
+        text.replace("%H-%i", "here-1").replace("%C/stride-%i", &root.join("var/cache").display().to_string())
     };
     let start = |line: &str, environment: &BTreeMap<String, String>, log: &str| {
         let words = words(&here(line));
@@ -159,13 +160,13 @@ fn the_units_of_systemd() {
 
     let (text, worker) = unit("stride-worker@.service");
     assert_eq!(worker["EnvironmentFile"], "/etc/stride/worker.env");
-    // The file that the unit's own comment shows.
+    // The environment file in the unit's own comment.
     let shown = text.lines().filter_map(|line| line.strip_prefix("#   ")).filter_map(|line| line.split_once('='));
     let environment: BTreeMap<String, String> = shown
         .map(|(name, value)| (name.to_owned(), here(value)))
         .filter(|(name, _)| name.starts_with("STRIDE_"))
         .collect();
-    assert_eq!(environment.len(), 3, "{environment:?}");
+    assert_eq!(environment.len(), 4, "{environment:?}");
     let mut join = start(&worker["ExecStart"], &environment, "worker.log");
 
     let url = format!("https://localhost:{port}");
@@ -181,7 +182,7 @@ fn the_units_of_systemd() {
     assert!(ask(&["status"]).expect_code(0).stdout.contains("vae"));
     ask(&["registry", "list"]).expect_code(0);
 
-    // What the wrong caller hears.
+    // Errors for callers with a wrong token, no token or no certificate.
     let nodes = etc("nodes.token");
     let said = bench.run(&["registry", "list", "--server", &url, "--token-file", &nodes, "--ca", &ca]).expect_code(5);
     assert!(said.stderr.contains("`nodes` may worker"), "{}", said.stderr);
@@ -225,7 +226,7 @@ fn the_container_file_builds_what_there_is() {
     let bench = Bench::new(TRAINER);
     bench.run(&arguments.iter().map(String::as_str).collect::<Vec<_>>()).expect_code(0);
 
-    // What the comments say to run in the image parses: `plan` in place of `run`, and nothing is bound for `serve`.
+    // The commands in the comments parse: `plan` replaces `run`, and `serve` binds no port.
     let inside = |comment: &str| {
         let line = text.lines().find(|line| line.contains(comment)).expect("a comment with a command");
         words(line.split_once(" stride ").expect("the image's name").1)
@@ -238,4 +239,83 @@ fn the_container_file_builds_what_there_is() {
     let serve: Vec<&str> = serve.iter().map(String::as_str).collect();
     let said = bench.run(&serve).expect_code(2);
     assert!(said.stderr.contains("/etc/stride/tokens"), "it wants the file that the comment mounts: {}", said.stderr);
+}
+
+/// Plans every pipeline in the documents, and every shipped one.
+#[test]
+fn every_pipeline_of_the_documents_and_of_configs_can_be_planned() {
+    let root = Bench::repository();
+    let bench = Bench::new(TRAINER);
+    let mut planned = 0;
+    let mut plan = |place: &str, path: &Path| {
+        let path = path.display().to_string();
+        let said = bench.run(&["plan", "--no-time", &path]);
+        assert!(said.code == Some(0), "{place}: {}", said.stderr);
+        planned += 1;
+    };
+    for document in documented::all(&root) {
+        for (line, text) in documented::pipelines(&document) {
+            let path = bench.path().join("shown.yaml");
+            fs::write(&path, text).expect("written");
+            plan(&format!("{}:{line}", document.display()), &path);
+        }
+    }
+    for folder in ["configs", "docs/results"] {
+        for entry in fs::read_dir(root.join(folder)).expect("a folder") {
+            let path = entry.expect("an entry").path();
+            if path.extension().is_some_and(|extension| extension == "yaml") {
+                plan(&path.display().to_string(), &path);
+            }
+        }
+    }
+    assert!(planned >= 30, "only {planned} pipelines were found");
+}
+
+#[test]
+fn a_version_says_what_was_built_and_under_which_licence() {
+    let bench = Bench::new(TRAINER);
+    let said = bench.run(&["--version"]).expect_code(0).stdout;
+    let line = said.lines().next().expect("a line");
+    assert!(line.starts_with(&format!("trainer {} (", env!("CARGO_PKG_VERSION"))), "{line}");
+    assert!(line.contains("debug build;") || line.contains("commit "), "{line}");
+    assert!(line.contains("features: ") && line.contains("flex"), "{line}");
+    assert!(line.contains("licence: MIT OR Apache-2.0"), "{line}");
+    let root = Bench::repository();
+    let readme = fs::read_to_string(root.join("README.md")).expect("a README");
+    for (name, words) in [("LICENSE-MIT", "Permission is hereby granted"), ("LICENSE-APACHE", "Apache License")] {
+        let text = fs::read_to_string(root.join(name)).expect("a licence");
+        assert!(text.contains(words) && readme.contains(&format!("]({name})")), "{name}");
+    }
+}
+
+/// Runs the examples of `--help` that need no model, and checks their output.
+#[test]
+fn a_shell_and_a_manual_get_what_they_read() {
+    let bench = Bench::new(TRAINER);
+    for (shell, part) in [("bash", "complete -F"), ("zsh", "#compdef trainer"), ("fish", "complete -c trainer")] {
+        let script = bench.run(&["completions", shell]).expect_code(0).stdout;
+        assert!(script.contains(part) && script.contains("generate"), "{shell}: {} bytes", script.len());
+    }
+    bench.run(&["man", "pages"]).expect_code(0);
+    for page in ["trainer.1", "trainer-run.1", "trainer-worker-join.1"] {
+        let text = fs::read_to_string(bench.path().join("pages").join(page)).expect("a page");
+        assert!(text.contains(".TH"), "{page}");
+    }
+}
+
+#[test]
+fn a_doctor_says_what_is_missing_and_what_to_do() {
+    let bench = Bench::new(TRAINER);
+    let said = bench.run(&["doctor"]).expect_code(0).stdout;
+    assert!(said.contains("warn  store    there is none in `.stride`; `trainer run PIPELINE` makes one"), "{said}");
+    assert!(said.contains("ok    device   `flex`") && said.contains("  disk  "), "{said}");
+    bench.run(&["run", &Bench::config("smoke.yaml"), "--until", "dataset", "--workers", "1"]).expect_code(0);
+    let said = bench.run(&["doctor", "-o", "json"]).expect_code(0).json();
+    let findings = said["findings"].as_array().expect("findings");
+    let store = findings.iter().find(|finding| finding["what"] == "store").expect("the store");
+    assert_eq!((&store["state"], &store["hint"]), (&"ok".into(), &serde_json::Value::Null));
+    let said = bench.run(&["doctor", "--server", "http://127.0.0.1:1"]).expect_code(1).stdout;
+    let line = said.lines().find(|line| line.contains("server")).expect("the server");
+    assert!(line.starts_with("FAIL") && line.contains("trainer serve"), "{line}");
+    assert!(bench.path().read_dir().expect("a folder").count() == 1, "it writes nothing but what the run wrote");
 }

@@ -1,4 +1,5 @@
-//! A text encoder by its name on the hub, where there is no network: found in the hub's cache, or refused before anything runs with what to do.
+//! A text encoder by its hub id, without a network. It is found in the hub's cache, or refused with advice before
+//! anything runs.
 
 use std::fs;
 use std::path::Path;
@@ -16,7 +17,7 @@ fn pipeline(bench: &Bench, more: &str) {
     fs::write(bench.path().join("p.yaml"), text).expect("a file of ours");
 }
 
-/// What `huggingface_hub` leaves of a small CLIP.
+/// Creates the cache that `huggingface_hub` would keep for a small CLIP.
 fn fill_cache(home: &Path) {
     let root = home.join("hub/models--tiny--clip");
     for (name, bytes) in encoder_folder(false) {
@@ -47,7 +48,7 @@ fn an_encoder_of_the_hub_without_a_network() {
     let run = || bench.run(&["run", "p.yaml", "-o", "json"]).expect_code(0).json();
     assert_eq!(states(&run())["words"], "ran");
     assert_eq!(states(&run())["words"], "cached");
-    // The same content by its commit is the same encoder.
+    // The same content under its commit is the same encoder.
     pipeline(&bench, &format!(", revision: {COMMIT}"));
     assert_eq!(states(&run())["words"], "cached");
     pipeline(&bench, ", revision: v2");
@@ -60,7 +61,7 @@ fn an_encoder_of_the_hub_without_a_network() {
     fs::write(merges, "#version: 0.2\na b</w>\n\n").expect("a file of ours");
     assert_eq!(states(&run())["words"], "ran");
 
-    // A folder of that name comes first, and has no revision.
+    // A folder of that name takes precedence, and has no revision.
     fs::create_dir_all(bench.path().join("tiny/clip")).expect("a folder of ours");
     let refused = bench.run(&["run", "p.yaml"]).expect_code(2);
     assert!(refused.stderr.contains("tiny/clip: no `config.json`"), "{}", refused.stderr);

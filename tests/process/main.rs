@@ -1,4 +1,5 @@
-//! Real trainers, really killed. Each promise of the design that a process can break is broken here on purpose.
+//! Tests with real trainer processes that are really killed. Each promise of the design that a process can break is
+//! broken here on purpose.
 //!
 //! The pipeline is `configs/smoke.yaml`: every stage kind of the quickstart at toy sizes.
 
@@ -13,6 +14,7 @@ mod damage;
 mod determinism;
 mod documented;
 mod failpoints;
+mod files;
 mod hub;
 mod kinds;
 mod memory;
@@ -22,6 +24,7 @@ mod reading;
 mod registry;
 mod released;
 mod results;
+mod running;
 mod storage;
 mod streaming;
 mod sweeps;

@@ -1,4 +1,4 @@
-//! What workers need of memory: datasets are shared, and running out of it is said once and not tried again.
+//! Memory of workers: datasets are shared, and running out of memory is reported once and not retried.
 
 use std::fs;
 use std::os::unix::process::CommandExt;
@@ -13,7 +13,7 @@ use serde_json::Value;
 
 const TRAINER: &str = env!("CARGO_BIN_EXE_trainer");
 
-/// The smoke pipeline's VAE at another width, by a command inside `wrap`.
+/// Runs the smoke pipeline's VAE at another width, by a command inside `wrap`.
 fn run(bench: &Bench, width: u32, wrap: &[&str]) -> Said {
     let width = format!("stages.vae.network.width={width}");
     let config = Bench::config("smoke.yaml");
@@ -24,7 +24,7 @@ fn run(bench: &Bench, width: u32, wrap: &[&str]) -> Said {
     Running::start(command).wait()
 }
 
-/// Failed for good, for this reason, after one try.
+/// Checks that the stage failed for good, for this reason, after one try.
 fn check(bench: &Bench, said: Said, reason: &str) {
     let said = said.expect_code(1);
     let report: Value = serde_json::from_str(&said.stdout).unwrap_or_else(|e| panic!("{e}: {}", said.stdout));
@@ -36,7 +36,7 @@ fn check(bench: &Bench, said: Said, reason: &str) {
     assert_eq!(begins, 1, "tried once:\n{log}");
 }
 
-/// An allocation that is refused aborts the worker.
+/// A refused allocation aborts the worker.
 #[test]
 fn p15_a_worker_whose_allocation_is_refused_is_final() {
     if Command::new("prlimit").arg("--version").output().is_err() {
@@ -44,19 +44,19 @@ fn p15_a_worker_whose_allocation_is_refused_is_final() {
         return;
     }
     let bench = Bench::new(TRAINER);
-    // More than anything else here needs, and less than the 7 GB of all weights, the first of which has 1.8.
+    // More than everything else here needs, and less than the 7 GB of all weights; the first weights have 1.8 GB.
     let said = run(&bench, 12_288, &["prlimit", "--as=4294967296"]);
     check(&bench, said, "was refused");
 }
 
-/// A control group for memory; its processes are those of the command that it wraps.
+/// A control group with a memory limit for the processes of a wrapped command.
 struct Group(PathBuf);
 
 impl Group {
-    /// `None`, loudly, where groups cannot be made.
+    /// Creates a group. Skips the test where groups cannot be created.
     fn new(bytes: u64) -> Option<Self> {
         let name = format!("stride-{}", std::process::id());
-        // Of the first version the second bound is that of memory and swap together, of the second that of swap alone.
+        // In cgroup v1 the second limit covers memory and swap together, in v2 only swap.
         let limits = [
             ("/sys/fs/cgroup/memory", "memory.limit_in_bytes", "memory.memsw.limit_in_bytes", bytes),
             ("/sys/fs/cgroup", "memory.max", "memory.swap.max", 0),
@@ -68,7 +68,7 @@ impl Group {
             }
             let group = Self(group);
             if fs::write(group.0.join(limit), bytes.to_string()).is_ok() {
-                // Not there where the kernel does not count swap.
+                // Missing if the kernel does not account for swap.
                 let _ = fs::write(group.0.join(with_swap), swapped.to_string());
                 return Some(group);
             }
@@ -80,7 +80,7 @@ impl Group {
 
 impl Drop for Group {
     fn drop(&mut self) {
-        // Its processes have ended; if not, it stays, and that is all.
+        // Fails if a process still runs; the group then merely stays.
         let _ = fs::remove_dir(&self.0);
     }
 }
@@ -92,7 +92,7 @@ fn p15_a_worker_that_the_kernel_kills_for_want_of_memory_is_final() {
     let enter = format!("echo $$ > {}/cgroup.procs && exec \"$@\"", group.0.display());
     for _ in 0..4 {
         let bench = Bench::new(TRAINER);
-        // The first weights have .8 GB.
+        // The first weights have 0.8 GB.
         let said = run(&bench, 8_192, &["sh", "-c", &enter, "sh"]);
         if said.code.is_some() {
             return check(&bench, said, "the kernel killed it");
@@ -102,7 +102,7 @@ fn p15_a_worker_that_the_kernel_kills_for_want_of_memory_is_final() {
     panic!("the kernel took the command each time");
 }
 
-/// Kilobytes that a process holds of its own, and those of the store's blobs that it has mapped.
+/// Kilobytes of a process's own memory, and of the store's blobs that it has mapped.
 fn memory(pid: u32) -> Option<(u64, u64)> {
     let status = fs::read_to_string(format!("/proc/{pid}/status")).ok()?;
     let own = status.lines().find(|line| line.starts_with("RssAnon:"))?.split_whitespace().nth(1)?.parse().ok()?;
@@ -115,8 +115,8 @@ fn memory(pid: u32) -> Option<(u64, u64)> {
     Some((own, bytes.sum::<u64>() >> 10))
 }
 
-/// A machine holds a dataset once, however many workers train on it. Sampled: three workers and about 50 MB of clips; sixteen and 4 GB,
-/// which is HumanML3D, with `STRIDE_LONG_TESTS=1`.
+/// A machine holds a dataset once, for any number of workers. Sampled: three workers and about 50 MB of clips; with
+/// `STRIDE_LONG_TESTS=1`, sixteen workers and 4 GB, the size of HumanML3D.
 #[test]
 fn p15_workers_of_a_machine_share_a_dataset() {
     let is_long = std::env::var_os("STRIDE_LONG_TESTS").is_some();

@@ -1,4 +1,5 @@
-//! README's "Your own mocap" as it stands, on the folder that it makes, with fewer updates: features, a training, a one-step student, and what it draws as GLB.
+//! README's "Your own mocap" unchanged except for fewer updates, on the folder that it creates: features, a training, a
+//! one-step student, and its motion as GLB.
 
 use std::fs;
 use std::path::Path;
@@ -8,7 +9,7 @@ use cluster_tests::documented::{shell_lines, words};
 
 const TRAINER: &str = env!("CARGO_BIN_EXE_trainer");
 
-/// A few updates in the place of a few hundred.
+/// A few updates instead of a few hundred.
 const FEWER: [&str; 6] = [
     "stages.vae.steps=6",
     "stages.vae.warmup=2",

@@ -1,16 +1,16 @@
-//! What `generate`, `export` and `gallery` write, on a store with the models of the smoke pipeline.
+//! Output of `generate`, `export` and `gallery`, on a store with the models of the smoke pipeline.
 
 use std::fs::{self, File};
 
 use cluster_tests::{Bench, Running, Said};
 use serde_json::Value;
 
-/// Lines of JSON.
+/// Parses lines of JSON.
 fn lines(said: &Said) -> Vec<Value> {
     said.stdout.lines().map(|line| serde_json::from_str(line).unwrap_or_else(|e| panic!("{line}: {e}"))).collect()
 }
 
-/// One value of every line.
+/// Returns one value of every line.
 fn column<'a>(lines: &'a [Value], key: &str) -> Vec<&'a Value> {
     lines.iter().map(|line| &line[key]).collect()
 }
@@ -34,7 +34,7 @@ pub(crate) fn are_written(bench: &Bench) {
     let page = fs::read_to_string(at("m.html")).expect("the page");
     assert_eq!((page.matches("<figure>").count(), page.matches("走路").count()), (6, 1));
 
-    // Through a pipe, and for people.
+    // Through a pipe, with the report as text.
     let mut piped = bench.command(&["generate", "--captions", "-", "--model", "smoke@staging", "-o", "p.npy"]);
     piped.stdin(File::open(at("lines.jsonl")).expect("the file"));
     let said = Running::start(piped).wait().expect_code(0);
@@ -42,11 +42,25 @@ pub(crate) fn are_written(bench: &Bench) {
     let empty = bench.run(&[&["generate", "", "-o", "e.npy"][..], &model].concat()).expect_code(0);
     assert!(empty.stderr.contains("the sentence is empty"), "{}", empty.stderr);
 
-    // Another form, and back.
+    // Words that the training data lacks.
+    let unknown =
+        bench.run(&["generate", "quantum flapdoodle", "--model", "smoke@staging", "-o", "u.npy", "-o", "json"]);
+    let row = unknown.json();
+    assert_eq!((&row["known"], &row["unknown_words"]), (&false.into(), &serde_json::json!(["quantum", "flapdoodle"])));
+    for part in ["never saw `quantum`, `flapdoodle`", "nearest known: \""] {
+        assert!(unknown.stderr.contains(part), "{}", unknown.stderr);
+    }
+    let partly = bench.run(&["generate", "a flapdoodle", "--stage", "mld", "-o", "u.npy", "-o", "json"]).json();
+    assert_eq!((&partly["known"], &partly["unknown_words"]), (&true.into(), &serde_json::json!(["flapdoodle"])));
+    let far =
+        bench.run(&["generate", "a", "--model", "smoke@staging", "--guidance", "40", "-o", "u.npy"]).expect_code(0);
+    assert!(far.stderr.contains("was trained for guidance 0.5 to 5; at 40"), "{}", far.stderr);
+
+    // Convert to other formats and back.
     let said = bench.run(&["export", "p-01.npy", "-o", "x.bvh", "-o", "x.glb", "-o", "json"]).expect_code(0);
     let off = lines(&said)[0]["skeleton_error_m"].as_f64().expect("how far off");
     assert!(off > 0.0 && off < 5.0, "{off}");
-    // The legs of so small a model are of no length that tells the unit.
+    // Unit and axis are given, because the legs of so small a model have no plausible length.
     let back = [
         "export",
         "x.bvh",
@@ -75,7 +89,10 @@ pub(crate) fn are_written(bench: &Bench) {
     for (line, words) in [
         (&["generate", "x", "--model", "smoke@staging", "-o", "x.fbx"][..], "ends in .bvh, .glb"),
         (&["generate", "x", "--model", "smoke@staging", "-o", "none/x.glb"], "there is no folder `none`"),
-        (&["generate", "x", "y", "--frames", "40,44,48", "--model", "smoke@staging", "-o", "x.npy"], "3 lengths for 2"),
+        (
+            &["generate", "x x", "y y", "--frames", "40,44,48", "--model", "smoke@staging", "-o", "x.npy"],
+            "3 lengths for 2",
+        ),
         (&["generate", "--captions", "none.txt", "--model", "smoke@staging", "-o", "x.npy"], "none.txt"),
         (&["export", "m.html", "-o", "x.npy"], "an array, .npy, or a recording, .bvh"),
         (&["export", "lines.jsonl", "-o", "x.npy"], "an array, .npy"),

@@ -1,4 +1,5 @@
-//! Weights in and out from the command line: README's commands, with a checkpoint of the fixtures in place of the released one.
+//! Import and export of weights on the command line: README's commands, with a checkpoint of the fixtures in place of
+//! the released one.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -8,7 +9,7 @@ use cluster_tests::{Bench, digests};
 
 const TRAINER: &str = env!("CARGO_BIN_EXE_trainer");
 
-/// The recipe at a size of seconds: another checkpoint, and clips that are made up.
+/// The recipe at toy size, with another checkpoint and synthetic clips.
 fn pipeline(checkpoint: &Path) -> String {
     format!(
         "name: motionlcm-released
@@ -25,12 +26,12 @@ stages:
     )
 }
 
-/// The fixture, whose sizes are those of the recipe but for widths.
+/// The fixture; its sizes are those of the recipe except for widths.
 fn checkpoint() -> Option<PathBuf> {
     fixtures::data("parity/02_control_v2_lcm/weights.ckpt")
 }
 
-/// A folder with a mean and a deviation of HumanML3D's features.
+/// Creates a folder with a mean and a deviation of HumanML3D's features.
 fn statistics(dir: &Path) -> String {
     let folder = dir.join("meta");
     fs::create_dir_all(&folder).expect("a test's own files");
@@ -66,17 +67,17 @@ fn weights_go_in_and_out_as_the_readme_says() {
     assert_eq!(reports.len(), 4);
     let version = bench.run(&["registry", "show", "motionlcm:1", "-o", "json"]).expect_code(0).json();
     assert!(version["manifest"]["files"]["vae/model.safetensors"].is_object(), "{version}");
-    // What was exported is imported, and gives the same to the bit.
+    // Exported weights are imported again and give the same bits.
     for (i, exported) in ["motionlcm.ckpt", "motionlcm.safetensors"].into_iter().enumerate() {
         let again = dir.join(format!("{i}.yaml"));
         fs::write(&again, pipeline(&dir.join(exported))).expect("a test's own files");
         let report = bench.run(&["run", &again.display().to_string(), "-o", "json"]).expect_code(0).json();
         assert_eq!(digests(&report), digests(&reports[0]), "{exported}");
     }
-    // A file that is there is not overwritten, and a layout of other models is refused.
+    // An existing file is not overwritten, and a layout of other models is refused.
     let export = |more: &[&str]| bench.run(&[&["registry", "export", "motionlcm-released@staging"], more].concat());
     let said = export(&["motionlcm.ckpt", "--layout", "motionlcm"]);
     assert!(said.code == Some(1) && said.stderr.contains("motionlcm.ckpt"), "{}", said.stderr);
     let said = export(&["momask", "--layout", "momask"]).expect_code(2);
-    assert!(said.stderr.contains("has no place for its parts"), "{}", said.stderr);
+    assert!(said.stderr.contains("cannot hold its parts"), "{}", said.stderr);
 }

@@ -1,4 +1,4 @@
-//! `docs/results/`: the script that makes tables, run as it stands on a pipeline of seconds; and whether its templates can be filled.
+//! `docs/results/`: runs the script that makes tables on a toy pipeline, and checks that its templates can be filled.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -11,7 +11,7 @@ use serde_json::{Value, json};
 
 const TRAINER: &str = env!("CARGO_BIN_EXE_trainer");
 
-/// Every kind of evaluation that a template quotes, twice trained.
+/// Every kind of evaluation that a template quotes, trained twice.
 const TOY: &str = "name: toy
 seed: 3
 dataset: {format: synthetic, clips: 40, val: 0.1, test: 0.4, mirror: false}
@@ -85,7 +85,7 @@ fn metrics<'a>(run: &'a Value, stage: &str) -> &'a Value {
     &stages.iter().find(|one| one["name"] == stage).unwrap_or_else(|| panic!("no stage `{stage}`"))["metrics"]
 }
 
-/// A template quotes stages of the pipeline beside it, and of them metrics that such evaluations give.
+/// Checks that a template quotes only stages of the pipeline beside it, and only metrics that their evaluations report.
 fn a_shipped_template_can_be_filled(bench: &Bench, toy: &Value, path: &Path) {
     let pipeline = path.with_extension("yaml").display().to_string();
     let pipeline = bench.run(&["config", "show", &pipeline, "-o", "json"]).expect_code(0).json();
@@ -113,7 +113,7 @@ fn a_shipped_template_can_be_filled(bench: &Bench, toy: &Value, path: &Path) {
         text.lines().filter(|line| line.starts_with("| ")).map(|l| l.matches('|').count()).collect();
     assert!(!text.contains("{{") && columns.iter().all(|columns| (4..=9).contains(columns)), "{columns:?}");
 
-    // What README shows is what the stored run gives.
+    // README shows the text that the stored run gives.
     if let Ok(stored) = fs::read_to_string(path.with_extension("json")) {
         let run = serde_json::from_str(&stored).expect("it is JSON");
         let text = render(&template, &Source { run, pipeline }).unwrap_or_else(|why| panic!("{why}"));

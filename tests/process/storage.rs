@@ -1,4 +1,4 @@
-//! A full disk and a read-only store: nothing is half written, and the message says what to do.
+//! A full disk and a read-only store: no half-written data, and a message with advice.
 
 use cluster_tests::Bench;
 use cluster_tests::mounted::Mounted;

@@ -1,4 +1,5 @@
-//! `trainer generate --stream`: over pipes and over WebSockets, with a control part, by infilling and without either, at toy sizes.
+//! `trainer generate --stream` over pipes and over WebSockets at toy sizes: with a control part, by infilling, and with
+//! neither.
 
 use std::fs;
 use std::io::{BufRead, BufReader, Write};
@@ -18,7 +19,7 @@ use tungstenite::{Message, WebSocket};
 const TRAINER: &str = env!("CARGO_BIN_EXE_trainer");
 const TOKEN: &str = "0123456789abcdef0123456789abcdef";
 
-/// A model of each way to join segments, and a control part of another base.
+/// A model for each way to join segments, and a control part of another base.
 const PIPELINE: &str = "name: toy
 seed: 3
 dataset: {format: synthetic, clips: 40, val: 0.1, test: 0.4}
@@ -47,7 +48,7 @@ fn bench() -> Bench {
     bench
 }
 
-/// A stream of the sentences in `input`.
+/// Streams the sentences in `input`.
 fn stream(bench: &Bench, input: &str, arguments: &[&str]) -> Said {
     let mut command = bench.command(&[&["generate", "--stream", "--report", "json"][..], arguments].concat());
     fs::write(bench.path().join("input"), input).expect("written");
@@ -59,7 +60,7 @@ fn frames(said: &Said) -> Vec<Value> {
     said.stdout.lines().map(|line| serde_json::from_str(line).unwrap_or_else(|e| panic!("{line}: {e}"))).collect()
 }
 
-/// What is said on stderr when a stream ends.
+/// The report on stderr at the end of a stream.
 fn report(said: &Said) -> Value {
     let line = said.stderr.lines().find(|line| line.starts_with('{')).unwrap_or_else(|| panic!("{}", said.stderr));
     serde_json::from_str(line).expect("a report")
@@ -79,7 +80,7 @@ fn largest_step(frames: &[Value]) -> f64 {
     frames.windows(2).map(step).fold(0.0, f64::max)
 }
 
-/// A stream that goes from sentence to sentence in one world.
+/// Streams several sentences in one world.
 fn goes_on(bench: &Bench, model: &[&str], joining: &str) {
     let input = "a person walks#3s\n\n{\"caption\": \"a person jumps\", \"seconds\": 12}\n\"a person turns\"\n";
     let said = stream(bench, input, &[model, &["-o", "s.html", "-o", "s.npy", "-o", "s.png"]].concat()).expect_code(0);
@@ -94,7 +95,7 @@ fn goes_on(bench: &Bench, model: &[&str], joining: &str) {
     assert!(rows.iter().all(|row| row["joints"].as_array().is_some_and(|joints| joints.len() == 22)));
     let root = &rows[0]["joints"][0];
     assert_eq!((&root[0], &root[2]), (&json!(0.0), &json!(0.0)));
-    // Models of so few steps leap, but not where segments meet.
+    // Models with so little training jump, but not where segments meet.
     let steps: Vec<f64> = rows.windows(2).map(largest_step).collect();
     let junction = |t: usize| rows[t]["segment"] != rows[t + 1]["segment"];
     let (mut at, mut between) = (0.0_f64, 0.0_f64);
@@ -118,7 +119,7 @@ fn goes_on(bench: &Bench, model: &[&str], joining: &str) {
     assert!(other.len() == 61 && other[60]["joints"] != rows[60]["joints"]);
 }
 
-/// A path through sentences: the documented example, by the documented command.
+/// Follows a path through sentences: the documented example, by the documented command.
 fn follows_a_path(bench: &Bench) {
     let root = Bench::repository();
     fs::create_dir_all(bench.path().join("docs")).expect("a folder");
@@ -150,7 +151,7 @@ fn follows_a_path(bench: &Bench) {
     }
 }
 
-/// What is refused, and with which words.
+/// Refused inputs with their messages.
 fn mistakes(bench: &Bench) {
     const CONTROL: [&str; 2] = ["--model", "motionlcm-control-mini@staging"];
     let path = |rows: &str| {
@@ -190,7 +191,7 @@ fn mistakes(bench: &Bench) {
     ] {
         let said = stream(bench, &input, model);
         if wanted.is_empty() {
-            // Nothing is told there, so that the overlap says nothing.
+            // This model is not conditioned on earlier frames, so the overlap has no effect.
             said.expect_code(0);
             continue;
         }
@@ -212,7 +213,7 @@ fn is_read_as_it_goes(bench: &Bench) {
         command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped());
         command.spawn().expect("the trainer starts")
     };
-    // It goes on without end until nobody reads.
+    // The stream is endless until its output is closed.
     let mut child = start(&[]);
     let mut input = child.stdin.take().expect("piped");
     writeln!(input, "a person walks").expect("written");
@@ -223,7 +224,7 @@ fn is_read_as_it_goes(bench: &Bench) {
     drop(output);
     assert_eq!(child.wait().expect("it ends").code(), Some(0), "quietly");
 
-    // In time, a new sentence does not wait for the end of a segment.
+    // With a pace, a new sentence does not wait for the end of a segment.
     let mut child = start(&["--pace", "50"]);
     let mut input = child.stdin.take().expect("piped");
     let mut output = BufReader::new(child.stdout.take().expect("piped")).lines();
@@ -272,7 +273,7 @@ fn send(socket: &mut Socket, text: &str) {
     socket.send(Message::text(text)).expect("sent");
 }
 
-/// The WebSocket.
+/// Streams over a WebSocket.
 fn is_served(bench: &Bench) {
     let model = ["generate", "--stream", "--model", "motionlcm-control-mini@staging"];
     let said = bench.run(&[&model[..], &["--listen", "127.0.0.1:0"]].concat()).expect_code(2);
@@ -294,12 +295,15 @@ fn is_served(bench: &Bench) {
     assert_eq!(connect(&address, Some("wrong")).err(), Some(StatusCode::UNAUTHORIZED));
     assert_eq!(connect(&address, Some(&TOKEN.replace('0', "9"))).err(), Some(StatusCode::FORBIDDEN), "another scope");
 
+    // Any number of silent connections holds no place.
+    let silent: Vec<Socket> = (0..40).map(|_| connect(&address, Some(TOKEN)).expect("let in")).collect();
     let mut socket = connect(&address, Some(TOKEN)).expect("let in");
-    assert_eq!(connect(&address, Some(TOKEN)).err(), Some(StatusCode::SERVICE_UNAVAILABLE), "one stream at once");
     send(&mut socket, "walks#soon");
     assert!(message(&mut socket).expect("an answer")["error"].to_string().contains("line 1: `soon`"));
     send(&mut socket, "a person walks");
     let mut last = message(&mut socket).expect("a frame");
+    assert_eq!(connect(&address, Some(TOKEN)).err(), Some(StatusCode::SERVICE_UNAVAILABLE), "one stream at once");
+    drop(silent);
     assert_eq!((&last["frame"], &last["line"]), (&json!(0), &json!(2)));
     send(&mut socket, "{\"caption\": \"a person jumps\", \"waypoints\": [[0, 900, 1, 0]]}");
     send(&mut socket, "{\"caption\": \"a person jumps\", \"seconds\": 2}");
@@ -323,10 +327,10 @@ fn is_served(bench: &Bench) {
 
     // The place is free again; a message beyond the limit ends the connection.
     let mut socket = wait_for("the place to be free", || connect(&address, Some(TOKEN)).ok());
-    // It may close before all of it is sent.
+    // The server may close before all of it is sent.
     let _ = socket.send(Message::text("a".repeat(100_000)));
     assert!(message(&mut socket).is_none());
-    // A client that leaves without a word makes room.
+    // A client that leaves without a close message frees its place.
     let mut socket = wait_for("the place to be free", || connect(&address, Some(TOKEN)).ok());
     send(&mut socket, "a person walks");
     message(&mut socket).expect("a frame");
@@ -346,7 +350,7 @@ fn motion_without_end() {
     mistakes(&bench);
     is_read_as_it_goes(&bench);
     is_served(&bench);
-    // Which base the control part is for.
+    // The registry shows the base of the control part.
     let shown = bench.run(&["registry", "show", "motionlcm-control-mini@staging"]).expect_code(0).stdout;
     assert!(shown.contains("control for denoiser=") && shown.contains("bases       base:1\n"), "{shown}");
     let shown = bench.run(&["registry", "show", "foreign:1", "-o", "json"]).expect_code(0).json();

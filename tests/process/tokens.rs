@@ -1,4 +1,4 @@
-//! Stages of tokens: promises 1 and 4, and a part of a motion drawn anew from the command line.
+//! Token stages: promises 1 and 4, and editing part of a motion on the command line.
 
 use cluster_tests::{Bench, Running, digests};
 
@@ -6,7 +6,8 @@ use crate::determinism::begins;
 
 const TRAINER: &str = env!("CARGO_BIN_EXE_trainer");
 
-/// Two tokenizers, a generator of each masked kind, a flow decoder. Long enough that a kill lands inside each training stage.
+/// Two tokenizers, a generator of each masked kind, a flow decoder. Long enough that a kill hits the middle of each
+/// training stage.
 const PIPELINE: &str = "name: tokens
 seed: 1234
 dataset: {format: synthetic, clips: 24, val: 0.1, test: 0.2}
@@ -102,7 +103,7 @@ fn p5_p6_tokens_have_the_same_digests_with_2_workers_and_after_kills() {
     edits(&alone);
 }
 
-/// What `--edit` does with what the stages gave.
+/// Edits motions with `--edit`, with the models of the stages.
 fn edits(bench: &Bench) {
     let draw = ["generate", "a person walks", "--stage", "momask", "--frames", "62", "-o", "walk.npy"];
     bench.run(&draw).expect_code(0);
@@ -110,7 +111,7 @@ fn edits(bench: &Bench) {
         let edit = ["generate", "a jump", "--stage", stage, "--edit", "walk.npy", "--keep", "0:1s,-1s:"];
         let json = ["-o", "edited.npy", "--report", "json"];
         let said = bench.run(&[&edit[..], &json[..], &more[..]].concat()).expect_code(0).json();
-        // 62 frames are 15 tokens; the last second begins within the eleventh.
+        // 62 frames are 15 tokens; the last second starts within the eleventh.
         assert_eq!(said["kept"], serde_json::json!([[0, 20], [44, 60]]), "{stage}: {said}");
         assert_eq!(said["frames"], 60, "{stage}");
     }

@@ -13,14 +13,20 @@ fn verify(bench: &Bench, more: &[&str], code: i32) -> Value {
     bench.run(&[&["run", &config, "-o", "json"][..], more].concat()).expect_code(code).json()
 }
 
-/// All five training stages of the smoke pipeline, from a checkpoint to the end, and from nothing.
+/// All five training stages of the smoke pipeline, from a checkpoint to the end, and from the beginning.
 #[test]
 fn p5_verify_finds_everything_equal_and_then_what_was_changed() {
     let bench = Bench::new(TRAINER);
     let config = Bench::config("smoke.yaml");
     let said = bench.run(&["run", &config, "--verify"]).expect_code(2);
     assert!(said.stderr.contains(".stride"), "there is no store yet: {}", said.stderr);
-    bench.pipeline("smoke.yaml", &["--workers", "2"]);
+    let keep: Vec<String> = ["vae", "mld", "lcm", "pcm", "evaluator"]
+        .map(|stage| format!("stages.{stage}.checkpoint.keep.ended=2"))
+        .into_iter()
+        .flat_map(|set| ["--set".to_owned(), set])
+        .collect();
+    let keep: Vec<&str> = keep.iter().map(String::as_str).collect();
+    bench.pipeline("smoke.yaml", &[&["--workers", "2"], &keep[..]].concat());
 
     let said = verify(&bench, &["--verify", "5"], 0);
     let stages = said["stages"].as_array().expect("stages");
@@ -32,7 +38,7 @@ fn p5_verify_finds_everything_equal_and_then_what_was_changed() {
         assert_eq!(stage["differences"], serde_json::json!([]));
     }
 
-    // The last value of one curve is told otherwise by its last bit.
+    // The last bit of one curve's last value is changed.
     tell_otherwise(&bench.store());
     let said = bench.run(&["run", &Bench::config("smoke.yaml"), "-o", "json", "--verify", "5"]).expect_code(9);
     let report: Value = serde_json::from_str(&said.stdout).expect("one object");
@@ -48,10 +54,11 @@ async fn tell_otherwise(dir: &std::path::Path) {
     let store = Store::open(dir, Holder::this_process("a test")).await.expect("the store");
     let run = store.runs().await.expect("runs")[0].run.clone();
     let stage: StageName = "mld".into();
-    let curve = store.metrics(&run, &stage, Some(&["loss".into()]), 0).await.expect("values").remove("loss");
+    let curve =
+        store.points(&run, &stage, Some(&["loss".into()]), registry::Page::ALL).await.expect("values").remove("loss");
     let last = *curve.expect("a curve").points.last().expect("a value");
     let value = f64::from_bits(last.value.to_bits() ^ 1);
-    // As a later attempt would supersede it.
+    // Written as a later attempt, which supersedes the value.
     let task = TaskId::of(&run, &stage, None);
     let grant = Grant {
         task: task.clone(),

@@ -1,4 +1,4 @@
-//! Versions of the registry in the place of stages, and versions on their way from one store to another.
+//! Registry versions in place of stages, and transfers of versions between stores.
 
 use std::fs;
 
@@ -7,7 +7,8 @@ use cluster_tests::{Bench, digests, wait_for};
 
 const TRAINER: &str = env!("CARGO_BIN_EXE_trainer");
 
-/// Latents by a version's VAE, and a teacher that begins with the same version's denoiser; long enough that a kill lands within.
+/// Latents by a version's VAE, and a teacher that starts from the same version's denoiser. Long enough that a kill hits
+/// its middle.
 const TUNED: &str = "name: tuned
 seed: 5
 dataset: {format: synthetic, clips: 32, val: 0.1, test: 0.2}
@@ -24,7 +25,7 @@ stages:
     checkpoint: {every: 20}
 ";
 
-/// A store with the two students of the smoke pipeline as versions, and the pipeline above beside it.
+/// Creates a store with the two students of the smoke pipeline as versions, and the pipeline above beside it.
 fn with_versions() -> Bench {
     let bench = Bench::new(TRAINER);
     bench.pipeline("smoke.yaml", &["--workers", "2"]);
@@ -32,7 +33,7 @@ fn with_versions() -> Bench {
     bench
 }
 
-/// Points `staging` at the other one of the two versions.
+/// Moves the alias `staging` to the other of the two versions.
 fn promote_the_other(bench: &Bench) {
     let shown = bench.run(&["registry", "show", "smoke@staging", "-o", "json"]).expect_code(0).json();
     let other = if shown["version"]["version"] == 1 { "smoke@2" } else { "smoke@1" };
@@ -50,7 +51,7 @@ fn p6_a_training_that_begins_with_a_version_is_killed_and_goes_on_with_it() {
     let logs = undisturbed.run(&["logs", "@last"]).expect_code(0).stdout;
     assert!(logs.contains("begins with") && logs.contains("not used: "), "{logs}");
 
-    // Both students have one VAE, but each its own denoiser.
+    // Both students share one VAE, but each has its own denoiser.
     promote_the_other(&undisturbed);
     let moved = plan();
     assert_eq!(moved["stages"][3]["action"], "run", "{moved}");
@@ -130,11 +131,11 @@ fn a_bundle_draws_the_same_motion_from_another_store() {
     assert_eq!(listed["versions"].as_array().map(Vec::len), Some(1), "imported twice, it is one version");
     other.run(&["registry", "fsck"]).expect_code(0);
 
-    // What came from elsewhere is as good to begin with.
+    // Training can also start from an imported version.
     fs::write(other.path().join("tuned.yaml"), TUNED.replace("smoke@staging", "renamed@1")).expect("a pipeline");
     other.run(&["run", "tuned.yaml", "--set", "stages.tuned.steps=4", "--workers", "1"]).expect_code(0);
 
-    // A server takes it over the network, and its holder's command line as well.
+    // A server imports it over the network, and so does the command line on the server's machine.
     let cluster = Cluster::start(TRAINER);
     fs::write(cluster.bench().path().join("smoke.tar.zst"), &bundle).expect("a copy");
     let url = cluster.url();

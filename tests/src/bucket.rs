@@ -1,4 +1,5 @@
-//! A bucket on this machine: `s3s-fs`, which speaks the S3 protocol over a folder, on a loopback port, and a line to it that tests cut.
+//! A bucket on this machine: `s3s-fs`, which serves the S3 protocol over a folder on a loopback port. Tests can cut the
+//! connections to it.
 
 use std::io;
 use std::net::SocketAddr;
@@ -16,30 +17,30 @@ use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::runtime::Runtime;
 
-/// The bucket that there is.
+/// Name of the bucket.
 pub const NAME: &str = "stride-tests";
-/// Who may use it.
+/// Access key of the bucket.
 pub const KEY: &str = "tests";
-/// By this word.
+/// Secret key of the bucket.
 pub const SECRET: &str = "a-secret-of-tests-only";
 
-/// A server of the S3 protocol with one empty bucket. It and all objects are gone when this is dropped.
+/// A server of the S3 protocol with one empty bucket. Dropping it deletes all objects.
 #[derive(Debug)]
 pub struct Bucket {
     dir: tempfile::TempDir,
     address: SocketAddr,
     line: Arc<Line>,
-    /// Dropped with all that is under way in it.
+    /// Dropped together with its running tasks.
     _runtime: Runtime,
 }
 
-/// What goes wrong on the way to the server, for all connections together.
+/// Faults of the connections to the server.
 #[derive(Debug)]
 struct Line {
-    /// Bytes that may yet arrive before the connection that brings the next ones ends; then everything is well again.
+    /// Bytes that may arrive before one connection is cut; then all connections work again.
     until_cut: AtomicU64,
     cuts: AtomicU64,
-    /// Nobody is answered.
+    /// True while the server answers no call.
     is_closed: AtomicBool,
 }
 
@@ -69,12 +70,12 @@ impl Bucket {
         Self { dir, address, line, _runtime: runtime }
     }
 
-    /// Where the server listens.
+    /// URL of the server.
     pub fn endpoint(&self) -> String {
         format!("http://{}", self.address)
     }
 
-    /// What a process needs in its environment to use it.
+    /// Environment of a process that uses the bucket.
     pub fn environment(&self) -> Vec<(&'static str, String)> {
         vec![
             ("AWS_ENDPOINT_URL", self.endpoint()),
@@ -85,7 +86,7 @@ impl Bucket {
         ]
     }
 
-    /// A place for blobs in it.
+    /// A location for blobs in the bucket.
     pub fn url(prefix: &str) -> String {
         format!("s3://{NAME}/{prefix}")
     }
@@ -95,22 +96,22 @@ impl Bucket {
         self.dir.path().join(NAME)
     }
 
-    /// Cuts the connection over which the byte comes that follows these, of all that is sent from now on; once.
+    /// Cuts a connection once, after `bytes` more bytes have arrived over all connections.
     pub fn cut_after(&self, bytes: u64) {
         self.line.until_cut.store(bytes, Ordering::SeqCst);
     }
 
-    /// How many connections were cut.
+    /// The number of connections that were cut.
     pub fn cuts(&self) -> u64 {
         self.line.cuts.load(Ordering::SeqCst)
     }
 
-    /// Ends every connection that says something, until [`open`](Self::open).
+    /// Ends every connection that sends data, until [`open`](Self::open).
     pub fn close(&self) {
         self.line.is_closed.store(true, Ordering::SeqCst);
     }
 
-    /// Answers again.
+    /// Answers calls again.
     pub fn open(&self) {
         self.line.is_closed.store(false, Ordering::SeqCst);
     }
@@ -119,7 +120,7 @@ impl Bucket {
 async fn serve(listener: TcpListener, service: S3Service, line: Arc<Line>) {
     while let Ok((stream, _)) = listener.accept().await {
         let (service, stream) = (service.clone(), OnLine { stream, line: Arc::clone(&line) });
-        // A connection that ends is the client's to notice.
+        // The client notices if a connection ends.
         tokio::spawn(async move { http1::Builder::new().serve_connection(TokioIo::new(stream), service).await });
     }
 }
@@ -136,7 +137,7 @@ impl AsyncRead for OnLine {
         ready!(Pin::new(&mut self.stream).poll_read(cx, into))?;
         let came = (into.filled().len() - before) as u64;
         let line = &self.line;
-        // One whose other side has gone brings nothing.
+        // The other side has closed the connection.
         if came == 0 {
             return Poll::Ready(Ok(()));
         }

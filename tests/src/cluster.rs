@@ -1,9 +1,10 @@
-//! A coordinator and workers as processes of their own, as on several machines: `trainer serve` and `trainer worker join`.
+//! A coordinator and workers as separate processes, as on several machines: `trainer serve` and `trainer worker join`.
 
 use std::collections::BTreeMap;
 use std::fs;
 use std::io::{self, Read, Write};
 use std::net::{SocketAddr, TcpListener, TcpStream};
+use std::os::unix::fs::PermissionsExt as _;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::Duration;
@@ -13,12 +14,15 @@ use serde_json::Value;
 
 use crate::{Bench, PATIENCE, Running, signal, wait_for, wait_within};
 
-/// What the coordinator wants to be shown.
+/// The coordinator's admin token.
 pub const TOKEN: &str = "a-token-of-tests-only";
-/// The least time of a training step, in milliseconds: 400 steps take ten seconds on the fastest machine, and a test finds a middle.
+/// The token of all workers, which allows nothing else.
+pub const WORKER_TOKEN: &str = "a-token-of-workers-of-tests-only";
+/// Minimum time of a training step, in milliseconds. 400 steps take at least ten seconds, so a test can act in the
+/// middle.
 const PACE: &str = "25";
 
-/// An answer of the coordinator.
+/// A response of the coordinator.
 #[derive(Debug, Clone)]
 pub struct Reply {
     /// HTTP status.
@@ -37,23 +41,23 @@ pub struct Cluster {
 }
 
 impl Cluster {
-    /// A coordinator on a free port of this machine, with an empty store.
+    /// Starts a coordinator on a free port of this machine, with an empty store.
     pub fn start(trainer: &str) -> Self {
         Self::listen(trainer, Self::free_address())
     }
 
-    /// A port of this machine that nobody uses.
+    /// Finds a free port of this machine.
     pub fn free_address() -> SocketAddr {
         let free = TcpListener::bind("127.0.0.1:0").expect("a free port");
         free.local_addr().expect("bound")
     }
 
-    /// The same at a chosen address.
+    /// Like [`start`](Self::start), at a chosen address.
     pub fn listen(trainer: &str, address: SocketAddr) -> Self {
         Self::listen_on(trainer, address, None)
     }
 
-    /// The same with its store in a chosen folder.
+    /// Like [`listen`](Self::listen), with its store in a chosen folder.
     pub fn listen_on(trainer: &str, address: SocketAddr, store: Option<&Path>) -> Self {
         let bench = Bench::new(trainer).with_token(TOKEN);
         fs::create_dir_all(bench.path().join("logs")).expect("a folder for logs");
@@ -70,12 +74,12 @@ impl Cluster {
         &self.bench
     }
 
-    /// Where the coordinator listens.
+    /// Address of the coordinator.
     pub fn address(&self) -> SocketAddr {
         self.address
     }
 
-    /// The same as a URL.
+    /// URL of the coordinator.
     pub fn url(&self) -> String {
         format!("http://{}", self.address)
     }
@@ -84,7 +88,7 @@ impl Cluster {
         self.bench.path().join("logs").join(format!("{who}.log"))
     }
 
-    /// All that a process wrote so far, over all its lives.
+    /// Everything that all processes of this name have written so far.
     pub fn said(&self, who: &str) -> String {
         fs::read(self.log(who)).map_or_else(|_| String::new(), |bytes| String::from_utf8_lossy(&bytes).into_owned())
     }
@@ -97,18 +101,26 @@ impl Cluster {
                 let mut command = Command::new(first);
                 command.args(rest).arg(trainer.get_program()).args(trainer.get_args());
                 command.current_dir(self.bench.path()).stdin(Stdio::null()).env("NO_COLOR", "1");
-                command.env("STRIDE_TOKEN", TOKEN);
                 command
             }
+        };
+        match arguments.first() {
+            Some(&"worker") => command.env("STRIDE_TOKEN", WORKER_TOKEN),
+            // The server has a file with both tokens.
+            _ => command.env_remove("STRIDE_TOKEN"),
         };
         command.env("STRIDE_WORKER_PACE", PACE);
         Running::logged(&mut command, &self.log(who))
     }
 
-    /// Starts the coordinator, again if it was there before, and waits until it answers.
+    /// Starts or restarts the coordinator and waits until it answers.
     pub fn serve(&mut self) {
         let address = self.address.to_string();
-        let mut arguments = vec!["serve", "--bind", &address];
+        let tokens = self.bench.path().join("tokens");
+        fs::write(&tokens, format!("admin admin {TOKEN}\nworkers worker {WORKER_TOKEN}\n")).expect("a token file");
+        fs::set_permissions(&tokens, fs::Permissions::from_mode(0o600)).expect("ours");
+        let tokens = tokens.display().to_string();
+        let mut arguments = vec!["serve", "--bind", &address, "--token-file", &tokens];
         if !self.address.ip().is_loopback() {
             arguments.push("--insecure");
         }
@@ -120,7 +132,7 @@ impl Cluster {
         self.server = Some(server);
     }
 
-    /// `kill -9` of the coordinator; it is gone when this returns.
+    /// Kills the coordinator with `kill -9` and waits for its end.
     pub fn kill_server(&mut self) {
         if let Some(mut server) = self.server.take() {
             server.kill();
@@ -128,32 +140,36 @@ impl Cluster {
         }
     }
 
-    /// Whether the coordinator's process runs.
+    /// Returns true if the coordinator's process is running.
     pub fn serving(&mut self) -> bool {
         self.server.as_mut().is_some_and(Running::alive)
     }
 
-    /// The coordinator's process id, while it is there.
+    /// The coordinator's process id while it is running.
     pub fn server(&self) -> Option<u32> {
         self.server.as_ref().map(Running::pid)
     }
 
-    /// Starts a worker; one of that name that has ended is replaced.
+    /// Starts a worker; replaces one of that name that has ended.
     pub fn join(&mut self, name: &str) {
         self.join_by(name, &[], &[]);
     }
 
-    /// Starts a worker with more arguments, and something before its command.
+    /// Starts a worker with more arguments, by a wrapping command.
     pub fn join_by(&mut self, name: &str, wrap: &[String], more: &[&str]) {
         self.join_at(&self.url(), name, wrap, more);
     }
 
-    /// The same by another way to the coordinator.
+    /// Like [`join_by`](Self::join_by), with another URL of the coordinator.
     pub fn join_at(&mut self, url: &str, name: &str, wrap: &[String], more: &[&str]) {
         let mut arguments = vec!["worker", "join", url, "--name", name];
         arguments.extend_from_slice(more);
         if !self.address.ip().is_loopback() {
             arguments.push("--insecure");
+        }
+        let folder = self.bench.path().display().to_string();
+        if !more.contains(&"--data-root") {
+            arguments.extend(["--data-root", &folder]);
         }
         let worker = self.spawn(name, wrap, &arguments);
         if let Some(mut old) = self.workers.insert(name.to_owned(), worker) {
@@ -161,22 +177,22 @@ impl Cluster {
         }
     }
 
-    /// A worker's process id.
+    /// The process id of a worker.
     pub fn pid(&self, name: &str) -> u32 {
         self.workers[name].pid()
     }
 
-    /// Whether a worker's process runs.
+    /// Returns true if a worker's process is running.
     pub fn alive(&mut self, name: &str) -> bool {
         self.workers.get_mut(name).is_some_and(Running::alive)
     }
 
-    /// A signal to a worker.
+    /// Sends a signal to a worker.
     pub fn signal(&self, name: &str, which: Signal) {
         signal(self.pid(name), which);
     }
 
-    /// `kill -9` of a worker; it is gone when this returns.
+    /// Kills a worker with `kill -9` and waits for its end.
     pub fn kill(&mut self, name: &str) {
         if let Some(mut worker) = self.workers.remove(name) {
             worker.kill();
@@ -184,17 +200,29 @@ impl Cluster {
         }
     }
 
-    /// Waits for a worker to end by itself and gives its exit code.
+    /// Waits for a worker to end by itself and returns its exit code.
     pub fn ended(&mut self, name: &str) -> Option<i32> {
         self.workers.remove(name).expect("a worker of that name").wait().code
     }
 
-    /// One call; an error if nobody answers.
+    /// Sends one call; an error if there is no answer.
     pub fn call(&self, method: &str, path: &str, headers: &[(&str, &str)], body: &[u8]) -> io::Result<Reply> {
+        self.call_as(TOKEN, method, path, headers, body)
+    }
+
+    /// Like [`call`](Self::call), with another token.
+    pub fn call_as(
+        &self,
+        token: &str,
+        method: &str,
+        path: &str,
+        headers: &[(&str, &str)],
+        body: &[u8],
+    ) -> io::Result<Reply> {
         let mut stream = TcpStream::connect_timeout(&self.address, Duration::from_secs(5))?;
         stream.set_read_timeout(Some(Duration::from_secs(30)))?;
         let mut head = format!("{method} {path} HTTP/1.1\r\nhost: localhost\r\nconnection: close\r\n");
-        head += &format!("authorization: Bearer {TOKEN}\r\n");
+        head += &format!("authorization: Bearer {token}\r\n");
         for (name, value) in headers {
             head += &format!("{name}: {value}\r\n");
         }
@@ -209,17 +237,17 @@ impl Cluster {
         Ok(Reply { status, body: serde_json::from_slice(&answer[end..]).unwrap_or(Value::Null) })
     }
 
-    /// A call with a JSON body.
+    /// Sends a call with a JSON body.
     pub fn post(&self, path: &str, body: &Value) -> io::Result<Reply> {
         self.call("POST", path, &[("content-type", "application/json")], body.to_string().as_bytes())
     }
 
-    /// What is at `path`; `None` if nobody answers or it is refused.
+    /// Gets the value at `path`; `None` if there is no answer or the call is refused.
     pub fn get(&self, path: &str) -> Option<Value> {
         self.call("GET", path, &[], b"").ok().filter(|reply| reply.status == 200).map(|reply| reply.body)
     }
 
-    /// Submits a pipeline and gives the run's name.
+    /// Submits a pipeline and returns the run's name.
     #[track_caller]
     pub fn submit(&self, config: &Path, more: &[&str]) -> String {
         let (config, url) = (config.display().to_string(), self.url());
@@ -232,7 +260,7 @@ impl Cluster {
         said.json()["run"].as_str().expect("a run").to_owned()
     }
 
-    /// The run as the API shows it, once the coordinator answers.
+    /// The run as the API returns it, once the coordinator answers.
     #[track_caller]
     pub fn view(&self, run: &str) -> Value {
         wait_for("the coordinator to show the run", || self.get(&format!("/v1/runs/{run}")))
@@ -255,13 +283,13 @@ impl Cluster {
         });
     }
 
-    /// Waits for the end of the run and gives it.
+    /// Waits for the end of the run and returns it.
     #[track_caller]
     pub fn wait_end(&self, run: &str) -> Value {
         self.wait_end_within(PATIENCE, run)
     }
 
-    /// The same on a machine that may take longer: one that compiles and tunes kernels first.
+    /// Like [`wait_end`](Self::wait_end), for a machine that first compiles and tunes kernels.
     #[track_caller]
     pub fn wait_end_within(&self, patience: Duration, run: &str) -> Value {
         let view = wait_within(patience, "the run to end", || {
@@ -273,10 +301,10 @@ impl Cluster {
         view
     }
 
-    /// A stage's current values: key -> (step, value), every one of them.
+    /// All current values of a stage: key -> (step, value).
     #[track_caller]
     pub fn metrics(&self, run: &str, stage: &str) -> BTreeMap<String, Vec<(u64, f64)>> {
-        let path = format!("/v1/runs/{run}/metrics?stage={stage}&points=0");
+        let path = format!("/v1/runs/{run}/metrics?stage={stage}&limit=10000");
         let all = self.get(&path).unwrap_or_else(|| panic!("no answer at {path}"));
         let curves = all[stage].as_object().cloned().unwrap_or_default();
         let point = |p: &Value| (p["step"].as_u64().expect("a step"), p["value"].as_f64().unwrap_or(f64::NAN));
@@ -284,7 +312,7 @@ impl Cluster {
         curves.iter().map(|(key, curve)| (key.clone(), points(curve))).collect()
     }
 
-    /// A run's log rows.
+    /// All log rows of a run.
     #[track_caller]
     pub fn logs(&self, run: &str) -> Vec<Value> {
         let (mut rows, mut after) = (Vec::new(), 0);
@@ -318,7 +346,7 @@ impl Cluster {
 
 impl Drop for Cluster {
     fn drop(&mut self) {
-        // A stopped process takes no other signal but this.
+        // A stopped process handles no other signal.
         for worker in self.workers.values_mut() {
             worker.kill();
         }

@@ -1,19 +1,19 @@
-//! A disk of its own for a store, that a test may fill or pause: a file system in a file, mounted by way of a loop device.
+//! A separate disk for a store that a test may fill or pause: a file system in a file, mounted through a loop device.
 
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-/// A mounted file system; thawed, unmounted and gone when dropped.
+/// A mounted file system; resumed, unmounted and deleted when dropped.
 #[derive(Debug)]
 pub struct Disk {
     dir: tempfile::TempDir,
     frozen: bool,
 }
 
-/// Larger than any store of the harness; the image is sparse, so that only what is written takes room.
+/// Larger than any store of the harness; the image is sparse, so only written blocks use space.
 const BYTES: u64 = 4 << 30;
-/// The smallest hole that [`Disk::fill`] leaves: less than one page of a database.
+/// Size of the smallest block that [`Disk::fill`] tries; the space left is less than one page of a database.
 const HOLE: u64 = 4096;
 
 fn tool(name: &str, arguments: &[&str], path: &Path) -> Result<(), String> {
@@ -25,7 +25,7 @@ fn tool(name: &str, arguments: &[&str], path: &Path) -> Result<(), String> {
 }
 
 impl Disk {
-    /// `None`, loudly, where file systems cannot be made or mounted.
+    /// Creates and mounts a disk. Skips the test where that is impossible.
     pub fn new() -> Option<Self> {
         let dir = tempfile::tempdir().expect("a temporary folder");
         let disk = Self { dir, frozen: false };
@@ -44,7 +44,7 @@ impl Disk {
         let (image, root) = (self.dir.path().join("image"), self.root());
         let file = fs::File::create(&image).and_then(|file| file.set_len(BYTES));
         file.and_then(|()| fs::create_dir(&root)).map_err(|e| format!("{}: {e}", image.display()))?;
-        // No part is kept for root, who runs the harness.
+        // Reserve no blocks for root, which runs the harness.
         tool("mkfs.ext4", &["-q", "-m", "0"], &image)?;
         let image = image.display().to_string();
         tool("mount", &["-o", "loop", &image], &root)?;
@@ -60,7 +60,7 @@ impl Disk {
         self.root().join("store")
     }
 
-    /// Takes all the room that there is.
+    /// Fills all free space.
     pub fn fill(&self) {
         let mut bytes = BYTES;
         let mut number = 0;
@@ -76,7 +76,7 @@ impl Disk {
         }
     }
 
-    /// Gives it back.
+    /// Frees the space again.
     pub fn empty(&self) {
         let files = fs::read_dir(self.root()).expect("the disk is mounted").flatten();
         for file in files.filter(|file| file.file_name().to_string_lossy().starts_with("ballast-")) {
@@ -84,13 +84,13 @@ impl Disk {
         }
     }
 
-    /// Every write waits from now on, and so does the process that asked for it: such a process takes no signal, not even `SIGKILL`.
+    /// Blocks every write from now on. A process that waits for a write handles no signal, not even `SIGKILL`.
     pub fn pause(&mut self) {
         tool("fsfreeze", &["-f"], &self.root()).unwrap_or_else(|e| panic!("{e}"));
         self.frozen = true;
     }
 
-    /// Writes go on.
+    /// Unblocks writes.
     pub fn resume(&mut self) {
         if self.frozen {
             tool("fsfreeze", &["-u"], &self.root()).unwrap_or_else(|e| panic!("{e}"));

@@ -1,8 +1,9 @@
-//! Which files of a crate import each other in a loop, read from their text as `rustfmt` leaves it.
+//! Finds files of a crate that import each other in a loop, from their text as `rustfmt` formats it.
 //!
-//! `mod x;` gives the tree of modules. Every path that begins with `crate`, `super`, `self` or a child module is followed through `use`
-//! declarations to the file that defines its item. Handing a name on (`pub use`) is not counted as using it, nor is anything behind
-//! `#[cfg(test)]`. Not seen: methods, names from a glob, modules written inside a file, what a macro writes.
+//! `mod x;` gives the tree of modules. Every path that starts with `crate`, `super`, `self` or a child module is
+//! followed through `use` declarations to the file that defines its item. A re-export (`pub use`) does not count as a
+//! use, and neither does code behind `#[cfg(test)]`. Not seen: methods, names from a glob, inline modules, and code
+//! from macros.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -10,19 +11,20 @@ use std::path::{Path, PathBuf};
 
 type Names = Vec<String>;
 
-/// The files that each file needs, with an item that it takes from there.
+/// The files that each file needs, each with one item that it uses.
 type Needs = BTreeMap<PathBuf, BTreeMap<PathBuf, String>>;
 
 #[derive(Debug)]
 struct Module {
     file: PathBuf,
-    /// What a `use` calls something, and the path that the name stands for.
+    /// Names of `use` declarations with their paths.
     names: BTreeMap<String, Names>,
-    /// The paths that are used in it.
+    /// The paths used in the module.
     paths: Vec<Names>,
 }
 
-/// The imports that close loops in the crate whose root is `root` (`lib.rs` or `main.rs`), each as `FILE -> FILE: NAME`.
+/// The imports that close loops in the crate with the root file `root` (`lib.rs` or `main.rs`), each as
+/// `FILE -> FILE: NAME`.
 ///
 /// # Panics
 ///
@@ -42,7 +44,7 @@ pub fn loops(root: &Path) -> Vec<String> {
     closing.map(|(from, to, name)| format!("{} -> {}: {name}", from.display(), to.display())).collect()
 }
 
-/// All files that `from` needs, directly or not.
+/// All files that `from` needs, directly or indirectly.
 fn reached<'a>(needs: &'a Needs, from: &'a PathBuf) -> BTreeSet<&'a PathBuf> {
     let (mut seen, mut next) = (BTreeSet::new(), vec![from]);
     while let Some(file) = next.pop() {
@@ -51,7 +53,7 @@ fn reached<'a>(needs: &'a Needs, from: &'a PathBuf) -> BTreeSet<&'a PathBuf> {
     seen
 }
 
-/// Reads the file of the module `at`, and those of its child modules, which lie in `folder`.
+/// Reads the file of the module `at`, and those of its child modules in `folder`.
 fn read(modules: &mut BTreeMap<Names, Module>, file: &Path, at: &[String], folder: &Path) {
     let text = fs::read_to_string(file).unwrap_or_else(|e| panic!("{}: {e}", file.display()));
     let mut module = Module { file: file.to_owned(), names: BTreeMap::new(), paths: Vec::new() };
@@ -92,7 +94,7 @@ fn read(modules: &mut BTreeMap<Names, Module>, file: &Path, at: &[String], folde
     }
 }
 
-/// The paths of a `use` tree below `prefix`, each with the name that it brings.
+/// The paths of a `use` tree below `prefix`, each with the name that it imports.
 fn unfold(tree: &str, prefix: &[String], paths: &mut Vec<(Names, String)>) {
     let tree = tree.trim();
     if let Some((head, rest)) = tree.split_once('{') {
@@ -118,7 +120,8 @@ fn unfold(tree: &str, prefix: &[String], paths: &mut Vec<(Names, String)>) {
     }
 }
 
-/// The file that defines the item that `path` names in the module `at`, and the item's name. `None` for what is not of this crate.
+/// The file that defines the item `path` as seen from the module `at`, and the item's name. `None` for items of other
+/// crates.
 fn item(modules: &BTreeMap<Names, Module>, at: &[String], path: &[String], depth: usize) -> Option<(PathBuf, String)> {
     let mut module = at.to_vec();
     for (i, word) in path.iter().enumerate() {
@@ -134,7 +137,7 @@ fn item(modules: &BTreeMap<Names, Module>, at: &[String], path: &[String], depth
                     Some(stands_for) if depth < 16 => {
                         item(modules, &module, &[stands_for, &path[i + 1..]].concat(), depth + 1)
                     }
-                    // A path that begins with a name that nothing here has is another crate's.
+                    // A path whose first name is unknown here belongs to another crate.
                     _ => (i > 0).then(|| (here.file.clone(), name.to_owned())),
                 };
             }

@@ -1,7 +1,7 @@
 //! Starts, watches and kills real trainers.
 //!
-//! Every test gets a folder of its own with its own store. Nothing here waits for time to pass: it waits for a condition,
-//! with a bound after which the test fails and prints what the trainer said.
+//! Every test gets its own folder with its own store. This crate never sleeps for a fixed time. It waits for a
+//! condition with a time limit, after which the test fails and prints the trainer's output.
 
 pub mod bucket;
 pub mod cluster;
@@ -10,6 +10,7 @@ pub mod documented;
 pub mod imports;
 pub mod mounted;
 pub mod network;
+pub mod supply;
 pub mod tables;
 
 use std::collections::BTreeMap;
@@ -22,10 +23,10 @@ use std::time::{Duration, Instant};
 
 use serde_json::Value;
 
-/// How long a condition may take on a busy machine before the test gives up.
+/// Time limit of a condition on a busy machine.
 pub const PATIENCE: Duration = Duration::from_secs(300);
 
-/// One user: a folder, a store in it, and the trainer binary.
+/// A user's environment: a folder with a store, and the trainer binary.
 #[derive(Debug)]
 pub struct Bench {
     trainer: PathBuf,
@@ -34,28 +35,28 @@ pub struct Bench {
     environment: Vec<(&'static str, String)>,
 }
 
-/// What a finished command said.
+/// Output of a finished command.
 #[derive(Debug)]
 pub struct Said {
     /// Exit code; `None` after a signal.
     pub code: Option<i32>,
-    /// Standard output.
+    /// Text on stdout.
     pub stdout: String,
-    /// Standard error.
+    /// Text on stderr.
     pub stderr: String,
-    /// How long it took.
+    /// Duration of the command.
     pub took: Duration,
 }
 
 impl Said {
-    /// The one JSON object on stdout.
+    /// Parses the only JSON object on stdout.
     pub fn json(&self) -> Value {
         serde_json::from_str(&self.stdout).unwrap_or_else(|e| {
             panic!("stdout is not one JSON object ({e}):\n{}\n--- stderr\n{}", self.stdout, self.stderr)
         })
     }
 
-    /// Panics with all that was said unless the exit code is `code`.
+    /// Panics with all output unless the exit code is `code`.
     #[track_caller]
     pub fn expect_code(self, code: i32) -> Self {
         assert_eq!(self.code, Some(code), "exit code; stdout:\n{}\n--- stderr\n{}", self.stdout, self.stderr);
@@ -64,25 +65,25 @@ impl Said {
 }
 
 impl Bench {
-    /// A fresh folder. `trainer` is `env!("CARGO_BIN_EXE_trainer")`.
+    /// Creates an empty folder. `trainer` is `env!("CARGO_BIN_EXE_trainer")`.
     pub fn new(trainer: &str) -> Self {
         let dir = tempfile::tempdir().expect("a temporary folder");
         Self { trainer: trainer.into(), dir, token: None, environment: Vec::new() }
     }
 
-    /// Every command has these in its environment.
+    /// Sets environment variables for every command.
     #[must_use]
     pub fn with_environment(self, environment: impl IntoIterator<Item = (&'static str, String)>) -> Self {
         Self { environment: environment.into_iter().collect(), ..self }
     }
 
-    /// Every command shows this token, and a server wants it.
+    /// Sets the token of every command and server.
     #[must_use]
     pub fn with_token(self, token: &'static str) -> Self {
         Self { token: Some(token), ..self }
     }
 
-    /// The folder.
+    /// The folder of the user.
     pub fn path(&self) -> &Path {
         self.dir.path()
     }
@@ -97,12 +98,12 @@ impl Bench {
         Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("tests/ lies in the repository").to_owned()
     }
 
-    /// A shipped pipeline.
+    /// Path of a shipped pipeline.
     pub fn config(name: &str) -> String {
         Self::repository().join("configs").join(name).display().to_string()
     }
 
-    /// A command that has not started.
+    /// Creates a command without starting it.
     pub fn command(&self, arguments: &[&str]) -> Command {
         let mut command = Command::new(&self.trainer);
         command.args(arguments).current_dir(self.path()).stdin(Stdio::null());
@@ -119,12 +120,11 @@ impl Bench {
         self.spawn(arguments).wait()
     }
 
-    /// Starts a command.
     pub fn spawn(&self, arguments: &[&str]) -> Running {
         Running::start(self.command(arguments))
     }
 
-    /// `trainer run` of a shipped pipeline to its end, as JSON.
+    /// Runs a shipped pipeline with `trainer run` and returns the JSON result.
     #[track_caller]
     pub fn pipeline(&self, config: &str, more: &[&str]) -> Value {
         let config = Self::config(config);
@@ -134,7 +134,7 @@ impl Bench {
     }
 }
 
-/// A command that runs.
+/// A command that is running.
 #[derive(Debug)]
 pub struct Running {
     child: Child,
@@ -144,7 +144,7 @@ pub struct Running {
 }
 
 impl Running {
-    /// Starts `command` and collects what it says.
+    /// Starts `command` and collects its output.
     pub fn start(mut command: Command) -> Self {
         let mut child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("the trainer starts");
         let stdout = collect(child.stdout.take().expect("piped"));
@@ -152,7 +152,7 @@ impl Running {
         Self { child, stdout: Some(stdout), stderr: Some(stderr), since: Instant::now() }
     }
 
-    /// Starts `command`, whose every word goes to the end of a file.
+    /// Starts `command` and appends all its output to a file.
     pub fn logged(command: &mut Command, log: &Path) -> Self {
         let file = append(log);
         let both = file.try_clone().expect("one file twice");
@@ -160,7 +160,6 @@ impl Running {
         Self { child, stdout: None, stderr: None, since: Instant::now() }
     }
 
-    /// Process id.
     pub fn pid(&self) -> u32 {
         self.child.id()
     }
@@ -192,22 +191,22 @@ impl Running {
         }
     }
 
-    /// `kill -9`.
+    /// Sends SIGKILL.
     pub fn kill(&mut self) {
         signal(self.child.id(), nix::sys::signal::Signal::SIGKILL);
     }
 
-    /// Any signal.
+    /// Sends a signal.
     pub fn signal(&self, signal_: nix::sys::signal::Signal) {
         signal(self.child.id(), signal_);
     }
 
-    /// Whether it still runs.
+    /// Returns true if the process is running.
     pub fn alive(&mut self) -> bool {
         self.child.try_wait().expect("the child can be waited for").is_none()
     }
 
-    /// Its worker processes, by the name they were started with.
+    /// Its worker processes, by the names they were started with.
     pub fn workers(&self) -> BTreeMap<String, u32> {
         let mut found = BTreeMap::new();
         for entry in fs::read_dir("/proc").expect("/proc").flatten() {
@@ -241,31 +240,31 @@ impl Drop for Running {
 fn collect(mut pipe: impl Read + Send + 'static) -> JoinHandle<String> {
     thread::spawn(move || {
         let mut bytes = Vec::new();
-        // A killed process closes its pipe in the middle; what came before is what it said.
+        // A killed process closes its pipe early; the text before that is its output.
         drop(pipe.read_to_end(&mut bytes));
         String::from_utf8_lossy(&bytes).into_owned()
     })
 }
 
-/// Opens a log that is written on.
+/// Opens a log for appending.
 pub(crate) fn append(path: &Path) -> File {
     let file = fs::OpenOptions::new().create(true).append(true).open(path);
     file.unwrap_or_else(|e| panic!("{}: {e}", path.display()))
 }
 
-/// Sends a signal; a process that is gone already is fine.
+/// Sends a signal; ignores a process that has ended.
 pub fn signal(pid: u32, signal: nix::sys::signal::Signal) {
     let pid = nix::unistd::Pid::from_raw(i32::try_from(pid).expect("a pid"));
     let _gone = nix::sys::signal::kill(pid, signal);
 }
 
-/// Waits until `condition` gives something.
+/// Waits until `condition` returns a value.
 #[track_caller]
 pub fn wait_for<T>(what: &str, condition: impl FnMut() -> Option<T>) -> T {
     wait_within(PATIENCE, what, condition)
 }
 
-/// The same with another patience.
+/// Like [`wait_for`], with another time limit.
 #[track_caller]
 pub fn wait_within<T>(patience: Duration, what: &str, mut condition: impl FnMut() -> Option<T>) -> T {
     let deadline = Instant::now() + patience;
@@ -278,13 +277,13 @@ pub fn wait_within<T>(patience: Duration, what: &str, mut condition: impl FnMut(
     }
 }
 
-/// Every stage's outputs: stage -> name -> digest.
+/// The outputs of all stages: stage -> name -> digest.
 pub fn digests(report: &Value) -> BTreeMap<String, Value> {
     let stages = report["stages"].as_array().expect("`stages` is a list");
     stages.iter().map(|stage| (stage["name"].as_str().expect("`name`").to_owned(), stage["outputs"].clone())).collect()
 }
 
-/// Stage -> state.
+/// The states of all stages by name.
 pub fn states(report: &Value) -> BTreeMap<String, String> {
     let stages = report["stages"].as_array().expect("`stages` is a list");
     let text = |v: &Value| v.as_str().expect("a text").to_owned();

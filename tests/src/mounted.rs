@@ -1,4 +1,4 @@
-//! Small file systems of a test's own.
+//! Small file systems for single tests.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -9,7 +9,7 @@ use std::process::Command;
 pub struct Mounted(PathBuf);
 
 impl Mounted {
-    /// Mounts one at `path`, with options such as `size=40m`. `None`, loudly, where mounting is not allowed.
+    /// Mounts a file system at `path`, with options such as `size=40m`. Skips the test where mounting is not allowed.
     pub fn tmpfs(path: &Path, options: &str) -> Option<Self> {
         fs::create_dir_all(path).expect("created");
         let done = Command::new("mount").args(["-t", "tmpfs", "-o", options, "tmpfs"]).arg(path).output();
@@ -21,7 +21,7 @@ impl Mounted {
         }
     }
 
-    /// Changes its options.
+    /// Changes the mount options.
     pub fn remount(&self, options: &str) {
         let done = Command::new("mount").args(["-o", &format!("remount,{options}")]).arg(&self.0).status();
         assert!(done.expect("mount runs").success(), "remount {options}");

@@ -1,4 +1,5 @@
-//! Hosts of their own for workers: a network namespace each, all on one bridge with the coordinator. And slow lines without any of that.
+//! Separate hosts for workers: one network namespace each, all on one bridge with the coordinator. Also slow lines
+//! without namespaces.
 
 use std::io::{Read, Write};
 use std::net::{Shutdown, SocketAddr, TcpListener, TcpStream};
@@ -8,7 +9,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::thread;
 use std::time::Duration;
 
-/// A bridge and a namespace per worker; gone when dropped.
+/// A bridge and a namespace per worker; removed when dropped.
 #[derive(Debug)]
 pub struct Network {
     id: u32,
@@ -28,9 +29,9 @@ fn tool(name: &str, arguments: &str) -> Result<(), String> {
 }
 
 impl Network {
-    /// `None`, loudly, where namespaces cannot be made.
+    /// Creates the hosts. Skips the test where namespaces cannot be created.
     pub fn new(hosts: usize) -> Option<Self> {
-        // Another harness may have the first choice: its bridge is neither used nor removed.
+        // Another harness may use the first choice of id; its bridge is neither used nor removed.
         let bridge = |id: u32| ip(&format!("link add stride{id} type bridge")).map(|()| Self { id, hosts });
         let first = std::process::id() % 250;
         let made = bridge(first).or_else(|_| bridge((first + 101) % 250));
@@ -63,28 +64,38 @@ impl Network {
         format!("stride{}-{i}", self.id)
     }
 
-    /// Where the coordinator listens.
+    /// Address of the coordinator.
     pub fn coordinator(&self) -> SocketAddr {
         SocketAddr::from(([10, 77, u8::try_from(self.id).expect("below 250"), 1], 7700))
     }
 
-    /// What runs a command on host `i`.
+    /// The command prefix that runs a command on host `i`.
     pub fn inside(&self, i: usize) -> Vec<String> {
         ["ip", "netns", "exec", &self.space(i)].map(str::to_owned).to_vec()
     }
 
-    /// Nothing reaches host `i` and nothing leaves it; no connection is told.
+    /// Cuts host `i` off in both directions, without closing its connections.
     pub fn cut(&self, i: usize) {
         ip(&format!("link set sv{}-{i} nomaster", self.id)).unwrap_or_else(|e| panic!("{e}"));
     }
 
-    /// What comes to host `i` comes at so many kilobits a second from now on. False, loudly, where `tc` cannot do that.
+    /// Limits the bandwidth towards host `i` from now on. Returns false with a notice where `tc` cannot do that.
     pub fn slow_down(&self, i: usize, kilobits: u32) -> bool {
         let shape = format!("qdisc add dev sv{}-{i} root tbf rate {kilobits}kbit burst 32kb latency 400ms", self.id);
         tool("tc", &shape).map_err(|error| fixtures::skip(&format!("a slow link: {error}"))).is_ok()
     }
 
-    /// The host is back, and so are its connections.
+    /// Drops all packets of host `i` to the other hosts, or stops dropping them. It still receives theirs, and the
+    /// coordinator still receives its packets.
+    pub fn mute(&self, i: usize, is_mute: bool) {
+        let (verb, space) = (if is_mute { "add" } else { "del" }, self.space(i));
+        for other in (0..self.hosts).filter(|other| *other != i) {
+            ip(&format!("-n {space} route {verb} blackhole 10.77.{}.{}/32", self.id, other + 2))
+                .unwrap_or_else(|e| panic!("{e}"));
+        }
+    }
+
+    /// Restores the host and its connections.
     pub fn mend(&self, i: usize) {
         ip(&format!("link set sv{0}-{i} master stride{0}", self.id)).unwrap_or_else(|e| panic!("{e}"));
     }
@@ -92,7 +103,7 @@ impl Network {
 
 impl Drop for Network {
     fn drop(&mut self) {
-        // What was never made cannot be removed, and that is fine.
+        // Ignore hosts that were never created.
         for i in 0..self.hosts {
             let _ = ip(&format!("link del sv{}-{i}", self.id));
             let _ = ip(&format!("netns del {}", self.space(i)));
@@ -101,7 +112,7 @@ impl Drop for Network {
     }
 }
 
-/// A way to a server on which each connection's answers come slowly.
+/// A relay to a server that limits the speed of each connection's answers.
 #[derive(Debug)]
 pub struct SlowLine {
     address: SocketAddr,
@@ -109,10 +120,10 @@ pub struct SlowLine {
 }
 
 impl SlowLine {
-    /// Longest rest between two pieces.
+    /// Longest pause between two pieces.
     const BEAT: Duration = Duration::from_millis(50);
 
-    /// Listens on this machine and passes everything on to `server`. It lasts as long as the process.
+    /// Listens on this machine and forwards everything to `server`. It lasts as long as the process.
     pub fn to(server: SocketAddr, bytes_per_second: u64) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").expect("a free port");
         let address = listener.local_addr().expect("bound");
@@ -120,7 +131,7 @@ impl SlowLine {
         let shared = rate.clone();
         thread::spawn(move || {
             for client in listener.incoming().flatten() {
-                // A caller that comes while the server is away finds the connection closed.
+                // While the server is down, a caller finds the connection closed.
                 let Ok(server) = TcpStream::connect(server) else { continue };
                 let (there, back) = (pair(&client, &server), pair(&server, &client));
                 let rate = shared.clone();
@@ -131,12 +142,12 @@ impl SlowLine {
         Self { address, bytes_per_second: rate }
     }
 
-    /// Where to call instead of the server.
+    /// URL to use in place of the server's.
     pub fn url(&self) -> String {
         format!("http://{}", self.address)
     }
 
-    /// As fast as it goes, from now on.
+    /// Removes the speed limit.
     pub fn open(&self) {
         self.bytes_per_second.store(u64::MAX, Ordering::SeqCst);
     }
@@ -159,7 +170,7 @@ fn pass((mut from, mut to): (TcpStream, TcpStream), bytes_per_second: &AtomicU64
             thread::sleep(SlowLine::BEAT);
         }
     }
-    // One direction's end is the other side's news.
+    // The end of one direction is passed on to the other side.
     let _ = to.shutdown(Shutdown::Write);
     let _ = from.shutdown(Shutdown::Read);
 }

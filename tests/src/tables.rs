@@ -1,7 +1,7 @@
-//! Text with numbers of a run in it: a template's places in double braces are filled from the run's JSON (`trainer run -o json`) and its settings
-//! (`trainer config show -o json`). A number is rounded once, here.
+//! Text with numbers of a run. A template's places in double braces are filled from the run's JSON
+//! (`trainer run -o json`) and its settings (`trainer config show -o json`). A number is rounded once, here.
 //!
-//! | place | becomes |
+//! | place | value |
 //! |---|---|
 //! | `{{STAGE METRIC}}` | the value, with `±` half of its 95 % interval, or its standard deviation over sampling seeds, if the run has one |
 //! | `{{NAME_* METRIC}}` | mean ± standard deviation (n - 1) over the stages `NAME_1`, `NAME_2`, ...: trainings from other random draws |
@@ -9,32 +9,32 @@
 //! | `{{bare ...}}` | any of these without `±` |
 //! | `{{... :N}}` | with N decimals, 3 otherwise |
 //! | `{{set STAGE PATH}}` | a setting |
-//! | `{{core minutes}}` | what all stages took, one after the other |
+//! | `{{core minutes}}` | the total time of all stages, one after the other |
 
 use serde_json::Value;
 
-/// Decimals where nothing else is said.
+/// Default number of decimals.
 const DECIMALS: usize = 3;
 
-/// What a template is filled from.
+/// Data to fill a template from.
 #[derive(Debug)]
 pub struct Source {
-    /// `trainer run -o json`.
+    /// Output of `trainer run -o json`.
     pub run: Value,
-    /// `trainer config show -o json`.
+    /// Output of `trainer config show -o json`.
     pub pipeline: Value,
 }
 
-/// A value and how far it may be off.
+/// A value with its uncertainty.
 struct Number {
     value: f64,
     spread: Option<f64>,
 }
 
-/// The template with its places filled.
+/// Fills the places of a template.
 ///
 /// # Errors
-/// The place that cannot be, with its line.
+/// The first place that cannot be filled, with its line.
 pub fn render(template: &str, source: &Source) -> Result<String, String> {
     let mut text = String::with_capacity(template.len());
     for (i, line) in template.lines().enumerate() {
@@ -52,10 +52,10 @@ pub fn render(template: &str, source: &Source) -> Result<String, String> {
     Ok(text)
 }
 
-/// `text` with what stands between the lines `<!-- NAME: from here -->` and `<!-- NAME: to here -->` replaced.
+/// Replaces the part of `text` between the lines `<!-- NAME: from here -->` and `<!-- NAME: to here -->`.
 ///
 /// # Errors
-/// If it does not have both.
+/// If a line is missing.
 pub fn between(text: &str, name: &str, new: &str) -> Result<String, String> {
     let (from, to) = (format!("<!-- {name}: from here -->\n"), format!("<!-- {name}: to here -->\n"));
     let (before, rest) = text.split_once(&from).ok_or_else(|| format!("no line `{}`", from.trim()))?;
@@ -93,7 +93,7 @@ fn fill(place: &str, source: &Source) -> Result<String, String> {
 fn setting(source: &Source, stage: &str, path: &str) -> Result<String, String> {
     let stages = source.pipeline["stages"].as_array().ok_or("the pipeline has no stages")?;
     let found = stages.iter().find(|one| one["name"] == stage).ok_or_else(|| format!("no stage `{stage}`"))?;
-    // Where settings stand beside the name, and where under it.
+    // Settings are beside the name or below it.
     let under = [&found["settings"], found].into_iter();
     let mut values = under.map(|settings| path.split('.').fold(settings, |value, key| &value[key]));
     match values.find(|value| !value.is_null()) {
@@ -108,7 +108,7 @@ fn core_minutes(source: &Source) -> f64 {
     stages.filter_map(|stage| stage["wall_s"].as_f64()).sum::<f64>() / 60.0
 }
 
-/// The metrics of the stages that `name` stands for, with what stands in the place of its `*`.
+/// The metrics of the stages that match `name`, each with the part that its `*` matches.
 fn stages<'a>(source: &'a Source, name: &str) -> Result<Vec<(String, &'a Value)>, String> {
     let all = source.run["stages"].as_array().ok_or("the run has no stages")?;
     let (before, after) = name.split_once('*').unwrap_or((name, ""));
@@ -153,7 +153,7 @@ fn ratio(source: &Source, (a, of_a): (&str, &str), (b, of_b): (&str, &str)) -> R
     Ok(of_seeds(&ratios))
 }
 
-/// Mean and standard deviation; none of one value.
+/// Mean and standard deviation; a single value has no deviation.
 fn of_seeds(values: &[f64]) -> Number {
     let n = values.len() as f64;
     let mean = values.iter().sum::<f64>() / n;

@@ -1,11 +1,12 @@
-//! Whatever is selected, third parties are compiled with the same features: `cargo test -p X` after `cargo test` compiles no Burn again.
+//! Every selection of packages compiles third-party crates with the same features: `cargo test -p X` after `cargo test`
+//! does not compile Burn again.
 
 use std::collections::BTreeSet;
 use std::process::Command;
 
 use serde_json::Value;
 
-/// What cargo says, run on the workspace.
+/// Runs cargo on the workspace and returns its output.
 fn cargo(arguments: &[&str]) -> String {
     let output = Command::new(env!("CARGO"))
         .args(arguments)
@@ -17,11 +18,11 @@ fn cargo(arguments: &[&str]) -> String {
     String::from_utf8(output.stdout).expect("text")
 }
 
-/// Every third party with its features, as a selection of packages and their tests has it.
+/// Every third-party crate with its features, for a selection of packages and their tests.
 fn features(selection: &[&str]) -> BTreeSet<String> {
     let how = ["--edges", "normal,build,dev", "--prefix", "none", "--no-dedupe", "--format", "{p}|{f}"];
     let tree = cargo(&[&["tree"], selection, &how].concat());
-    // Ours have their path behind the version.
+    // Our own packages have their path behind the version.
     let third_parties = tree.lines().filter(|line| line.contains('|') && !line.contains(" (/"));
     third_parties.map(|line| line.replace(" (proc-macro)", "")).collect()
 }

@@ -1,14 +1,14 @@
-//! Dependencies point one way: the control plane builds without Burn, the training library without a database, and no two files of a crate
-//! need each other.
+//! Dependencies point one way: the control plane builds without Burn, the training library without a database, and no
+//! two files of a crate import each other.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use cluster_tests::{Bench, imports};
 use serde_json::Value;
 
-/// What `cargo metadata` says of the workspace.
+/// Runs `cargo metadata` on the workspace.
 fn metadata(options: &[&str]) -> Value {
     let output = Command::new(env!("CARGO"))
         .args(["metadata", "--format-version", "1", "--locked", "--offline"])
@@ -55,7 +55,7 @@ fn closure(metadata: &Value) -> BTreeMap<String, BTreeSet<String>> {
 
 #[test]
 fn dependencies_point_one_way() {
-    // What this machine would build: other platforms' dependencies (wasm pulls in an async runtime) say nothing here.
+    // Only dependencies of this machine's platform; other platforms have more, such as an async runtime for wasm.
     let version = Command::new("rustc").arg("-vV").output().expect("rustc -vV runs");
     let version = String::from_utf8_lossy(&version.stdout).into_owned();
     let host = version.lines().find_map(|line| line.strip_prefix("host: ")).expect("rustc names its host");
@@ -71,6 +71,7 @@ fn dependencies_point_one_way() {
     never("checkpoint", &["burn", "tokio", "sqlx", "axum", "registry", "stages"]);
     never("registry", &["burn", "coordinator", "stages", "models", "worker"]);
     never("coordinator", &["burn", "stages", "models", "worker"]);
+    never("page", &["burn", "tokio", "sqlx", "axum", "hyper", "registry", "coordinator", "access"]);
     never("motion", &["burn", "tokio", "sqlx", "axum", "registry", "checkpoint"]);
     never("mocap", &["burn", "tokio", "sqlx", "axum", "registry", "checkpoint"]);
     never("text-models", &["burn", "tokio", "sqlx", "axum", "reqwest", "hf-hub", "onig", "registry", "checkpoint"]);
@@ -82,6 +83,52 @@ fn dependencies_point_one_way() {
     never("models", &["tokio", "sqlx", "axum", "reqwest", "registry", "checkpoint", "stages"]);
     never("stages", &["sqlx", "axum", "reqwest", "registry", "coordinator", "worker"]);
     never("worker", &["sqlx", "coordinator", "registry"]);
+}
+
+/// The code of a crate's files without their tests.
+fn sources(folder: &Path) -> Vec<(PathBuf, String)> {
+    let entries = std::fs::read_dir(folder).expect("a folder").map(|entry| entry.expect("an entry").path());
+    let found = entries.flat_map(|path| match path.is_dir() {
+        true => sources(&path),
+        false => {
+            let text = std::fs::read_to_string(&path).expect("a source file");
+            let code = text.split("#[cfg(test)]").next().unwrap_or_default().to_owned();
+            vec![(path, code)]
+        }
+    });
+    found.collect()
+}
+
+/// A stage reads files of its settings only through `stages::external`, which checks the worker's data roots and the
+/// digests. Parsers open files only through `motion::DataPath`.
+#[test]
+fn stages_and_parsers_open_no_path_of_their_own() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
+    let opens =
+        ["File::open(", "OpenOptions", "fs::read", "fs::metadata", "read_dir(", "symlink_metadata", ".is_dir()"];
+    let makes = ["DataPath::local", "Path::new(", "PathBuf::from"];
+    let at = |folder: &str| sources(&root.join(folder));
+    let expect_none = |folder: &str, words: &[&str], but: &[&str]| {
+        let files = at(folder);
+        assert!(files.len() > 3, "{folder}");
+        for (path, code) in files.iter().filter(|(path, _)| !but.iter().any(|but| path.ends_with(but))) {
+            // `WeightsFile::open(` opens no file of the system.
+            let is_whole =
+                |word: &str, at: usize| word.starts_with('.') || !code[..at].ends_with(char::is_alphanumeric);
+            let found = words.iter().find(|word| code.match_indices(**word).any(|(at, _)| is_whole(word, at)));
+            assert!(found.is_none(), "{}: `{}`", path.display(), found.unwrap_or(&""));
+        }
+    };
+    let testing = ["attempt.rs", "gang.rs", "hostile.rs", "hostile_models.rs"];
+    expect_none("trainer/stages/src", &[&opens[..], &makes].concat(), &testing);
+    expect_none("trainer/text/src", &[&opens[..], &makes[..1]].concat(), &[]);
+    // Files for a user's own commands.
+    expect_none("trainer/mocap/src", &opens, &["sample.rs"]);
+    expect_none("trainer/motion/src", &opens, &["files.rs", "synthetic.rs"]);
+    for parser in ["listing.rs", "captions.rs", "corpus.rs", "arrays.rs", "bvh.rs", "parse.rs", "take.rs"] {
+        let file = at("trainer/mocap/src").into_iter().find(|(path, _)| path.ends_with(parser)).expect(parser);
+        assert!(!file.1.contains("DataPath::local"), "{parser}");
+    }
 }
 
 #[test]

@@ -1,26 +1,25 @@
-//! The HTTP client of a coordinator: the one given by `--server`, the one that holds the store, or one started for the
-//! length of a command that changes something. What only reads asks a [`Reader`](crate::reader::Reader).
+//! The HTTP client of a coordinator. The coordinator is the one of `--server`, the one that holds the store, or one
+//! started for a command that changes something. Commands that only read use a [`Reader`](crate::reader::Reader).
 
 use std::path::Path;
 
 use access::{Server, ServerOptions, explain, local};
+use coordinator::shell::{CurveSeries, Curves, StageMetrics};
 use coordinator::{Config, Coordinator, Handle, WorkerView};
-use protocol::message::{
-    ApiError, DesiredAssignments, FailureClass, Poll, ReportOutcome, RunView, Submit, TaskOutcome,
-};
-use protocol::{Digest, Incarnation, RunId, WorkerId};
+use protocol::message::{ApiError, RunView, Submit};
+use protocol::{Digest, RunId};
 use registry::cli::{Answer, Command};
-use registry::{Holder, LogRow, ReadStore, Store};
+use registry::{Axis, Holder, LogRow, Page, ReadStore, Store, Window};
 use reqwest::{Method, RequestBuilder, Response, StatusCode};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 use crate::problem::{Problem, Result, exit};
 
-/// How often a server that has too much to do is asked again.
+/// Number of tries to reach a busy server.
 const BUSY_TRIES: usize = 20;
 
-/// Where a command is sent.
+/// Destination of a command.
 #[derive(Debug, Clone, clap::Args)]
 pub(crate) struct Target {
     /// The store's folder
@@ -30,16 +29,17 @@ pub(crate) struct Target {
     pub(crate) server: ServerOptions,
 }
 
-/// A coordinator that can be asked.
+/// A client of a coordinator.
 #[derive(Debug)]
 pub(crate) struct Client {
     server: Server,
-    /// Kept alive: a coordinator of our own, if nobody else's was running.
+    /// A coordinator of our own, kept alive if no other one is running.
     own: Option<Handle>,
 }
 
 impl Client {
-    /// The coordinator of `target` if one is running: the one that is named, or the one that holds the store.
+    /// Returns a client if a coordinator of `target` is running: the one that is named, or the one that holds the
+    /// store.
     pub(crate) async fn running(target: &Target) -> Result<Option<Self>> {
         if let Some(server) = target.server.connect()? {
             return Ok(Some(Self { server, own: None }));
@@ -52,7 +52,7 @@ impl Client {
         }
     }
 
-    /// The coordinator of `target`; if none is running, one is started and goes with this.
+    /// Connects to the coordinator of `target`. If none is running, starts one that ends with the client.
     pub(crate) async fn connect(target: &Target) -> Result<Self> {
         if let Some(client) = Self::running(target).await? {
             return Ok(client);
@@ -63,13 +63,13 @@ impl Client {
         Ok(Self { own: Some(handle), ..client })
     }
 
-    /// A client of a coordinator in this process.
-    pub(crate) fn of(handle: &Handle) -> Result<Self> {
+    /// Connects to a coordinator in this process.
+    fn of(handle: &Handle) -> Result<Self> {
         let server = Server::new(&handle.local_url(), Some(handle.token().clone()), None)?;
         Ok(Self { server, own: None })
     }
 
-    /// Ends a coordinator of our own, and lets go of its store.
+    /// Shuts down a coordinator of our own and closes its store.
     pub(crate) async fn close(self) {
         if let Some(handle) = self.own {
             handle.shutdown().await;
@@ -137,16 +137,17 @@ impl Client {
         Ok(self.post::<coordinator::shell::Submitted>("/v1/runs", submit).await?.run)
     }
 
-    /// Runs that go on, and of those that ended the newest `ended`.
-    pub(crate) async fn newest_runs(&self, ended: u32) -> Result<Vec<RunView>> {
-        self.get(&format!("/v1/runs?limit={ended}")).await
+    /// The newest runs by submission, or those before a run: at most `limit`, and at most the server's page size.
+    pub(crate) async fn runs_before(&self, before: Option<&RunId>, limit: u32) -> Result<Vec<RunView>> {
+        let before = before.map(|run| format!("&before={run}")).unwrap_or_default();
+        self.get(&format!("/v1/runs?limit={limit}{before}")).await
     }
 
     pub(crate) async fn run(&self, run: &RunId) -> Result<RunView> {
         self.get(&format!("/v1/runs/{run}")).await
     }
 
-    /// `pause`, `resume` or `cancel`.
+    /// Sends `pause`, `resume` or `cancel`.
     pub(crate) async fn control(&self, run: &RunId, action: &str) -> Result<RunView> {
         self.post(&format!("/v1/runs/{run}/{action}"), &()).await
     }
@@ -157,25 +158,34 @@ impl Client {
         self.get(&format!("/v1/runs/{run}/logs?after={after}&limit={limit}{stage}")).await
     }
 
-    pub(crate) async fn workers(&self) -> Result<Vec<WorkerView>> {
-        self.get("/v1/workers").await
+    pub(crate) async fn curves(
+        &self,
+        run: &RunId,
+        stage: Option<&str>,
+        keys: &[String],
+        window: &Window,
+    ) -> Result<Vec<CurveSeries>> {
+        let x = match window.axis {
+            Axis::Step => "step",
+            Axis::Time => "time",
+            Axis::Hours => "hours",
+        };
+        let mut query = vec![("run", run.to_string()), ("x", x.to_owned()), ("buckets", window.buckets.to_string())];
+        query.extend(stage.map(|stage| ("stage", stage.to_owned())));
+        query.extend(keys.iter().map(|key| ("key", key.clone())));
+        query.extend(window.from.map(|from| ("from", from.to_string())));
+        query.extend(window.to.map(|to| ("to", to.to_string())));
+        Ok(self.get::<Curves>(&with_query("/v1/metrics", &query)).await?.series)
     }
 
-    /// Reports what a worker that has died can no longer report: how its work ended.
-    pub(crate) async fn fail_for(
-        &self,
-        worker: &WorkerId,
-        incarnation: Incarnation,
-        class: FailureClass,
-        message: &str,
-    ) -> Result<()> {
-        let poll = Poll { incarnation, doing: Vec::new(), ready: Vec::new(), version: 0 };
-        let desired: DesiredAssignments = self.post(&format!("/v1/workers/{worker}/poll"), &poll).await?;
-        for assignment in desired.assignments {
-            let outcome = TaskOutcome::Failed { class, message: message.to_owned() };
-            self.post::<()>("/v1/outcomes", &ReportOutcome { grant: assignment.grant, outcome }).await?;
-        }
-        Ok(())
+    pub(crate) async fn points(&self, run: &RunId, stage: &str, key: &str, page: Page) -> Result<StageMetrics> {
+        let mut query = vec![("stage", stage.to_owned()), ("key", key.to_owned()), ("limit", page.limit.to_string())];
+        query.extend(page.after.map(|after| ("after", after.to_string())));
+        self.get(&with_query(&format!("/v1/runs/{run}/metrics"), &query)).await
+    }
+
+    pub(crate) async fn workers(&self) -> Result<Vec<WorkerView>> {
+        self.get("/v1/workers").await
     }
 
     pub(crate) async fn registry(&self, command: &Command) -> Result<Answer> {
@@ -189,15 +199,28 @@ impl Client {
     }
 }
 
-/// Tells the commands of this user where `handle` answers and how to be let in. What is given back takes that away again, and
-/// is to be dropped before the store is.
+/// A path with a percent-encoded query.
+fn with_query(path: &str, query: &[(&str, String)]) -> String {
+    let escaped = |text: &str| -> String {
+        let escape = |byte: u8| match byte {
+            b'a'..=b'z' | b'A'..=b'Z' | b'0'..=b'9' | b'-' | b'_' | b'.' => char::from(byte).to_string(),
+            other => format!("%{other:02X}"),
+        };
+        text.bytes().map(escape).collect()
+    };
+    let query: Vec<String> = query.iter().map(|(name, value)| format!("{name}={}", escaped(value))).collect();
+    format!("{path}?{}", query.join("&"))
+}
+
+/// Publishes the address and token of `handle` for the commands of this user. Dropping the returned value withdraws
+/// them; do so before the store is dropped.
 pub(crate) fn announce(store: &Store, handle: &Handle) -> Result<local::Published> {
     let announced = local::publish(store.dir(), handle.token())
         .and_then(|published| store.set_address(handle.local_url()).map(|()| published));
     announced.map_err(|error| Problem::usage(format!("cannot write to the store `{}`: {error}", store.dir().display())))
 }
 
-/// A store's folder as messages show it.
+/// Formats a store's folder for messages.
 pub(crate) fn shown(store: &Path) -> String {
     store.display().to_string()
 }

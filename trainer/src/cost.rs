@@ -1,18 +1,19 @@
-//! What a plan says a run would cost: entries of its datasets, and the time of each stage, tried on this machine.
+//! Cost estimates of a plan: the entries of its datasets, and the time of each stage, measured on this machine.
 
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::time::Duration;
 
+use motion::DataPath;
 use protocol::StageName;
 use protocol::pipeline::Pipeline;
 use protocol::stage::{DataFeatures, DataFormat, DataOpen, DataSynthetic};
 use stages::estimate::{Entries, Estimate, estimate};
 
-/// How long stages are tried; the one that is being tried then is the last.
+/// Time limit of all trial runs; the stage that reaches it is the last.
 const BUDGET: Duration = Duration::from_secs(30);
 
-/// An estimate for each stage that could be tried.
+/// Estimates each stage that can be tried.
 pub(crate) fn estimates(pipeline: &Pipeline) -> BTreeMap<StageName, Estimate> {
     let Ok(device) = models::device::open(pipeline.backend, 0) else { return BTreeMap::new() };
     let entries: BTreeMap<StageName, Entries> = pipeline
@@ -28,17 +29,17 @@ pub(crate) fn estimates(pipeline: &Pipeline) -> BTreeMap<StageName, Estimate> {
         })
         .collect();
     let pipeline = pipeline.clone();
-    // As a worker computes: one thread, with room for deep graphs.
+    // Computes as a worker does: one thread, with a stack for deep graphs.
     let thread = std::thread::Builder::new().name("estimate".to_owned()).stack_size(64 << 20);
     let tried = thread.spawn(move || {
         worker::process::compute_here();
         estimate(&pipeline, &entries, &device, BUDGET)
     });
-    // Without a thread, or if a stage panics on made-up clips, there is no estimate; the plan stands without.
+    // Without a thread, or if a stage panics on synthetic clips, the plan has no estimate.
     tried.map(|tried| tried.join().unwrap_or_default()).unwrap_or_default()
 }
 
-/// Clips of the lists of a folder; those of the published set if it is not there.
+/// Counts the clips of a folder's lists; those of the published dataset if the folder does not exist.
 fn listed(data: &DataOpen) -> Entries {
     let (train, val, test) = match data.format {
         DataFormat::Humanml3d => (23_384, 1_460, 4_384),
@@ -55,9 +56,9 @@ fn synthetic(data: &DataSynthetic) -> Entries {
     divided(data.clips, data.mirror, data.val, data.test)
 }
 
-/// As many clips as the folder has files; a hundred if it is not there.
+/// Counts the recordings of a folder; a hundred if the folder does not exist.
 fn recorded(data: &DataFeatures) -> Entries {
-    let files = mocap::listing::list(Path::new(&data.path), None).map_or(100, |listing| listing.clips.len());
+    let files = mocap::listing::list(&DataPath::local(&data.path), None).map_or(100, |listing| listing.clips.len());
     divided(files, data.mirror, data.val, data.test)
 }
 

@@ -1,4 +1,4 @@
-//! The worker processes of `trainer run`: started, watched, started again when they die, and ended.
+//! The worker processes of `trainer run`: started, watched, restarted when they die, and ended.
 
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
@@ -13,21 +13,21 @@ use tokio::process::{Child, Command};
 use crate::out_of_memory::Watch;
 use crate::problem::{Problem, Result};
 
-/// A worker that lives shorter than this has died at its start.
+/// A shorter life counts as an early death.
 const SHORT_LIFE: Duration = Duration::from_secs(5);
-/// So much of what a dead worker said is looked at; a back trace may follow the words that count.
+/// Bytes of a dead worker's log that are read; a backtrace may follow the relevant message.
 const LAST_WORDS: usize = 256 << 10;
-/// So many early deaths in a row and the worker is given up.
+/// Consecutive early deaths after which the worker is given up.
 const EARLY_DEATHS: u32 = 5;
 
-/// A worker's process, if it lives.
+/// A worker with its process, if one is running.
 #[derive(Debug)]
 struct Member {
     name: WorkerId,
     device: usize,
     child: Option<Child>,
     since: Instant,
-    /// Where its words begin in the log, which is that of all its lives.
+    /// Offset of the current process in the log, which all processes of the worker share.
     log_from: u64,
     early_deaths: u32,
     next_start: Instant,
@@ -45,19 +45,19 @@ pub(crate) struct Fleet {
     memory: Watch,
 }
 
-/// A worker's process that has ended.
+/// The death of a worker process.
 #[derive(Debug)]
 pub(crate) struct Death {
     pub(crate) worker: WorkerId,
-    /// Why, if it was for want of memory.
+    /// Explanation if the process died for lack of memory.
     pub(crate) out_of_memory: Option<String>,
 }
 
 impl Fleet {
-    /// Starts `count` workers for `coordinator`, which holds `store`. What they say goes to files in its folder `workers`.
+    /// Starts `count` workers for `coordinator`, which holds `store`. Their logs are in its folder `workers`.
     pub(crate) fn start(count: usize, coordinator: &Handle, backend: Backend, store: &Path) -> Result<Self> {
         let logs = store.join("workers");
-        // Their place is a comfort: without the folder they are silent.
+        // Logs are optional: without the folder, the workers' output is discarded.
         let _ = std::fs::create_dir_all(&logs);
         let devices = device_count(backend);
         let now = Instant::now();
@@ -71,7 +71,7 @@ impl Fleet {
             next_start: now,
         };
         let members = (0..count).map(member).collect();
-        let (url, token) = (coordinator.local_url(), coordinator.token().clone());
+        let (url, token) = (coordinator.local_url(), coordinator.worker_token().clone());
         let mut fleet = Self { members, url, token, backend, store: store.to_owned(), logs, memory: Watch::new() };
         for i in 0..count {
             fleet.spawn(i)?;
@@ -88,18 +88,19 @@ impl Fleet {
         let member = &mut self.members[i];
         member.log_from = std::fs::metadata(&log).map_or(0, |log| log.len());
         let child = Command::new(program)
-            .args(["worker", "join", &self.url, "--name", member.name.as_str(), "--die-with-parent"])
+            .args(["worker", "join", &self.url, "--name", member.name.as_str(), "--die-with-parent", "--any-file"])
             .args(["--backend", self.backend.name(), "--device", &member.device.to_string(), "--store"])
             .arg(&self.store)
-            // Not an argument, which every user of the machine can read.
+            // Not an argument, because every user of the machine can read arguments.
             .env("STRIDE_TOKEN", self.token.secret())
-            // Ours are of another server.
+            // Our own settings are for another server.
             .env_remove("STRIDE_TOKEN_FILE")
             .env_remove("STRIDE_CA")
+            .env_remove("STRIDE_DATA_ROOT")
             .stdin(Stdio::null())
             .stdout(Stdio::null())
             .stderr(stderr)
-            // Ctrl-C in the terminal is for us; we tell them.
+            // Ctrl-C in the terminal is for this process, which tells the workers.
             .process_group(0)
             .kill_on_drop(true)
             .spawn()
@@ -113,7 +114,7 @@ impl Fleet {
         self.logs.join(format!("{worker}.log"))
     }
 
-    /// Collects workers that have died, and starts them again once their time has come. Gives the dead.
+    /// Collects dead workers and restarts them when their pause is over. Returns the deaths.
     pub(crate) fn reap(&mut self, restart: bool) -> Result<Vec<Death>> {
         let mut dead = Vec::new();
         self.memory.look();
@@ -147,15 +148,15 @@ impl Fleet {
         Ok(dead)
     }
 
-    /// Whether any worker lives.
+    /// Returns true if a worker is running.
     pub(crate) fn is_alive(&self) -> bool {
         self.members.iter().any(|member| member.child.is_some())
     }
 
-    /// Ends all workers at once. Only for when nothing of theirs is needed any more.
+    /// Kills all workers. Only for the case that their results are no longer needed.
     pub(crate) async fn kill(&mut self) {
         for child in self.members.iter_mut().filter_map(|member| member.child.as_mut()) {
-            // It may have ended by itself.
+            // It may have ended already.
             let _ = child.start_kill();
         }
         for member in &mut self.members {
@@ -166,7 +167,7 @@ impl Fleet {
     }
 }
 
-/// The end of what stands in the file behind `from`.
+/// The end of a file's text after offset `from`.
 fn last_words(path: &Path, from: u64) -> String {
     let bytes = std::fs::read(path).unwrap_or_default();
     let from = usize::try_from(from).unwrap_or(usize::MAX).clamp(bytes.len().saturating_sub(LAST_WORDS), bytes.len());
@@ -178,7 +179,7 @@ fn last_lines(text: &str, count: usize) -> String {
     lines[lines.len().saturating_sub(count)..].join("\n")
 }
 
-/// How many workers a backend gets when nobody says: one a core on CPU, one a device on GPU.
+/// Default number of workers of a backend: one per core on CPU, one per device on GPU.
 pub(crate) fn default_size(backend: Backend) -> usize {
     match backend {
         Backend::Flex | Backend::Ndarray => std::thread::available_parallelism().map_or(1, usize::from),
@@ -186,7 +187,7 @@ pub(crate) fn default_size(backend: Backend) -> usize {
     }
 }
 
-/// Devices of a backend, at least 1: a backend that has none says so itself, when a worker opens it.
+/// Devices of a backend, at least 1. A worker that opens a backend without devices reports the error.
 fn device_count(backend: Backend) -> usize {
     let here = |device: &models::device::DeviceInfo| device.backend == backend && device.index.is_some();
     models::device::available().iter().filter(|device| here(device)).count().max(1)

@@ -1,5 +1,5 @@
-//! Text encoders that a pipeline names as the Hugging Face hub does: the folder in the hub's cache takes the name's place before anything is digested, so that all else
-//! sees a folder.
+//! Text encoders that a pipeline names by their Hugging Face hub id. The folder in the hub's cache replaces the id
+//! before anything is digested, so that later code sees only folders.
 
 use std::path::Path;
 
@@ -11,7 +11,7 @@ use crate::missing::Missing;
 use crate::print;
 use crate::problem::{Problem, Result};
 
-/// The encoder that `settings` name on the hub; none if they name a folder or need none.
+/// The encoder that `settings` name on the hub; `None` if they name a folder or need none.
 fn named(settings: &TextEmbed) -> Option<(Name, Encoder)> {
     let encoder = match settings.encoder {
         TextEncoder::Hashed => return None,
@@ -19,14 +19,14 @@ fn named(settings: &TextEmbed) -> Option<(Name, Encoder)> {
         TextEncoder::T5 => Encoder::T5,
         TextEncoder::SentenceT5 => Encoder::SentenceT5,
     };
-    // A link that leads nowhere is a folder that is missing.
+    // A link with a missing target is a missing folder.
     if Path::new(&settings.path).symlink_metadata().is_ok() {
         return None;
     }
     Some((Name::of(&settings.path, &settings.revision)?, encoder))
 }
 
-/// Puts the folder in the name's place; the revision has done its work.
+/// Replaces the name by the folder and clears the revision, which is no longer needed.
 fn place(settings: &mut TextEmbed, folder: &Path) {
     settings.path = std::path::absolute(folder).unwrap_or_else(|_| folder.to_owned()).display().to_string();
     settings.revision.clear();
@@ -39,7 +39,7 @@ fn encoders(pipeline: &mut Pipeline) -> impl Iterator<Item = (String, &mut TextE
     })
 }
 
-/// Refuses a revision of what has none.
+/// Refuses a revision of a folder, which has none.
 fn check_revision(stage: &str, settings: &TextEmbed) -> Result<()> {
     if settings.revision.is_empty() || settings.encoder == TextEncoder::Hashed {
         return Ok(());
@@ -50,7 +50,7 @@ fn check_revision(stage: &str, settings: &TextEmbed) -> Result<()> {
         .hint("leave it out, or name the encoder as on huggingface.co, such as `openai/clip-vit-base-patch32`"))
 }
 
-/// Puts folders in the place of names, and fetches what is not in the cache.
+/// Replaces names by folders, and fetches those that are not in the cache.
 pub(crate) fn resolve(pipeline: &mut Pipeline) -> Result<()> {
     for (stage, settings) in encoders(pipeline) {
         let Some((name, encoder)) = named(settings) else {
@@ -58,7 +58,7 @@ pub(crate) fn resolve(pipeline: &mut Pipeline) -> Result<()> {
             continue;
         };
         let hub = Hub::new(Settings::of_environment());
-        // The client drives a runtime of its own, which this thread may do already.
+        // The client drives its own runtime, and this thread may already drive one.
         let found = std::thread::scope(|scope| {
             let fetching = scope.spawn(|| hub.folder(&name, encoder, &mut print::note));
             fetching.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))
@@ -76,7 +76,7 @@ fn refused(stage: &str, error: &HubError) -> Problem {
     Problem::usage(format!("stage `{stage}`: {error}")).hint(error.advice())
 }
 
-/// The same with what is in the cache alone. Gives the names that are not in it, and why.
+/// Like [`resolve`], but without fetching. Returns the names that are not in the cache, with reasons.
 pub(crate) fn resolve_cached(pipeline: &mut Pipeline) -> Result<Vec<(String, String)>> {
     let mut absent = Vec::new();
     for (stage, settings) in encoders(pipeline) {
@@ -97,7 +97,7 @@ pub(crate) fn resolve_cached(pipeline: &mut Pipeline) -> Result<Vec<(String, Str
     Ok(absent)
 }
 
-/// Says of names that they are no folders that are missing.
+/// Replaces the reason of missing paths that are hub names.
 pub(crate) fn explain(missing: &mut [Missing], absent: &[(String, String)]) {
     for one in missing {
         if let Some((_, why)) = absent.iter().find(|(path, _)| *path == one.path) {

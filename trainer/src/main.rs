@@ -1,7 +1,9 @@
 //! The `trainer` command: composition root of control plane and data plane.
 //!
-//! No logic of its own: it reads arguments and files, starts a coordinator and worker processes, and shows what they say.
+//! No logic of its own: it reads arguments and files, starts a coordinator and worker processes, and prints their
+//! results.
 
+mod advice;
 mod cli;
 mod client;
 mod cost;
@@ -27,7 +29,7 @@ use std::process::ExitCode;
 use clap::Parser;
 
 fn main() -> ExitCode {
-    // First of all: the allocator can be tuned only while there is one thread.
+    // First, because the allocator can be tuned only while there is one thread.
     worker::process::tune_allocator();
     registry::failpoints::arm_from_env();
     coordinator::failpoints::arm_from_env();

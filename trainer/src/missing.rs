@@ -1,8 +1,8 @@
-//! What a pipeline reads from outside the store, and whether it is on this machine: before anything is digested.
+//! Checks that the data which a pipeline reads from outside the store is on this machine, before it is digested.
 
 use std::path::Path;
 
-use motion::{Skeleton, npy};
+use motion::{DataPath, Skeleton, npy};
 use protocol::StageName;
 use protocol::pipeline::Pipeline;
 use protocol::stage::{Backend, DataFormat, ExternalFolder};
@@ -10,35 +10,35 @@ use serde::Serialize;
 
 use crate::problem::{Problem, Result};
 
-/// A folder that is not here, or lacks a file.
+/// A folder that does not exist or lacks a file.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub(crate) struct Missing {
-    /// Who reads it.
+    /// The stage that reads it.
     pub(crate) stage: StageName,
     /// The setting that names it.
     pub(crate) field: String,
     pub(crate) path: String,
-    /// What of it is not there.
+    /// The missing part.
     pub(crate) what: String,
-    /// What it is and where to get it.
+    /// Description of the data and its source.
     pub(crate) origin: &'static str,
 }
 
 impl Missing {
-    /// Which folder, what it lacks, and who reads it.
+    /// Names the folder, the missing part and the stage that reads it.
     pub(crate) fn place(&self) -> String {
         let Self { stage, field, path, what, .. } = self;
         let named = if field == "path" { stage.to_string() } else { format!("{stage}.{field}") };
         format!("{path}: {what}, for `{named}`")
     }
 
-    /// All that is known of it, in one line.
+    /// Describes the missing data in one line.
     pub(crate) fn line(&self) -> String {
         format!("{}: {}", self.place(), self.origin)
     }
 }
 
-/// All that is missing, in the order of the pipeline; what several stages read is named once.
+/// All missing data, in the order of the pipeline; a folder that several stages read appears once.
 pub(crate) fn missing(pipeline: &Pipeline) -> Vec<Missing> {
     let mut found: Vec<Missing> = Vec::new();
     for stage in &pipeline.stages {
@@ -53,14 +53,14 @@ pub(crate) fn missing(pipeline: &Pipeline) -> Vec<Missing> {
     found
 }
 
-/// What is not there of a folder.
+/// Describes the missing part of a folder.
 fn lacks(folder: &ExternalFolder) -> Option<String> {
     let path = Path::new(&folder.path);
     if !path.exists() {
         let file = path.extension().is_some() && folder.format.is_none() && folder.files.is_empty();
         return Some(if file { "no such file" } else { "no such folder" }.into());
     }
-    // What is wrong with a dataset's folder is told by who opens it, all of it at once.
+    // Opening a dataset's folder reports all its defects at once.
     if folder.format.is_some() || !path.is_dir() {
         return None;
     }
@@ -68,10 +68,10 @@ fn lacks(folder: &ExternalFolder) -> Option<String> {
     absent.map(|file| format!("no `{}` in it", file.split('|').collect::<Vec<_>>().join("` or `")))
 }
 
-/// Refuses a folder whose features have the width of another format, which its statistics tell.
+/// Refuses a folder whose features have the width of another format, according to its statistics.
 pub(crate) fn check_format(path: &Path, format: DataFormat) -> Result<()> {
-    // What else is wrong with the file is said by who opens the folder.
-    let Ok(mean) = npy::read_any_float(&path.join("Mean.npy")) else { return Ok(()) };
+    // Opening the folder reports other defects of the file.
+    let Ok(mean) = npy::read_any_float(&DataPath::local(path.join("Mean.npy"))) else { return Ok(()) };
     let width = |format| Skeleton::of(format).features;
     let found = mean.data.len();
     if found == width(format) {
@@ -91,7 +91,7 @@ pub(crate) fn check_format(path: &Path, format: DataFormat) -> Result<()> {
     )))
 }
 
-/// Refuses a backend that is not in this program, or has no device here.
+/// Refuses a backend that this program lacks or that has no device here.
 pub(crate) fn check_backend(backend: Backend) -> Result<()> {
     let problem = |error| Problem::usage(format!("`backend: {}`: {error}", backend.name()));
     models::device::open(backend, 0).map(drop).map_err(|error| {

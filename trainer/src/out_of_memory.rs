@@ -1,8 +1,11 @@
-//! Whether a worker died for want of memory.
+//! Detects that a worker died for lack of memory.
 //!
-//! Such a death is final: the next try would need as much. It is known in two cases. The worker was aborted because an allocation was
-//! refused, which its log says; or it was killed, and the kernel's count of kills for want of memory has just risen. Only the process that started
-//! the process can tell; a worker on another machine that dies so is a lost worker like any other.
+//! Such a death is final, because the next try would need as much. It is detected in two cases:
+//! - The worker was aborted because an allocation failed, which its log shows.
+//! - The worker was killed, and the kernel's count of out-of-memory kills has just risen.
+//!
+//! Only the parent of a process can detect this. A worker on another machine that dies this way is a lost worker like
+//! any other.
 
 use std::fs;
 use std::os::unix::process::ExitStatusExt;
@@ -12,10 +15,10 @@ use std::time::{Duration, Instant};
 
 use nix::sys::signal::Signal;
 
-/// A process that the kernel killed may take this long to free what it had and be gone.
+/// Longest time for a killed process to free its memory and end.
 const RECENT: Duration = Duration::from_secs(10);
 
-/// The kernel's count of processes that it killed for want of memory.
+/// The kernel's count of out-of-memory kills.
 #[derive(Debug)]
 pub(crate) struct Watch {
     source: Option<PathBuf>,
@@ -24,14 +27,14 @@ pub(crate) struct Watch {
 }
 
 impl Watch {
-    /// Counts from now.
+    /// Starts with the current count.
     pub(crate) fn new() -> Self {
         let source = sources().into_iter().find(|path| count(path).is_some());
         let seen = source.as_ref().and_then(count).unwrap_or_default();
         Self { source, seen, risen: None }
     }
 
-    /// Takes note of the count. To be called more often than processes die.
+    /// Reads the count. Call it more often than processes die.
     pub(crate) fn look(&mut self) {
         let now = self.source.as_ref().and_then(count).unwrap_or(self.seen);
         if now > self.seen {
@@ -40,7 +43,8 @@ impl Watch {
         self.seen = now;
     }
 
-    /// Why a process that ended like this, and said this, died for want of memory; `None` if it did not, or if nobody can tell.
+    /// Explains a death for lack of memory, from a process's exit status and its output. `None` if it died otherwise or
+    /// the cause is unknown.
     pub(crate) fn explain(&self, status: ExitStatus, said: &str) -> Option<String> {
         explain(status, said, self.risen.is_some_and(|risen| risen.elapsed() < RECENT))
     }
@@ -51,7 +55,7 @@ fn explain(status: ExitStatus, said: &str, kernel_killed: bool) -> Option<String
     let signal = Signal::try_from(status.signal()?).ok()?;
     match signal {
         Signal::SIGABRT => {
-            // The words of Rust's runtime, the last that such a process says.
+            // The message of Rust's runtime, the last output of such a process.
             let refused = said.lines().rev().find_map(|line| line.split_once("memory allocation of "))?.1;
             let (bytes, _) = refused.split_once(" bytes failed")?;
             Some(format!("is out of memory: an allocation of {bytes} bytes was refused; {ADVICE}"))
@@ -61,7 +65,7 @@ fn explain(status: ExitStatus, said: &str, kernel_killed: bool) -> Option<String
     }
 }
 
-/// Where the count may stand, the nearest first: our own control group's, which the workers share, then the machine's.
+/// Possible files of the count, nearest first: our own control group's, which the workers share, then the machine's.
 fn sources() -> Vec<PathBuf> {
     let groups = fs::read_to_string("/proc/self/cgroup").unwrap_or_default();
     let mut paths = Vec::new();
@@ -94,7 +98,7 @@ mod tests {
         let said = explain(by(Signal::SIGABRT), refused, false).expect("an allocation was refused");
         assert!(said.contains("4096 bytes"), "{said}");
         assert!(explain(by(Signal::SIGKILL), "", true).is_some());
-        // Killed by somebody else; aborted for another reason; ended by itself, whatever it said.
+        // Killed by another process; aborted for another reason; crashed; exited by itself with that output.
         assert_eq!(explain(by(Signal::SIGKILL), refused, false), None);
         assert_eq!(explain(by(Signal::SIGABRT), "stack overflow", true), None);
         assert_eq!(explain(by(Signal::SIGSEGV), refused, true), None);

@@ -1,4 +1,4 @@
-//! The pictures that stages drew, where a person finds them: copies in the store's folder, `pictures/RUN/STAGE-NAME`.
+//! Copies the pictures of stages to the store's folder for users: `pictures/RUN/STAGE-NAME`.
 
 use std::path::{Path, PathBuf};
 
@@ -8,13 +8,13 @@ use registry::Store;
 
 /// Ending of pictures among a stage's files.
 const ENDING: &str = ".png";
-/// A picture above this many bytes is left in the store; sheets have a few hundred thousand.
+/// A picture above this many bytes is not copied; sheets have a few hundred thousand.
 const LARGEST: u64 = 64 << 20;
 
-/// Copies what the stages of a run drew, and gives the copies by stage.
+/// Copies the pictures of a run's stages. Returns the copies by stage.
 ///
 /// # Errors
-/// Why one cannot be copied; those before it are there.
+/// The reason why one cannot be copied; the earlier copies remain.
 pub(crate) async fn save(store: &Store, run: &RunView) -> Result<Vec<(String, PathBuf)>, String> {
     let folder = store.dir().join("pictures").join(run.run.as_str());
     let blobs = store.blobs().clone();
@@ -47,7 +47,7 @@ fn pictures(manifest: &Manifest) -> impl Iterator<Item = (&str, Digest)> {
     drawn.map(|(name, file)| (name.as_str(), file.digest))
 }
 
-/// Writes beside and renames, so that nobody sees half a picture.
+/// Writes a temporary file and renames it, so that no reader sees half a picture.
 fn write(path: &Path, bytes: &[u8]) -> std::io::Result<()> {
     if let Some(folder) = path.parent() {
         std::fs::create_dir_all(folder)?;

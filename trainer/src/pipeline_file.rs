@@ -1,38 +1,74 @@
-//! A pipeline file on disk: read, checked, and its dataset folders looked at, all before a store is opened.
+//! A pipeline file on disk: reads and checks it and its dataset folders, before a store is opened.
 
 use std::io::Read as _;
-use std::path::Path;
+use std::os::unix::fs::FileTypeExt as _;
+use std::path::{Path, PathBuf};
 
-use motion::Dataset;
 use motion::folder_digest::{files_digest, folder_digest};
+use motion::{DataPath, Dataset};
 use protocol::pipeline::{self, Pipeline, PipelineStage};
 use protocol::stage::{DataFormat, ExternalFolder};
-use protocol::{Digest, StageName, limits};
+use protocol::{Digest, StageName, limits, spelling};
 use registry::ReadStore;
 
 use crate::hub_names;
 use crate::missing::{Missing, check_backend, check_format, missing};
 use crate::problem::{Problem, Result};
 
-/// A pipeline as read.
+/// A pipeline with its source text.
 #[derive(Debug)]
 pub(crate) struct PipelineFile {
     pub(crate) pipeline: Pipeline,
     pub(crate) source: String,
 }
 
-/// Reads and validates the file alone.
+/// Reads and validates only the file.
 pub(crate) fn read(path: &Path, sets: &[String]) -> Result<PipelineFile> {
     let name = path.display().to_string();
     let source = read_text(path).map_err(|error| {
         let problem = Problem::usage(format!("cannot read the pipeline `{name}`: {error}"));
-        if error.kind() == std::io::ErrorKind::NotFound {
-            problem.hint("shipped pipelines are in `configs/`; `trainer run configs/quickstart.yaml` needs no data")
-        } else {
-            problem
+        match error.kind() {
+            std::io::ErrorKind::NotFound => problem.hint(instead_of(path)),
+            std::io::ErrorKind::IsADirectory => problem.hint(inside(path)),
+            _ => problem,
         }
     })?;
     of_text(&name, source, sets)
+}
+
+/// The pipelines in a folder, by name.
+fn pipelines_in(folder: &Path) -> Vec<PathBuf> {
+    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
+    let is_yaml = |path: &PathBuf| path.extension().is_some_and(|ending| ending == "yaml" || ending == "yml");
+    let mut found: Vec<PathBuf> = entries.map(|entry| entry.path()).filter(is_yaml).collect();
+    found.sort();
+    found
+}
+
+/// Suggests an existing pipeline for a path that does not exist.
+fn instead_of(path: &Path) -> String {
+    let beside = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let known: Vec<PathBuf> = [beside, Path::new("configs")].into_iter().flat_map(pipelines_in).collect();
+    let stem = |path: &Path| path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+    let stems: Vec<String> = known.iter().map(|path| stem(path)).collect();
+    let near = spelling::nearest(&stem(path), stems.iter().map(String::as_str));
+    let near = near.and_then(|near| known.iter().find(|path| stem(path) == near));
+    near.map_or_else(
+        || "shipped pipelines are in `configs/`; `trainer run configs/quickstart.yaml` needs no data".to_owned(),
+        |near| format!("did you mean `{}`?", near.strip_prefix(".").unwrap_or(near).display()),
+    )
+}
+
+/// Suggests a pipeline inside a folder.
+fn inside(folder: &Path) -> String {
+    match pipelines_in(folder).as_slice() {
+        [] => "name a pipeline's file, such as `configs/quickstart.yaml`; it has none".to_owned(),
+        found => {
+            let names: Vec<String> = found.iter().take(8).map(|path| path.display().to_string()).collect();
+            let more = if found.len() > names.len() { ", ..." } else { "" };
+            format!("name one of its pipelines: {}{more}", names.join(", "))
+        }
+    }
 }
 
 /// Validates the text of a file called `name`.
@@ -45,9 +81,18 @@ pub(crate) fn of_text(name: &str, source: String, sets: &[String]) -> Result<Pip
     Ok(PipelineFile { pipeline, source })
 }
 
-/// A pipeline may come through a pipe (`<(...)`), so that only its end says how long it is.
+/// Reads a pipeline. It may come through a pipe of the shell (`<(...)`), so its length is unknown until the end. A
+/// named pipe in a folder is refused, because it may never have a writer.
 fn read_text(path: &Path) -> std::io::Result<String> {
     let mut bytes = Vec::new();
+    let of_the_shell = path.starts_with("/dev") || path.starts_with("/proc");
+    let found = std::fs::metadata(path)?.file_type();
+    if found.is_dir() {
+        return Err(std::io::Error::new(std::io::ErrorKind::IsADirectory, "it is a folder; expected a file"));
+    }
+    if found.is_fifo() && !of_the_shell {
+        return Err(std::io::Error::other("it is a named pipe; expected a file"));
+    }
     std::fs::File::open(path)?.take(limits::PIPELINE_BYTES + 1).read_to_end(&mut bytes)?;
     let refuse = |what: String| std::io::Error::new(std::io::ErrorKind::InvalidData, what);
     if bytes.len() as u64 > limits::PIPELINE_BYTES {
@@ -56,12 +101,13 @@ fn read_text(path: &Path) -> std::io::Result<String> {
     String::from_utf8(bytes).map_err(|error| refuse(format!("it is no UTF-8 text: {}", error.utf8_error())))
 }
 
-/// Reads the file and digests the folders it names, which must all be there; those that it names as the hub does are fetched.
+/// Reads the file and digests the folders that it names, which must all exist. Folders that it names by hub id are
+/// fetched.
 pub(crate) fn read_with_data(path: &Path, sets: &[String]) -> Result<PipelineFile> {
     with_data(read(path, sets)?)
 }
 
-/// Digests the folders that a pipeline names, which must all be there.
+/// Digests the folders that a pipeline names, which must all exist.
 pub(crate) fn with_data(mut file: PipelineFile) -> Result<PipelineFile> {
     hub_names::resolve(&mut file.pipeline)?;
     let missing = missing(&file.pipeline);
@@ -75,7 +121,7 @@ pub(crate) fn with_data(mut file: PipelineFile) -> Result<PipelineFile> {
     Ok(file)
 }
 
-/// As [`read_with_data`], and what is not there besides.
+/// Like [`read_with_data`], but also returns the missing data instead of refusing it.
 pub(crate) fn read_to_plan(path: &Path, sets: &[String]) -> Result<(PipelineFile, Vec<Missing>)> {
     let mut file = read(path, sets)?;
     check_backend(file.pipeline.backend)?;
@@ -86,7 +132,7 @@ pub(crate) fn read_to_plan(path: &Path, sets: &[String]) -> Result<(PipelineFile
     Ok((file, missing))
 }
 
-/// Digests the folders that are there.
+/// Digests the folders that exist.
 fn digest_folders(pipeline: &mut Pipeline) -> Result<()> {
     let absent: Vec<String> = missing(pipeline).into_iter().map(|one| one.path).collect();
     for stage in &mut pipeline.stages {
@@ -97,9 +143,9 @@ fn digest_folders(pipeline: &mut Pipeline) -> Result<()> {
             let content = match format {
                 Some(format) => {
                     check_format(Path::new(&path), format)?;
-                    folder_digest(Path::new(&path), format).map_err(bad_folder)?
+                    folder_digest(&DataPath::local(&path), format).map_err(bad_folder)?
                 }
-                None => files_digest(Path::new(&path))
+                None => files_digest(&DataPath::local(&path))
                     .map_err(|e| Problem::usage(format!("stage `{}`: {path}: {e}", stage.name)))?,
             };
             stage.external.insert(field, content);
@@ -108,7 +154,7 @@ fn digest_folders(pipeline: &mut Pipeline) -> Result<()> {
     Ok(())
 }
 
-/// Fills in what the versions of the registry stand for that the pipeline names; `None` is a store that does not exist yet.
+/// Fills in the registry versions that the pipeline names; `None` is a store that does not exist yet.
 pub(crate) async fn resolve_versions(pipeline: &mut Pipeline, store: Option<&ReadStore>) -> Result<()> {
     let named = || pipeline.stages.iter().find_map(|stage| Some((stage, stage.versions().into_iter().next()?)));
     match (store, named()) {
@@ -123,7 +169,7 @@ pub(crate) async fn resolve_versions(pipeline: &mut Pipeline, store: Option<&Rea
     }
 }
 
-/// Whether the stage of `--until` exists.
+/// Checks that the stage of `--until` exists.
 pub(crate) fn check_stage(pipeline: &Pipeline, until: Option<&StageName>) -> Result<()> {
     match until {
         Some(until) if pipeline.stage(until).is_none() => {
@@ -137,23 +183,23 @@ pub(crate) fn check_stage(pipeline: &Pipeline, until: Option<&StageName>) -> Res
     }
 }
 
-/// Opens the dataset folders whose content this store has not seen yet, so that what is wrong with them is said before
-/// anything is stored.
+/// Opens the dataset folders whose content is new to this store, so that their defects are reported before anything is
+/// stored.
 pub(crate) fn check_data(pipeline: &Pipeline, store: &Path) -> Result<()> {
     for (stage, folder, format) in dataset_folders(pipeline) {
         let seen = |digest: &Digest| store.join("seen").join(digest.hex()).exists();
         if !stage.external.get(&folder.field).is_some_and(seen) {
-            Dataset::open(Path::new(&folder.path), format).map_err(bad_folder)?;
+            Dataset::open(&DataPath::local(&folder.path), format).map_err(bad_folder)?;
         }
     }
     Ok(())
 }
 
-/// Remembers which folders were good, so that they are not opened twice. A hint only: `data.open` checks again.
+/// Remembers which folders were valid, so that they are not opened twice. Only a hint: `data.open` checks again.
 pub(crate) fn remember_data(pipeline: &Pipeline, store: &Path) {
     for digest in dataset_folders(pipeline).filter_map(|(stage, folder, _)| stage.external.get(&folder.field)) {
         let seen = store.join("seen");
-        // Losing the note costs one more look at the folder.
+        // If the note is lost, the folder is merely opened once more.
         let _ = std::fs::create_dir_all(&seen).and_then(|()| std::fs::write(seen.join(digest.hex()), b""));
     }
 }

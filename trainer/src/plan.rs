@@ -1,4 +1,5 @@
-//! `trainer plan`: what a run would do and why, from keys, checkpoints and the newest run of the same name. Runs nothing.
+//! `trainer plan`: shows what a run would do and why, from keys, checkpoints and the newest run of the same name. Runs
+//! nothing.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -17,7 +18,7 @@ use crate::missing::Missing;
 use crate::problem::Result;
 use crate::{fleet, print};
 
-/// What would happen to a stage.
+/// Plan of a stage.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub(crate) struct Step {
     pub(crate) stage: StageName,
@@ -28,9 +29,9 @@ pub(crate) struct Step {
     pub(crate) key: Option<Digest>,
     /// Updates of a training stage.
     pub(crate) steps: Option<u64>,
-    /// Of what it trains, if that was tried.
+    /// Number of trained parameters, if the stage was tried.
     pub(crate) parameters: Option<u64>,
-    /// Of one worker, if it was tried: about.
+    /// Estimated seconds with one worker, if the stage was tried.
     pub(crate) seconds: Option<f64>,
 }
 
@@ -40,15 +41,15 @@ pub(crate) struct Plan {
     schema_version: u32,
     pipeline: String,
     pub(crate) stages: Vec<Step>,
-    /// Folders that a run would ask for in vain.
+    /// Folders that a run would need but that are missing.
     pub(crate) missing: Vec<Missing>,
     pub(crate) device: String,
-    /// Worker processes that `run` starts when nobody says.
+    /// Default number of worker processes of `run`.
     pub(crate) workers: usize,
 }
 
 impl Plan {
-    /// Adds what the stages were found to take.
+    /// Adds estimates to the stages.
     pub(crate) fn estimate(&mut self, estimates: &BTreeMap<StageName, Estimate>) {
         for step in &mut self.stages {
             if let Some(Estimate { parameters, seconds }) = estimates.get(&step.stage) {
@@ -57,7 +58,7 @@ impl Plan {
         }
     }
 
-    /// As people read it, in lines of at most [`COLUMNS`].
+    /// The plan as text, in lines of at most [`COLUMNS`].
     pub(crate) fn screen(&self, pipeline: &Pipeline) -> String {
         let Self { pipeline: name, device, workers, .. } = self;
         let mut text = format!("{name}, seed {}, on {device}, {workers} worker(s)\n", pipeline.seed);
@@ -96,7 +97,7 @@ impl Plan {
         let (mut seconds, mut untried) = (0.0, 0);
         for step in runs {
             seconds += step.seconds.unwrap_or(0.0);
-            // Stages of other kinds take no time worth a word.
+            // Stages of other kinds take negligible time.
             let long = ["train.", "distill.", "encode.", "evaluate."].iter().any(|kind| step.kind.starts_with(kind));
             untried += usize::from(step.seconds.is_none() && long);
         }
@@ -121,10 +122,10 @@ impl Plan {
     }
 }
 
-/// Columns of a screen.
+/// Width of a screen.
 const COLUMNS: usize = 100;
 
-/// The beginning of a line that is too long.
+/// Truncates a line that is too long.
 fn cut(line: &str, columns: usize) -> String {
     if line.chars().count() <= columns {
         return line.to_owned();
@@ -132,7 +133,7 @@ fn cut(line: &str, columns: usize) -> String {
     line.chars().take(columns - 1).chain(['…']).collect()
 }
 
-/// `18.06M`, `612k`.
+/// Formats a count: `18.06M`, `612k`.
 fn short(count: u64) -> String {
     match count {
         0..1_000 => count.to_string(),
@@ -141,13 +142,13 @@ fn short(count: u64) -> String {
     }
 }
 
-/// As [`print::duration`], in days where those are many.
+/// Like [`print::duration`], but in days from three days on.
 fn long(seconds: f64) -> String {
     const DAY: f64 = 86_400.0;
     if seconds < 3.0 * DAY { print::duration(seconds) } else { format!("{:.0} days", seconds / DAY) }
 }
 
-/// Keys that are decided already, and the outputs of stages that are known.
+/// Keys that are already known, and the outputs of finished stages.
 struct Known {
     keys: BTreeMap<StageName, Digest>,
     outputs: BTreeMap<StageName, Digest>,
@@ -171,7 +172,7 @@ async fn known(pipeline: &Pipeline, store: Option<&ReadStore>) -> Result<Known> 
         let inputs: Option<BTreeMap<String, Digest>> =
             stage.inputs.iter().map(|input| Some((input.field.clone(), *known.outputs.get(&input.stage)?))).collect();
         let Some(inputs) = inputs else { continue };
-        // Without a folder's content there is no key.
+        // A key needs the content of all folders.
         if !stage.settings.folders().iter().all(|folder| stage.external.contains_key(&folder.field)) {
             continue;
         }
@@ -187,7 +188,8 @@ async fn known(pipeline: &Pipeline, store: Option<&ReadStore>) -> Result<Known> 
     Ok(known)
 }
 
-/// The best trial of a sweep, if the store has all that the sweep would ask for: the searcher is asked, with the store's results.
+/// The best trial of a sweep, if the store has all results that the sweep needs. The searcher runs on the store's
+/// results.
 async fn best_of_sweep(
     pipeline: &Pipeline,
     stage: &PipelineStage,
@@ -229,7 +231,7 @@ async fn best_of_sweep(
     Ok(search.best().and_then(|(trial, _)| made.remove(&rung_name(&stage.name, trial, last))))
 }
 
-/// Says what a run of `pipeline` on `store` would do; `None` is a store that does not exist yet.
+/// Plans a run of `pipeline` on `store`; `None` is a store that does not exist yet.
 pub(crate) async fn plan(pipeline: &Pipeline, store: Option<&ReadStore>) -> Result<Plan> {
     let now = known(pipeline, store).await?;
     let mut resumable = BTreeMap::new();
@@ -277,7 +279,7 @@ pub(crate) async fn plan(pipeline: &Pipeline, store: Option<&ReadStore>) -> Resu
     }
     let backend = pipeline.backend;
     let device = models::device::available().into_iter().find(|device| device.backend == backend);
-    // `CPU`, of a note that goes on.
+    // The part of a note before its first comma, such as `CPU`.
     let device = device.and_then(|device| device.note.split(',').next().map(str::to_owned)).unwrap_or_default();
     Ok(Plan {
         schema_version: 1,
@@ -289,8 +291,8 @@ pub(crate) async fn plan(pipeline: &Pipeline, store: Option<&ReadStore>) -> Resu
     })
 }
 
-/// The run, step and checkpoint that each unfinished training stage would resume from, for people. Stages of runs that ended are found by key; only runs that have not
-/// ended are read, each once.
+/// Describes the run, step and checkpoint from which each unfinished training stage would resume. Stages of ended runs
+/// are found by key. Only runs that have not ended are read, each once.
 async fn checkpoints(
     pipeline: &Pipeline,
     now: &Known,
@@ -312,7 +314,7 @@ async fn checkpoints(
     let keys: Vec<Digest> = unfinished.keys().copied().collect();
     let mut begun: Vec<(Digest, (RunId, StageName))> = store.sources(&keys).await?.into_iter().collect();
     for row in runs.iter().filter(|row| !has_ended(row)) {
-        // A run of another build may not read.
+        // The pipeline of another build may not parse.
         let Ok(other) = serde_json::from_value::<Pipeline>(row.pipeline.clone()) else { continue };
         for (stage, key) in known(&other, Some(store)).await?.keys {
             begun.push((key, (row.run.clone(), stage)));
@@ -337,14 +339,14 @@ fn has_ended(row: &RunRow) -> bool {
     serde_json::from_value(Value::String(row.state.clone())).is_ok_and(RunState::is_final)
 }
 
-/// The pipelines of earlier runs of this name, newest first. A run of another build that does not read is left out.
+/// The pipelines of earlier runs of this name, newest first. Skips runs of another build that do not parse.
 fn earlier_runs(name: &str, mut rows: Vec<RunRow>) -> Vec<Pipeline> {
     rows.retain(|row| row.pipeline.get("name").and_then(Value::as_str) == Some(name));
     rows.sort_by_key(|row| std::cmp::Reverse(row.created_ms));
     rows.into_iter().filter_map(|row| serde_json::from_value(row.pipeline).ok()).collect()
 }
 
-/// What tells a stage from the same one of the newest run of that name.
+/// Describes the differences of a stage from the same stage in the newest run of that name.
 fn difference(pipeline: &Pipeline, stage: &PipelineStage, earlier: &[Pipeline]) -> String {
     let before = earlier.iter().find_map(|other| Some((other, other.stage(&stage.name)?)));
     let Some((other, before)) = before else { return "never run".into() };
@@ -430,7 +432,7 @@ mod tests {
     async fn a_recipe_without_its_data_is_one_screen() {
         let file = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/motionpcm.yaml");
         let text = std::fs::read_to_string(file).expect("a shipped recipe");
-        // Folders that are nowhere, whatever lies beside the tests.
+        // Paths that do not exist, independent of the folders beside the tests.
         let text = text.replace("path: data/", "path: nowhere/data/").replace(" deps/", " nowhere/deps/");
         let pipeline = protocol::pipeline::read("p.yaml", &text, &[]).unwrap_or_else(|mistakes| panic!("{mistakes}"));
         let mut plan = plan(&pipeline, None).await.unwrap_or_else(|problem| panic!("{problem:?}"));

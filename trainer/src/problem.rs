@@ -1,13 +1,29 @@
-//! What went wrong, as the user sees it: the chain of causes, a blank line, `hint:`, and an exit code.
+//! Errors as the user sees them: the chain of causes, a blank line, `hint:`, and an exit code.
 
 use std::fmt::Display;
 
-/// Exit codes. 1 is a run or a request that failed.
+/// Exit codes, one meaning each.
 pub(crate) mod exit {
+    /// The table of `--help`.
+    pub(crate) const HELP: &str = "\
+Exit codes:
+    0  done
+    1  what was asked for failed, such as a run
+    2  wrong usage, a wrong file or a store that cannot be used; nothing was changed
+    3  a fault of this program; please report it
+    4  a conflict with what is stored
+    5  the token is missing or not enough
+    6  the server does not answer
+    7  there is no such run, stage or model
+    8  the run was cancelled
+    9  stored data is damaged
+   10  a gate does not hold; nothing was changed
+  130  interrupted; the same command continues";
+
     pub(crate) const FAILED: u8 = 1;
     pub(crate) const USAGE: u8 = 2;
     pub(crate) const FAULT: u8 = 3;
-    pub(crate) const NOT_FOUND: u8 = 3;
+    pub(crate) const NOT_FOUND: u8 = 7;
     pub(crate) const CONFLICT: u8 = 4;
     pub(crate) const UNAUTHORISED: u8 = 5;
     pub(crate) const UNREACHABLE: u8 = 6;
@@ -16,7 +32,7 @@ pub(crate) mod exit {
     pub(crate) const INTERRUPTED: u8 = 130;
 }
 
-/// An error with what to do about it.
+/// An error with a hint and an exit code.
 #[derive(Debug)]
 pub(crate) struct Problem {
     pub(crate) error: anyhow::Error,
@@ -24,7 +40,7 @@ pub(crate) struct Problem {
     pub(crate) exit: u8,
 }
 
-/// What most of the command returns.
+/// Result of most functions of the command.
 pub(crate) type Result<T, E = Problem> = std::result::Result<T, E>;
 
 impl Problem {

@@ -1,57 +1,68 @@
-//! Commands that only read ask the best source: the server that is named, the coordinator that holds the store, or, where nobody
-//! holds it, the store itself. They start nothing and leave the store as it is.
+//! Source of commands that only read: the named server, the coordinator that holds the store, or a store without a
+//! coordinator. They start nothing and leave the store unchanged.
 
+use coordinator::shell::CurveSeries;
 use coordinator::{Records, WorkerView};
 use protocol::message::RunView;
-use protocol::{Digest, RunId, StageName};
-use registry::LogRow;
+use protocol::{Digest, RunId, StageName, limits};
 use registry::cli::{Answer, Command};
+use registry::{LogRow, Page, Point, Window};
 
 use crate::client::{Client, Target};
 use crate::problem::{Problem, Result, exit};
 
-/// Lines of a log that are asked for at once.
+/// Lines of a log per request.
 const LINES: u32 = 1000;
 
-/// What can be asked about runs and models.
+/// A source of runs and models.
 #[derive(Debug)]
 pub(crate) enum Reader {
-    /// A coordinator that runs.
-    Server(Client),
-    /// A store that nobody holds.
+    /// A running coordinator.
+    Server(Box<Client>),
+    /// A store that no coordinator holds.
     Store(Box<Records>),
 }
 
 impl Reader {
-    /// Finds what answers for `target`.
+    /// Opens the source for `target`.
     pub(crate) async fn open(target: &Target) -> Result<Self> {
         match Client::running(target).await? {
-            Some(client) => Ok(Self::Server(client)),
+            Some(client) => Ok(Self::Server(Box::new(client))),
             None => Ok(Self::Store(Box::new(Records::open(&target.store).await?))),
         }
     }
 
-    /// Lets go of the store, for somebody who wants to hold it.
+    /// Closes the store, so that a coordinator can open it.
     pub(crate) async fn close(self) {
         if let Self::Store(records) = self {
             records.close().await;
         }
     }
 
-    /// Whether what is read may change: a coordinator is at work.
+    /// Returns true if a coordinator is running, so that the data may change.
     pub(crate) fn is_live(&self) -> bool {
         matches!(self, Self::Server(_))
     }
 
     /// All runs by submission.
     pub(crate) async fn runs(&self) -> Result<Vec<RunView>> {
-        self.newest_runs(1_000_000).await
+        let mut all = Vec::new();
+        loop {
+            let before = all.last().map(|run: &RunView| run.run.clone());
+            let mut part = self.runs_before(before.as_ref(), limits::RUNS_LISTED).await?;
+            if part.is_empty() {
+                all.reverse();
+                return Ok(all);
+            }
+            part.reverse();
+            all.append(&mut part);
+        }
     }
 
-    /// Runs that go on, and of those that ended the newest `ended`.
-    async fn newest_runs(&self, ended: u32) -> Result<Vec<RunView>> {
+    /// The newest runs by submission, or those before a run.
+    async fn runs_before(&self, before: Option<&RunId>, limit: u32) -> Result<Vec<RunView>> {
         let records = match self {
-            Self::Server(client) => return client.newest_runs(ended).await,
+            Self::Server(client) => return client.runs_before(before, limit).await,
             Self::Store(records) => records,
         };
         let read = |view: String| {
@@ -60,7 +71,7 @@ impl Reader {
                     .hint("use the build that wrote it")
             })
         };
-        records.run_views(ended).await?.into_iter().map(read).collect()
+        records.run_views(before, limit).await?.into_iter().map(read).collect()
     }
 
     pub(crate) async fn run(&self, run: &RunId) -> Result<RunView> {
@@ -77,6 +88,34 @@ impl Reader {
         }
     }
 
+    /// The curves of a run in buckets; of all stages and keys, or of those named.
+    pub(crate) async fn curves(
+        &self,
+        run: &RunId,
+        stage: Option<&str>,
+        keys: &[String],
+        window: &Window,
+    ) -> Result<Vec<CurveSeries>> {
+        let records = match self {
+            Self::Server(client) => return client.curves(run, stage, keys, window).await,
+            Self::Store(records) => records,
+        };
+        let (stage, keys) = (stage.map(StageName::new), (!keys.is_empty()).then_some(keys));
+        let stages = records.buckets(run, stage.as_ref(), keys, window).await?;
+        Ok(CurveSeries::of(run, stages))
+    }
+
+    /// A part of the values of one key of a stage.
+    pub(crate) async fn points(&self, run: &RunId, stage: &str, key: &str, page: Page) -> Result<Vec<Point>> {
+        let (name, keys) = (StageName::new(stage), [key.to_owned()]);
+        let mut stages = match self {
+            Self::Server(client) => client.points(run, stage, key, page).await?,
+            Self::Store(records) => records.points(run, Some(&name), Some(&keys), page).await?,
+        };
+        let curve = stages.remove(&name).and_then(|mut curves| curves.remove(key));
+        Ok(curve.map(|curve| curve.points).unwrap_or_default())
+    }
+
     pub(crate) async fn workers(&self) -> Result<Vec<WorkerView>> {
         match self {
             Self::Server(client) => client.workers().await,
@@ -84,7 +123,7 @@ impl Reader {
         }
     }
 
-    /// Asks the registry something that changes nothing.
+    /// Sends a read-only command to the registry.
     pub(crate) async fn registry(&self, command: &Command) -> Result<Answer> {
         match self {
             Self::Server(client) => client.registry(command).await,
@@ -103,9 +142,9 @@ impl Reader {
         read.map_err(|error| Problem::failed(error).hint("`trainer registry fsck` checks the store"))
     }
 
-    /// The run that `text` means: its name, a unique beginning of it, or `@last`.
+    /// Finds a run by its name, a unique beginning of it, or `@last`.
     pub(crate) async fn find(&self, text: &str) -> Result<RunView> {
-        let runs = if text == "@last" { self.newest_runs(1).await? } else { self.runs().await? };
+        let runs = if text == "@last" { self.runs_before(None, 1).await? } else { self.runs().await? };
         let not_found = |message: String| Problem::new(exit::NOT_FOUND, anyhow::anyhow!("{message}"));
         if text == "@last" {
             return runs.into_iter().next_back().ok_or_else(|| {

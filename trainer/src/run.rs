@@ -1,16 +1,17 @@
-//! `trainer run`: a coordinator, its workers and a pipeline, from start to end or to Ctrl-C.
+//! `trainer run`: runs a coordinator, its workers and a pipeline, to the end or to Ctrl-C.
 
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use coordinator::shell::raise_descriptor_limit;
-use coordinator::{Config, Control, Coordinator, Handle, Trouble, WorkerView};
+use coordinator::{Config, Control, Coordinator, Handle, Trouble};
 use protocol::message::{FailureClass, RunState, RunView, StageState, Submit};
 use protocol::pipeline::Pipeline;
 use protocol::{RunId, StageName};
 use registry::{Holder, Place, Store};
 use tokio::signal::unix::{Signal, SignalKind, signal};
 
+use crate::advice::advice;
 use crate::fleet::{self, Death, Fleet};
 use crate::missing::check_backend;
 use crate::pipeline_file::PipelineFile;
@@ -20,24 +21,26 @@ use crate::progress::Progress;
 use crate::summary::{self, Summary};
 use crate::{client, pictures, pipeline_file};
 
-/// How often workers and progress are looked at.
+/// Interval at which workers and progress are checked.
 const BEAT: Duration = Duration::from_millis(200);
-/// How long draining may take before workers are ended.
+/// Longest time for draining before workers are killed.
 const PATIENCE: Duration = Duration::from_secs(45);
 
-/// What to run, and how.
+/// Options of a run.
 #[derive(Debug)]
 pub(crate) struct Options {
     pub(crate) store: PathBuf,
-    /// Where the blobs lie, if that was said.
+    /// Location of the blobs, if it is given.
     pub(crate) blobs: Option<Place>,
     pub(crate) workers: Option<usize>,
     pub(crate) output: Output,
-    /// The command as typed, to show how to go on.
+    /// Print a link to the page.
+    pub(crate) ui: bool,
+    /// The command as typed, to show how to continue.
     pub(crate) command: String,
 }
 
-/// A pipeline, or a run of the store to take up again.
+/// A new pipeline, or a run of the store to continue.
 #[derive(Debug)]
 pub(crate) enum Request {
     Submit { file: Box<PipelineFile>, until: Option<StageName> },
@@ -65,14 +68,14 @@ impl Stop {
     }
 }
 
-/// How the watching ended.
+/// Reason for the end of watching.
 enum End {
     Final,
     Interrupted { killed: bool },
     Trouble(Trouble),
 }
 
-/// Runs to the end and gives the exit code.
+/// Runs to the end and returns the exit code.
 pub(crate) async fn run(request: Request, options: Options) -> Result<u8> {
     let mut stop = Stop::new()?;
     if options.workers == Some(0) {
@@ -82,6 +85,7 @@ pub(crate) async fn run(request: Request, options: Options) -> Result<u8> {
         pipeline_file::check_stage(&file.pipeline, until.as_ref())?;
         check_backend(file.pipeline.backend)?;
         pipeline_file::check_data(&file.pipeline, &options.store)?;
+        advice(&file.pipeline).iter().for_each(|note| print::note(&format!("note: {note}")));
     }
     let holder = Holder::this_process(&*options.command);
     let store = match &request {
@@ -96,8 +100,12 @@ pub(crate) async fn run(request: Request, options: Options) -> Result<u8> {
     let (run, pipeline) = begin(&handle, &store, request).await?;
     pipeline_file::remember_data(&pipeline, &dir);
     let bars = options.output == Output::Table && print::on_terminal();
-    let mut progress = Progress::new(bars);
+    let mut progress =
+        Progress::new(bars, &pipeline, "all of this run are busy or starting, and `--workers N` has N of them");
     progress.note(&format!("run {run} in {}", client::shown(&options.store)));
+    if options.ui {
+        progress.note(&format!("page {}", handle.page_link()));
+    }
 
     let mut fleet = None;
     let watched = watch(&handle, &run, &pipeline, &options, &mut progress, &mut fleet, &mut stop).await;
@@ -110,11 +118,13 @@ pub(crate) async fn run(request: Request, options: Options) -> Result<u8> {
     let end = watched?;
     let view = view.map_err(|error| Problem::new(exit::FAULT, error))?;
     let exit = report(&view, &pipeline, &end, &options);
-    if view.state == RunState::Finished && options.output == Output::Table {
+    if view.state == RunState::Finished {
         match pictures::save(&store, &view).await {
-            Ok(copies) => copies.iter().for_each(|(stage, path)| {
+            Ok(copies) if options.output == Output::Table => copies.iter().for_each(|(stage, path)| {
                 print::out(&format!("{stage} drew {}", client::shown(path)));
             }),
+            // Programs find the pictures by their path.
+            Ok(_) => {}
             Err(why) => print::note(&format!("pictures of the run were not copied: {why}")),
         }
     }
@@ -178,38 +188,29 @@ async fn watch(
             () = tokio::time::sleep(BEAT) => {}
             () = stop.asked() => return drain(handle, run, progress, fleet, stop).await,
         }
-        // A training step may change something ten times a second; nobody reads so fast.
+        // A training step may change values ten times a second, faster than anyone can read.
         if fleet.is_some() {
             tokio::time::sleep(BEAT / 4).await;
         }
     }
 }
 
-/// Tells the coordinator that a worker has died, and what of.
+/// Reports the death of a worker and its cause to the coordinator.
 async fn report_death(handle: &Handle, death: &Death) {
     if let Some(why) = &death.out_of_memory {
-        // Said in the worker's own name, as it would have said it: with a grant that still holds, and never again with one that does not.
-        let held = handle.workers().into_iter().find(|view| view.worker == death.worker && view.task.is_some());
-        if let Some(view) = held
-            && let Err(problem) = fail_for(handle, &view, why).await
-        {
-            tracing::warn!(worker = %death.worker, "its work is tried again: {}", problem.error);
+        // Reported as by the worker itself: under a grant that still holds.
+        let message = format!("worker `{}` {why}", death.worker);
+        if let Err(error) = handle.fail_for(&death.worker, FailureClass::OutOfMemory, message).await {
+            tracing::warn!(worker = %death.worker, "its work is tried again: {error}");
         }
     }
-    // A worker that never joined is not known; then there is nothing to take from it.
+    // A worker that never joined is unknown and holds no work.
     let _ = handle.worker_gone(&death.worker).await;
 }
 
-async fn fail_for(handle: &Handle, dead: &WorkerView, why: &str) -> Result<()> {
-    let client = client::Client::of(handle)?;
-    let message = format!("worker `{}` {why}", dead.worker);
-    client.fail_for(&dead.worker, dead.incarnation, FailureClass::OutOfMemory, &message).await
-}
-
-/// Whether a stage waits for somebody to do it. A run whose stages are all known needs no workers.
+/// Returns true if a stage waits for a worker. A run whose stages are all cached needs none.
 fn wants_workers(view: &RunView) -> bool {
-    let waits = |stage: &protocol::message::StageView| stage.state == StageState::Ready && stage.message.is_some();
-    view.state == RunState::Running && view.stages.iter().any(waits)
+    view.state == RunState::Running && view.stages.iter().any(|stage| stage.wants_workers.is_some())
 }
 
 async fn drain(

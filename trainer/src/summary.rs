@@ -1,25 +1,32 @@
-//! What a run came to: a table for people, one object for programs.
+//! Result of a run: a table for people, one object for programs.
 
 use std::collections::BTreeMap;
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
-use protocol::message::{RunState, RunView, StageState, StageView, SweepView};
+use protocol::message::{RunState, RunView, StageState, StageView, StorageProblem, SweepView};
 use protocol::pipeline::Pipeline;
 use protocol::stage::Register;
+use protocol::units::grouped;
 use protocol::{Digest, StageName};
 use serde::Serialize;
 
 use crate::print;
 
-/// The one object of `run -o json` and `status -o json`. It only grows.
+/// The object of `run -o json` and `status -o json`. Fields are only ever added.
 #[derive(Debug, Serialize)]
 pub(crate) struct Summary {
     schema_version: u32,
     run: String,
     pipeline: String,
+    /// Owner of the run.
+    owner: String,
     state: String,
     stages: Vec<StageSummary>,
     #[serde(skip_serializing_if = "Vec::is_empty")]
     sweeps: Vec<SweepView>,
+    /// The problem that keeps the coordinator from reading or writing the run's data.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    storage: Option<StorageProblem>,
 }
 
 #[derive(Debug, Serialize)]
@@ -33,13 +40,13 @@ struct StageSummary {
     wall_s: f64,
     #[serde(skip_serializing_if = "Option::is_none")]
     message: Option<String>,
-    /// The swept stage that it is a trial of.
+    /// The swept stage of which this one is a trial.
     #[serde(skip_serializing_if = "Option::is_none")]
     of: Option<StageName>,
 }
 
 impl Summary {
-    /// `interrupted` tells a run that was wound down from one that is running.
+    /// Creates the object; `interrupted` distinguishes a run that was drained from a running one.
     pub(crate) fn of(run: &RunView, interrupted: bool) -> Self {
         let stage = |stage: &StageView| StageSummary {
             name: stage.name.to_string(),
@@ -52,14 +59,16 @@ impl Summary {
             message: stage.message.clone(),
             of: stage.of.clone(),
         };
-        let interrupted = interrupted && !run.state.is_final();
+        let interrupted = run.interrupted || (interrupted && !run.state.is_final());
         Self {
             schema_version: 1,
             run: run.run.to_string(),
             pipeline: run.pipeline.clone(),
-            state: if interrupted { "interrupted".to_owned() } else { run_state(run.state).to_owned() },
+            owner: run.owner.to_string(),
+            state: if interrupted { "interrupted".to_owned() } else { run_state(run).to_owned() },
             stages: run.stages.iter().map(stage).collect(),
             sweeps: run.sweeps.clone(),
+            storage: run.storage.clone(),
         }
     }
 }
@@ -79,8 +88,9 @@ pub(crate) fn state(state: StageState) -> &'static str {
 }
 
 /// A run's state in one word.
-pub(crate) fn run_state(state: RunState) -> &'static str {
-    match state {
+pub(crate) fn run_state(run: &RunView) -> &'static str {
+    match run.state {
+        RunState::Paused if run.interrupted => "interrupted",
         RunState::Running => "running",
         RunState::Paused => "paused",
         RunState::Finished => "finished",
@@ -89,11 +99,13 @@ pub(crate) fn run_state(state: RunState) -> &'static str {
     }
 }
 
-/// The stages of a run, one a line, and a line for each sweep. Trials are for `trainer sweep status`.
+/// The requested stages, one per line, and one line per sweep. `trainer sweep status` shows the trials.
 pub(crate) fn table(run: &RunView) -> String {
-    let rows = run.stages.iter().filter(|stage| stage.of.is_none()).map(|stage| {
+    let asked_for = run.stages.iter().filter(|stage| stage.of.is_none() && stage.is_asked_for());
+    let rows = asked_for.map(|stage| {
         let progress = &stage.progress;
-        let steps = if progress.total > 0 { format!("{}/{}", progress.done, progress.total) } else { String::new() };
+        let (done, total) = (grouped(progress.done), grouped(progress.total));
+        let steps = if progress.total > 0 { format!("{done}/{total}") } else { String::new() };
         vec![
             stage.name.to_string(),
             stage.kind.clone(),
@@ -105,9 +117,21 @@ pub(crate) fn table(run: &RunView) -> String {
         ]
     });
     let table = print::table(&["STAGE", "KIND", "STATE", "DONE", "TIME", "KEY", "RESULT"], rows.collect());
-    run.sweeps.iter().fold(table, |text, sweep| format!("{text}\n\nsweep of {}", sweep_line(sweep)))
+    let table = run.sweeps.iter().fold(table, |text, sweep| format!("{text}\n\nsweep of {}", sweep_line(sweep)));
+    match &run.storage {
+        Some(problem) => format!("{table}\n\nstorage: {}", storage_line(problem)),
+        None => table,
+    }
 }
 
+/// Formats a storage problem: `for 2m 3s: there was no answer`.
+fn storage_line(problem: &StorageProblem) -> String {
+    let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+    let since = Duration::from_millis(u64::try_from(problem.since_ms).unwrap_or_default());
+    format!("for {}: {}", print::duration(now.saturating_sub(since).as_secs_f64()), problem.what)
+}
+
+/// Describes a sweep:
 /// `pcm: trial 7 is best, latent_fid 0.1234 with adversarial 0.1; 24 trials, 5200 of 21600 steps (24 %)`.
 pub(crate) fn sweep_line(sweep: &SweepView) -> String {
     let best =
@@ -127,7 +151,7 @@ pub(crate) fn sweep_line(sweep: &SweepView) -> String {
     format!("{stage}: {best}; {trials} trials, {spent} of {full} steps ({percent:.0} %)")
 }
 
-/// A table for each kind of evaluation that the run has several of, in the papers' column order.
+/// A table for each kind of evaluation with several stages, in the papers' column order.
 pub(crate) fn evaluations(run: &RunView) -> String {
     let mut kinds: Vec<&str> =
         run.stages.iter().map(|stage| stage.kind.as_str()).filter(|kind| kind.starts_with("evaluate.")).collect();
@@ -143,12 +167,12 @@ pub(crate) fn evaluations(run: &RunView) -> String {
     tables.collect()
 }
 
-/// The metric that says most, or why there is none.
+/// The most important metric, or the reason why there is none.
 fn headline(stage: &StageView) -> String {
     if matches!(stage.state, StageState::Failed | StageState::Skipped) {
         return stage.message.clone().unwrap_or_default().lines().next().unwrap_or_default().chars().take(90).collect();
     }
-    if let (StageState::Running, Some(message)) = (stage.state, &stage.message) {
+    if let (StageState::Running | StageState::Ready, Some(message)) = (stage.state, &stage.message) {
         return message.clone();
     }
     let first = ["latent_fid", "fid", "mpjpe", "mpjpe_mm", "loss"]
@@ -158,7 +182,7 @@ fn headline(stage: &StageView) -> String {
     first.map(|(key, value)| format!("{key} {}", print::number(*value))).unwrap_or_default()
 }
 
-/// The model that the run promoted, as `generate` takes it.
+/// The model that the run promoted, as an argument of `generate`.
 pub(crate) fn promoted(pipeline: &Pipeline, run: &RunView) -> Option<String> {
     let done = |name: &StageName| {
         let stage = run.stages.iter().find(|stage| &stage.name == name)?;
@@ -192,14 +216,21 @@ mod tests {
             workers: vec![],
             instruction_set: None,
             message: None,
+            wants_workers: None,
             of: None,
+            times: Default::default(),
+            needs: vec![],
         };
         RunView {
             run: "p-1".into(),
             pipeline: "p".into(),
+            owner: protocol::Owner::default(),
             state: RunState::Finished,
+            interrupted: false,
             stages: states.iter().map(stage).collect(),
             sweeps: vec![],
+            storage: None,
+            times: Default::default(),
         }
     }
 
@@ -224,6 +255,22 @@ mod tests {
         let lines: Vec<&str> = table.lines().collect();
         assert!(lines[0].starts_with("STAGE") && lines[1].starts_with("fid"), "{table}");
         assert!(lines[1].contains("resumed") && lines[1].contains("latent_fid 0.2500"), "{table}");
+    }
+
+    #[test]
+    fn an_interrupted_run_is_not_called_paused_and_what_was_not_asked_for_has_no_row() {
+        let mut run = view(&[("vae", "train.vae", StageState::Ready), ("mld", "train.mld", StageState::Skipped)]);
+        run.state = RunState::Paused;
+        assert_eq!(run_state(&run), "paused");
+        run.interrupted = true;
+        assert_eq!(run_state(&run), "interrupted");
+        assert_eq!(serde_json::to_value(Summary::of(&run, false)).unwrap()["state"], "interrupted");
+        run.stages[0].message = Some("interrupted at 1,204 of 6,000 steps".to_owned());
+        run.stages[0].progress = Progress { done: 1204, total: 6000, ..Progress::default() };
+        run.stages[1].message = Some(StageView::NOT_ASKED_FOR.to_owned());
+        let table = table(&run);
+        assert!(table.contains("1,204/6,000") && table.contains("interrupted at 1,204 of 6,000 steps"), "{table}");
+        assert!(!table.contains("mld"), "{table}");
     }
 
     #[test]

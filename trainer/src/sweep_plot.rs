@@ -1,5 +1,5 @@
-//! A sweep as a picture, as SVG: the metric of every trial against its steps, where grey lines were stopped and the coloured one is the best; or
-//! metrics against a searched setting, or the time of the evaluation.
+//! Pictures of a sweep, as SVG. One shows the metric of every trial over its steps: stopped trials are grey, and the
+//! best one is coloured. The other shows metrics over a searched setting, or over the time of the evaluation.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write;
@@ -18,14 +18,14 @@ const RIGHT: f64 = 24.0;
 const TOP: f64 = 44.0;
 const BOTTOM: f64 = 56.0;
 
-/// The metric of every trial against its steps.
+/// Draws the metric of every trial over its steps.
 pub(crate) fn svg(sweep: &SweepView) -> String {
     let values = sweep.trials.iter().flat_map(|trial| trial.results.iter().flatten().copied());
     let x = Axis::new(sweep.rungs.iter().map(|steps| *steps as f64).chain([0.0]), LEFT, WIDTH - RIGHT);
     let y = Axis::new(values, HEIGHT - BOTTOM, TOP);
     let mut out = String::new();
     let mut line = |text: std::fmt::Arguments<'_>| {
-        // Writing to a text cannot fail.
+        // Writing to a string never fails.
         let _ = writeln!(out, "{text}");
     };
     line(format_args!(
@@ -79,19 +79,18 @@ pub(crate) fn svg(sweep: &SweepView) -> String {
     out
 }
 
-/// What the trials of a sweep are drawn by.
+/// Horizontal axis of the trials.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum By {
-    /// The steps that they were trained for.
     Steps,
     /// A searched setting that is a number.
     Setting(String),
-    /// Seconds that their evaluation took, reading and measuring included.
+    /// Seconds of the evaluation, including reading and measuring.
     Seconds,
 }
 
 impl By {
-    /// What says most: a searched number where every trial is trained to its end, or else the steps.
+    /// The default: a searched number if every trial is trained to its end, else the steps.
     pub(crate) fn usual(sweep: &SweepView) -> Self {
         let mut numbers = numbers(sweep).into_iter();
         match (sweep.rungs.len(), numbers.next(), numbers.next()) {
@@ -100,10 +99,10 @@ impl By {
         }
     }
 
-    /// A searched setting by its path or the end of it, `seconds` or `steps`.
+    /// Finds a searched setting by its path or the end of it, `seconds` or `steps`.
     ///
     /// # Errors
-    /// What there is.
+    /// If there is none; the message lists the choices.
     pub(crate) fn named(name: &str, sweep: &SweepView) -> Result<Self, String> {
         let numbers = numbers(sweep);
         let is = |path: &&String| *path == name || path.ends_with(&format!(".{name}"));
@@ -131,10 +130,11 @@ fn numbers(sweep: &SweepView) -> Vec<String> {
     first.values.keys().filter(differs).cloned().collect()
 }
 
-/// Curves of `metrics` over what the trials differ in: a panel for each, and a line for every choice of the other searched settings.
+/// Draws curves of `metrics` over the axis `by`: one panel per metric, and one line per choice of the other searched
+/// settings.
 ///
 /// # Errors
-/// A metric that no evaluation gave; the message lists those that were given.
+/// If no evaluation has a metric; the message lists those that exist.
 pub(crate) fn curves(run: &RunView, sweep: &SweepView, by: &By, metrics: &[String]) -> Result<String, String> {
     let last = sweep.rungs.len().saturating_sub(1);
     let evaluations: Vec<(&TrialView, &StageView)> = sweep
@@ -148,14 +148,14 @@ pub(crate) fn curves(run: &RunView, sweep: &SweepView, by: &By, metrics: &[Strin
     let named = |path: &str| path.rsplit('.').next().unwrap_or(path).to_owned();
     let x = |trial: &TrialView, stage: &StageView| match by {
         By::Setting(path) => trial.values.get(path).and_then(Value::as_f64),
-        // One that was found finished took no time now.
+        // A cached evaluation took no time in this run.
         By::Seconds => Some(stage.wall_s).filter(|seconds| *seconds > 0.0),
         By::Steps => Some(trial.steps as f64),
     };
     let line = |trial: &TrialView| {
         let others = trial.values.iter().filter(|(path, _)| match by {
             By::Setting(by) => *path != by,
-            // What is timed differs in the number that makes it longer.
+            // Timed trials differ in the numbers that change the time.
             By::Seconds | By::Steps => !trial.values[*path].is_number(),
         });
         let text = |value: &Value| value.as_str().map_or_else(|| value.to_string(), str::to_owned);
@@ -185,7 +185,7 @@ pub(crate) fn curves(run: &RunView, sweep: &SweepView, by: &By, metrics: &[Strin
             By::Seconds => "seconds that the evaluation took".to_owned(),
             By::Steps => "steps".to_owned(),
         };
-        panels.push(Panel { x, y: metric.clone(), lines });
+        panels.push(Panel { x, y: metric.clone(), lines, ..Panel::default() });
     }
     let title = format!("sweep of {}: {} trials", sweep.stage, sweep.trials.len());
     Ok(figure::svg(&title, &panels))

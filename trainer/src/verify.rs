@@ -1,9 +1,9 @@
-//! `trainer run --verify`: does this machine, with this build, still compute what the store says was computed?
+//! `trainer run --verify`: checks that this machine, with this build, reproduces the results in the store.
 //!
-//! Of every training stage that has got anywhere, some steps are run again: from a committed checkpoint that is followed by
-//! another one within reach, else from the newest one after which values were recorded, else from nothing. What comes out
-//! is compared bit by bit: every value that was recorded at a step, the training state at every later checkpoint, and the
-//! output if the stage's end is reached. The store is read and not changed.
+//! Some steps of every training stage with progress are run again. They start from a committed checkpoint that is
+//! followed by another one within reach. Otherwise they start from the newest checkpoint with later recorded values, or
+//! from the beginning. The results are compared bit by bit: every value recorded at a step, the training state at every
+//! later checkpoint, and the output if the stage's end is reached. The store is read and not changed.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -21,23 +21,23 @@ use stages::verify::{Rerun, rerun, state_digest};
 use crate::print::{self, Output};
 use crate::problem::{Problem, Result, exit};
 
-/// What verifying a stage gave.
+/// Result of verifying a stage.
 #[derive(Debug, Serialize)]
 struct Verified {
     stage: StageName,
     run: RunId,
-    /// Steps of the state from which it was run again, and of the one it ended with.
+    /// Steps of the initial state and of the final one.
     from: u64,
     to: u64,
-    /// How many recorded values were compared.
+    /// Number of compared values.
     values: usize,
-    /// How many digests were compared: training states, and the output.
+    /// Number of compared digests: training states, and the output.
     digests: usize,
-    /// What differs, in words; empty if nothing does.
+    /// Descriptions of the differences.
     differences: Vec<String>,
 }
 
-/// What the store knows about a stage.
+/// Data of a stage in the store.
 struct Recorded {
     run: RunId,
     inputs: BTreeMap<String, Digest>,
@@ -47,7 +47,7 @@ struct Recorded {
     values: BTreeMap<(u64, String), f64>,
 }
 
-/// Verifies `steps` steps of every training stage of `pipeline` that the store in `dir` knows.
+/// Verifies `steps` steps of every training stage of `pipeline` that the store in `dir` has.
 pub(crate) async fn verify(pipeline: &Pipeline, dir: &Path, steps: u64, output: Output) -> Result<u8> {
     let store = ReadStore::open(dir).await?;
     let mut pipeline = pipeline.clone();
@@ -62,7 +62,7 @@ pub(crate) async fn verify(pipeline: &Pipeline, dir: &Path, steps: u64, output: 
         let Some(inputs) = inputs else { continue };
         let identity = pipeline.identity(stage, &inputs);
         let known = store.stage_result(identity.key()).await?;
-        // Versions of the registry too.
+        // Includes versions of the registry.
         let inputs = identity.inputs;
         if let Some(value) = known.as_ref().and_then(|row| row.outputs.values().next()) {
             outputs.insert(stage.name.clone(), *value);
@@ -107,7 +107,7 @@ pub(crate) async fn verify(pipeline: &Pipeline, dir: &Path, steps: u64, output: 
     Ok(report(&all, output))
 }
 
-/// What the store has about a stage: of the run that made its value, or of the newest run with that pipeline.
+/// Reads the data of a stage: of the run that computed its result, or of the newest run with that pipeline.
 async fn recorded(
     store: &ReadStore,
     pipeline: &Pipeline,
@@ -124,7 +124,7 @@ async fn recorded(
         let mut rows = store.runs().await?;
         rows.sort_by_key(|row| std::cmp::Reverse(row.created_ms));
         let digest = pipeline.digest();
-        // A run of another build may not read; what it did is not ours to verify.
+        // The pipeline of another build may not parse; its results cannot be verified here.
         let same = |row: &registry::RunRow| {
             serde_json::from_value::<Pipeline>(row.pipeline.clone()).is_ok_and(|other| other.digest() == digest)
         };
@@ -139,7 +139,7 @@ async fn recorded(
             checkpoints.push((row.step, manifest));
         }
         let mut values = BTreeMap::new();
-        for (key, curve) in store.metrics(&run, &name, None, 0).await? {
+        for (key, curve) in store.points(&run, &name, None, registry::Page::ALL).await? {
             values.extend(curve.points.iter().map(|point| ((point.step, key.clone()), point.value)));
         }
         if !checkpoints.is_empty() || !values.is_empty() {
@@ -149,11 +149,11 @@ async fn recorded(
     Ok(None)
 }
 
-/// From which checkpoint, and up to which step.
+/// Chooses the checkpoint to start from and the last step.
 fn way(recorded: &Recorded, steps: u64, last: u64) -> (Option<usize>, u64) {
     let at = |i: usize| recorded.checkpoints[i].0;
     let count = recorded.checkpoints.len();
-    // Newest first: one that the next is in reach of.
+    // Newest first: a checkpoint whose successor is within reach.
     if let Some(i) = (1..count).rev().find(|i| at(*i) - at(i - 1) <= steps) {
         return (Some(i - 1), at(i));
     }

@@ -1,10 +1,10 @@
-//! What a user is told by measures: times, and what is wrong with a metric, a split or an evaluator.
+//! Messages to users about measures: times, and mistakes in a metric, a split or an evaluator.
 
 use cluster_tests::Bench;
 
 const TRAINER: &str = env!("CARGO_BIN_EXE_trainer");
 
-/// All on one smoke run, whose stages are cached from then on.
+/// All checks share one smoke run, whose stages are cached afterwards.
 #[test]
 fn measures_are_taken_and_misused_with_the_reason() {
     let bench = Bench::new(TRAINER);
@@ -20,7 +20,7 @@ fn measures_are_taken_and_misused_with_the_reason() {
         assert!(reconstruction[metric].is_number(), "{metric}: {reconstruction:#}");
     }
 
-    // The teacher by its stage, the student by its name: a row for every number of steps that a model has.
+    // The teacher by its stage, the student by its name: one row per supported number of steps.
     let time = ["time", "smoke@staging", "--stage", "mld", "--steps", "4,1", "--sentences", "3", "--frames", "40"];
     let said = bench.run(&[&time[..], &["-o", "json"]].concat()).expect_code(0).json();
     let rows = said["rows"].as_array().expect("rows");
@@ -33,19 +33,19 @@ fn measures_are_taken_and_misused_with_the_reason() {
     let table = bench.run(&time).expect_code(0).stdout;
     println!("{table}");
     assert!(table.contains("AITS") && table.contains("3 sentences") && table.contains("threads"), "{table}");
-    let unknown = bench.run(&["time", "--stage", "vae"]).expect_code(3).stderr;
+    let unknown = bench.run(&["time", "--stage", "vae"]).expect_code(7).stderr;
     assert!(unknown.contains("no model") && unknown.contains("mld"), "{unknown}");
     bench.run(&["time"]).expect_code(2);
     models_are_drawn_as_they_were_measured(&bench);
 
-    // What only the data tells stops one stage, says why, and names the stage once.
+    // A mistake that only the data reveals stops one stage. The message explains it and names the stage once.
     let config = Bench::config("smoke.yaml");
     let said = bench.run(&["run", &config, "--set", "stages.t2m_real.split=test"]).expect_code(1).stderr;
     assert!(["the split `test` has", "among 32", "split: all"].iter().all(|part| said.contains(part)), "{said}");
     let error = said.rsplit("error: ").next().expect("an error");
     assert!(error.starts_with("stage `t2m_real` failed: "), "{said}");
     assert_eq!(error.matches("stage `").count(), 1, "the stage is named once:\n{said}");
-    // What the pipeline tells is refused before anything runs.
+    // A mistake in the pipeline is refused before anything runs.
     for (set, parts) in [
         ("stages.release.metric=fdi", vec!["gives `fdi`", "`latent_fid`"]),
         ("stages.release.promote.require=[fdi <= 1]", vec!["asks for `fdi`", "`latent_fid`"]),
@@ -61,7 +61,8 @@ fn measures_are_taken_and_misused_with_the_reason() {
     assert!(said.stderr.contains("21 joints (kit)") && said.stderr.contains("22 joints"), "{}", said.stderr);
 }
 
-/// Two models that diffuse motion itself, one of them trained with Free-T2M's losses: measured, registered, compared and drawn from as any other.
+/// Two models that diffuse motion itself, one of them trained with Free-T2M's losses. They are measured, registered,
+/// compared and used like any other.
 fn models_of_motion_are_models(bench: &Bench, generate: &dyn Fn(&[&str]) -> serde_json::Value) {
     let config = Bench::config("smoke.yaml");
     let training = "steps: 6, batch: {global: 8, slices: 4}, checkpoint: {every: 2}, lr: 1e-3";
@@ -102,7 +103,7 @@ fn models_of_motion_are_models(bench: &Bench, generate: &dyn Fn(&[&str]) -> serd
     assert!(refused.contains("would flatter it"), "{refused}");
 }
 
-/// Students with a control part: measured, registered beside their bases, and told where to go.
+/// Students with a control part are measured, registered beside their bases, and given target positions.
 fn motion_goes_where_it_is_told(bench: &Bench, generate: &dyn Fn(&[&str]) -> serde_json::Value) {
     let config = Bench::config("smoke.yaml");
     let control = |base: &str| {
@@ -174,7 +175,7 @@ fn motion_goes_where_it_is_told(bench: &Bench, generate: &dyn Fn(&[&str]) -> ser
     assert!(refused.contains("`right_midfoot` is no joint of a skeleton of 22 joints"), "{refused}");
 }
 
-/// A promoted student, and what a stage gave, are drawn with the sampler of their evaluations, which is not that of the papers.
+/// A promoted student and a stage's model use the sampler of their evaluations, which is not the papers'.
 fn models_are_drawn_as_they_were_measured(bench: &Bench) {
     let config = Bench::config("smoke.yaml");
     let generate = |args: &[&str]| {
@@ -229,7 +230,7 @@ fn models_are_drawn_as_they_were_measured(bench: &Bench) {
     let shown = bench.run(&["registry", "show", "smoke@staging"]).expect_code(0).stdout;
     assert!(shown.contains("length="), "{shown}");
 
-    // A whole model leaves the store part by part.
+    // A whole model is exported part by part.
     bench.run(&["registry", "export", "smoke@staging", "out"]).expect_code(0);
     for file in [
         "manifest.json",

@@ -1,10 +1,9 @@
-//! One assignment as this worker holds it: shared by the poll, which changes it, the stage, which lives under it, and the
-//! uploads, which act in its name.
+//! The worker's state of one assignment. The poll changes it, the stage runs under it, and uploads use its grant.
 //!
-//! A grant ends when the coordinator no longer lists it, and for no other reason: not because a call failed, and not
-//! because a lease would have run out by our clock. A worker that is cut off goes on, since what it does may still be
-//! wanted; should somebody else hold the task by then, the store refuses our writes by their fence. Correctness rests on
-//! that alone.
+//! A grant ends when the coordinator no longer lists it, and for no other reason. A failed call does not end it, and
+//! neither does a lease that has expired by the local clock. A worker that is cut off keeps working, because its
+//! results may still be wanted. If another worker holds the task by then, the store refuses our writes by their fence.
+//! Correctness depends on that fence alone.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
@@ -14,28 +13,33 @@ use protocol::message::{Assignment, Doing, Grant, Progress, Role};
 use protocol::{Digest, Generation};
 use tokio::sync::Notify;
 
+use crate::client::Credential;
 use crate::event_count::{EventCount, lock};
 use crate::gang::endpoint::Endpoint;
 use crate::gang::member::{Busy, MeshConfig};
 use crate::gang::mesh::{Halt, Mesh};
 
-/// After a refused write, how long to wait for orders that explain it.
+/// Time to wait after a refused write for the orders that explain it.
 const STALE_PATIENCE: Duration = Duration::from_secs(30);
+/// Time to train after a failed checkpoint before the next try.
+const SAVE_PAUSE: Duration = Duration::from_secs(5);
 
 #[derive(Debug)]
 struct State {
     assignment: Assignment,
     ended: Option<String>,
-    /// The stage has returned; nothing runs under this grant any more.
+    /// Set once the stage has returned; nothing runs under this grant any more.
     done: bool,
     progress: Progress,
+    /// Steps applied to the training state in memory.
+    holds: Option<u64>,
     committed: Option<Digest>,
-    /// The newest generation's connections, until the stage takes them.
+    /// Connections of the newest generation, until the stage takes them.
     offered: Option<Arc<Mesh>>,
     newest: Option<Arc<Mesh>>,
 }
 
-/// One assignment.
+/// The state of one assignment; see the module.
 #[derive(Debug)]
 pub(crate) struct ActiveAssignment {
     state: Mutex<State>,
@@ -44,26 +48,36 @@ pub(crate) struct ActiveAssignment {
     endpoint: Arc<Endpoint>,
     flags: Arc<Flags>,
     busy: Busy,
+    /// True while the blobs being stored belong to a checkpoint that can be saved later.
+    postponable: AtomicBool,
+    put_off: Mutex<PutOff>,
 }
 
-/// What holds for all that a worker holds.
+/// Consecutive checkpoints that could not be stored, and the earliest time of the next try.
+#[derive(Debug, Default)]
+struct PutOff {
+    times: u32,
+    until: Option<Instant>,
+}
+
+/// Flags of the process, shared by all assignments.
 #[derive(Debug, Default)]
 pub(crate) struct Flags {
-    /// It is to go.
+    /// True once the worker is leaving.
     pub(crate) leaving: AtomicBool,
-    /// The last poll was not answered.
+    /// True if the last poll was not answered.
     pub(crate) away: AtomicBool,
 }
 
-/// What a worker does when orders speak of a task that it holds.
+/// Effect of new orders on a held task.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Reading {
-    /// The same right, perhaps with news.
+    /// The same grant, possibly with other fields changed.
     Same,
-    /// The gang goes on with other members.
+    /// The same attempt in a gang with other members.
     Regrouped,
-    /// A right to begin anew.
-    Anew,
+    /// A grant under which the stage starts from the beginning.
+    Restart,
 }
 
 impl ActiveAssignment {
@@ -78,26 +92,34 @@ impl ActiveAssignment {
             ended: None,
             done: false,
             progress: Progress::default(),
+            holds: None,
             committed: None,
             offered: None,
             newest: None,
         };
         let (state, busy) = (Mutex::new(state), Busy::default());
-        let held = Self { state, event_count: Arc::default(), wake, endpoint, flags, busy };
+        let (postponable, put_off) = (AtomicBool::new(false), Mutex::default());
+        let held = Self { state, event_count: Arc::default(), wake, endpoint, flags, busy, postponable, put_off };
         held.connect(&mut lock(&held.state));
         Arc::new(held)
     }
 
-    /// The right to write, as of the newest orders.
+    /// The current grant, from the newest orders.
     pub(crate) fn grant(&self) -> Grant {
         lock(&self.state).assignment.grant.clone()
+    }
+
+    /// The current grant with its secret.
+    pub(crate) fn credential(&self) -> Credential {
+        let state = lock(&self.state);
+        Credential { grant: state.assignment.grant.clone(), secret: state.assignment.secret.clone() }
     }
 
     pub(crate) fn assignment(&self) -> Assignment {
         lock(&self.state).assignment.clone()
     }
 
-    /// What the peers are told that this member is busy with.
+    /// Activity of this member, as reported to its peers.
     pub(crate) fn busy(&self) -> &Busy {
         &self.busy
     }
@@ -106,7 +128,7 @@ impl ActiveAssignment {
         &self.event_count
     }
 
-    /// What `newer` orders mean for this assignment.
+    /// Compares `newer` orders with this assignment.
     pub(crate) fn read(&self, newer: &Assignment) -> Reading {
         let state = lock(&self.state);
         let (old, new) = (&state.assignment.grant, &newer.grant);
@@ -116,11 +138,11 @@ impl ActiveAssignment {
         } else if gang && old.attempt == new.attempt && new.fence > old.fence && !state.done {
             Reading::Regrouped
         } else {
-            Reading::Anew
+            Reading::Restart
         }
     }
 
-    /// Takes newer orders for the same attempt.
+    /// Replaces the orders with newer ones for the same attempt.
     pub(crate) fn update(&self, assignment: Assignment) {
         {
             let mut state = lock(&self.state);
@@ -155,7 +177,7 @@ impl ActiveAssignment {
         state.newest = Some(mesh);
     }
 
-    /// The connections of the newest generation, if the stage does not have them yet.
+    /// Takes the connections of the newest generation, unless the stage already has them.
     pub(crate) fn take_mesh(&self) -> Option<Arc<Mesh>> {
         lock(&self.state).offered.take()
     }
@@ -168,7 +190,7 @@ impl ActiveAssignment {
         }
     }
 
-    /// Ends the grant: whatever is asked in its name from now on is refused.
+    /// Ends the grant: later calls under it are refused.
     pub(crate) fn end(&self, reason: &str) {
         {
             let mut state = lock(&self.state);
@@ -180,12 +202,12 @@ impl ActiveAssignment {
         self.event_count.notify();
     }
 
-    /// Why the grant has ended, if it has.
+    /// The reason for the end of the grant, or `None` while it holds.
     pub(crate) fn ended(&self) -> Option<String> {
         lock(&self.state).ended.clone()
     }
 
-    /// Nothing runs under this grant any more.
+    /// Marks the stage as returned and closes its connections.
     pub(crate) fn finish(&self) {
         let mut state = lock(&self.state);
         state.done = true;
@@ -201,17 +223,44 @@ impl ActiveAssignment {
         lock(&self.state).done
     }
 
-    /// Whether to stop between two steps: asked for by the coordinator, or because this process is to go.
+    /// Returns true if the stage should stop between two steps, because the coordinator drains it or the worker is
+    /// leaving.
     pub(crate) fn drain(&self) -> bool {
         self.flags.leaving.load(Ordering::SeqCst) || lock(&self.state).assignment.drain
     }
 
-    /// Whether the coordinator did not answer the last poll.
+    /// Returns true if the last poll was not answered.
     pub(crate) fn is_away(&self) -> bool {
         self.flags.away.load(Ordering::SeqCst)
     }
 
-    /// Why to give up waiting for peers of `generation`, if there is a reason.
+    /// Sets whether the blobs stored from now on may be stored later instead.
+    pub(crate) fn set_postponable(&self, may: bool) {
+        self.postponable.store(may, Ordering::SeqCst);
+    }
+
+    pub(crate) fn may_put_off(&self) -> bool {
+        self.postponable.load(Ordering::SeqCst)
+    }
+
+    /// Records whether part of a checkpoint could not be stored. If so, the next try follows after a pause that
+    /// doubles.
+    pub(crate) fn was_put_off(&self, was: bool) {
+        let mut put_off = lock(&self.put_off);
+        if was {
+            let pause = SAVE_PAUSE.saturating_mul(1 << put_off.times.min(4));
+            *put_off = PutOff { times: put_off.times + 1, until: Some(Instant::now() + pause) };
+        } else {
+            *put_off = PutOff::default();
+        }
+    }
+
+    /// Returns true during the pause after a failed checkpoint.
+    pub(crate) fn is_put_off(&self) -> bool {
+        lock(&self.put_off).until.is_some_and(|until| Instant::now() < until)
+    }
+
+    /// The reason to stop waiting for peers of `generation`, if there is one.
     pub(crate) fn halt(&self, generation: Generation) -> Option<Halt> {
         let state = lock(&self.state);
         if let Some(reason) = &state.ended {
@@ -223,7 +272,7 @@ impl ActiveAssignment {
         }
     }
 
-    /// Whether this worker is the one that records and reports: alone, or rank 0 of its gang.
+    /// Returns true if this worker records and reports: a single worker, or rank 0 of a gang.
     pub(crate) fn leads(&self) -> bool {
         let state = lock(&self.state);
         let grant = &state.assignment.grant;
@@ -231,11 +280,11 @@ impl ActiveAssignment {
             Role::Member { members, .. } => members
                 .first()
                 .is_some_and(|first| (&first.worker, first.incarnation) == (&grant.worker, grant.incarnation)),
-            Role::Alone | Role::Shard { .. } | Role::Merge { .. } => true,
+            Role::Alone | Role::Resolve | Role::Shard { .. } | Role::Merge { .. } => true,
         }
     }
 
-    /// The newest checkpoint: ours, or the one the orders name.
+    /// The newest checkpoint: the one committed here, else the one in the orders.
     pub(crate) fn checkpoint(&self) -> Option<Digest> {
         let state = lock(&self.state);
         state.committed.or(state.assignment.resume)
@@ -249,14 +298,20 @@ impl ActiveAssignment {
         lock(&self.state).progress = progress;
     }
 
-    /// For the poll.
+    /// The report of this assignment for the poll.
     pub(crate) fn doing(&self) -> Doing {
         let state = lock(&self.state);
-        let lost = state.newest.as_ref().map(|mesh| mesh.lost().into_iter().collect()).unwrap_or_default();
-        Doing { grant: state.assignment.grant.clone(), progress: state.progress.clone(), lost }
+        let (lost, waits_for) = state.newest.as_ref().map(|mesh| (mesh.lost(), mesh.waits_for())).unwrap_or_default();
+        let holds = state.holds;
+        Doing { holds, waits_for, lost, ..Doing::new(state.assignment.grant.clone(), state.progress.clone()) }
     }
 
-    /// Sleeps until something changes, at most so long; returns why the grant has ended, if it has.
+    /// Records the number of steps applied to the state in memory; `None` if the state is of no use to peers.
+    pub(crate) fn set_holds(&self, steps: Option<u64>) {
+        lock(&self.state).holds = steps;
+    }
+
+    /// Sleeps until something changes, for at most `at_most`. Returns the reason if the grant has ended.
     pub(crate) fn pause(&self, at_most: Duration) -> Result<(), String> {
         let until = Instant::now() + at_most;
         loop {
@@ -272,16 +327,16 @@ impl ActiveAssignment {
         }
     }
 
-    /// A write under `refused` met a newer fence. Waits for the orders that say what became of us: a newer grant to write
-    /// under, or the end.
-    pub(crate) fn after_stale(&self, refused: &Grant) -> Result<(), String> {
+    /// Waits for new orders after a call under `refused` met a newer fence or an unknown secret. Returns once there is
+    /// a newer grant, or with the reason for the end.
+    pub(crate) fn after_stale(&self, refused: &Credential) -> Result<(), String> {
         let until = Instant::now() + STALE_PATIENCE;
         loop {
             let ticket = self.event_count.ticket();
             if let Some(reason) = self.ended() {
                 return Err(reason);
             }
-            if self.grant() != *refused {
+            if self.credential() != *refused {
                 return Ok(());
             }
             let left = until.saturating_duration_since(Instant::now());

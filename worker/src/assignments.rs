@@ -1,7 +1,8 @@
-//! What this worker should be doing, kept equal to what the coordinator last said.
+//! Keeps the assignments of this worker equal to the newest orders of the coordinator.
 //!
-//! The poll is heartbeat, report and order book in one; each answer is the whole truth, so one that is lost, late or doubled
-//! changes nothing. A poll that fails changes nothing either: work goes on, and the next poll says it all again.
+//! A poll is heartbeat, report and request for orders in one. Each answer lists all assignments, so a lost, late or
+//! repeated answer changes nothing. A failed poll changes nothing either: work continues, and the next poll reports
+//! everything again.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
@@ -10,7 +11,7 @@ use std::time::Duration;
 use protocol::Incarnation;
 use protocol::message::{Assignment, DesiredAssignments, Join, Joined, Poll};
 use tokio::sync::Notify;
-use tokio::time::sleep;
+use tokio::time::{Instant, sleep};
 
 use crate::active_assignment::{ActiveAssignment, Flags, Reading};
 use crate::client::{CallError, Client};
@@ -18,18 +19,22 @@ use crate::event_count::{EventCount, lock};
 use crate::gang::endpoint::Endpoint;
 use crate::prepare::Preparation;
 
-/// Longest pause between two polls of a coordinator that is away.
+/// Longest pause between two polls of an unreachable coordinator.
 const LONGEST: Duration = Duration::from_secs(1);
 /// Shortest time between two polls.
 const SHORTEST: Duration = Duration::from_millis(20);
-/// Refusals in a row before they are believed.
+/// Time to wait for a name that another process holds. A killed process holds its name until its lease ends.
+const NAME_PATIENCE: Duration = Duration::from_secs(60);
+/// Time between two log lines of a worker that waits for its coordinator.
+const REMIND: Duration = Duration::from_secs(60);
+/// Consecutive refusals that end the worker.
 const REFUSALS: u32 = 5;
 
-/// What the poll and the stage thread share.
+/// State that the poll and the stage thread share.
 #[derive(Debug)]
 pub(crate) struct Shared {
     held: Mutex<Vec<Arc<ActiveAssignment>>>,
-    /// Rung when there may be something to start, or nothing more ever.
+    /// Notified when there may be work to start, and when no more work will come.
     pub(crate) work: EventCount,
     pub(crate) wake: Arc<Notify>,
     flags: Arc<Flags>,
@@ -52,7 +57,7 @@ impl Shared {
         })
     }
 
-    /// The next assignment to run. Called by the stage thread between two of them.
+    /// The next assignment to run. The stage thread calls it between two assignments.
     pub(crate) fn next(&self) -> Option<Arc<ActiveAssignment>> {
         if self.is_leaving() {
             return None;
@@ -60,7 +65,7 @@ impl Shared {
         lock(&self.held).iter().find(|held| !held.is_done() && held.ended().is_none()).cloned()
     }
 
-    /// Takes nothing new; what runs saves and yields.
+    /// Starts leaving: takes no new work, while the running stage saves and yields.
     pub(crate) fn leave(&self) {
         self.flags.leaving.store(true, Ordering::SeqCst);
         self.preparation.end();
@@ -79,7 +84,7 @@ impl Shared {
         self.over.load(Ordering::SeqCst)
     }
 
-    /// Nothing will come any more; what runs is of no use.
+    /// Ends all assignments: no more work will come, and running work is of no use.
     pub(crate) fn end(&self, reason: &str) {
         self.over.store(true, Ordering::SeqCst);
         for held in lock(&self.held).drain(..) {
@@ -93,7 +98,7 @@ impl Shared {
         lock(&self.held).iter().all(|held| held.is_done() || !running)
     }
 
-    /// Makes it so.
+    /// Applies orders: ends assignments that are no longer listed, updates or adds the others.
     pub(crate) fn apply(&self, desired: &DesiredAssignments) {
         let mut held = lock(&self.held);
         held.retain(|old| {
@@ -115,7 +120,7 @@ impl Shared {
             };
             match held[at].read(assignment) {
                 Reading::Same | Reading::Regrouped => held[at].update(assignment.clone()),
-                Reading::Anew => {
+                Reading::Restart => {
                     held[at].end("the coordinator has granted it anew");
                     held[at] = self.hold(assignment);
                 }
@@ -136,35 +141,47 @@ impl Shared {
     }
 }
 
-/// Why polling ended.
+/// Reason for the end of polling.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) enum End {
-    /// In good order.
+    /// The worker has left on request.
     Left,
-    /// The coordinator does not want this worker.
+    /// The coordinator refuses this worker.
     Refused(String),
 }
 
-/// Offers this process until the coordinator takes it, or gives how the worker ends instead.
+/// Joins the coordinator. Retries until it accepts this process; otherwise returns the end of the worker.
 async fn join(client: &Client, join: &Join, shared: &Shared) -> Result<Joined, End> {
     let mut pause = Duration::from_millis(50);
-    let mut said = false;
+    let begun = Instant::now();
+    let mut said: Option<Instant> = None;
     loop {
         match client.join(join).await {
             Ok(joined) => {
                 tracing::info!(worker = %join.worker, incarnation = %joined.incarnation, peer_address = join.peer_address, "joined");
                 return Ok(joined);
             }
+            Err(CallError::NameHeld(message)) if begun.elapsed() < NAME_PATIENCE => {
+                if said.is_none_or(|said| said.elapsed() > REMIND) {
+                    said = Some(Instant::now());
+                    tracing::warn!("{message}; waiting");
+                }
+            }
             Err(error) if error.may_pass() => {
-                if !std::mem::replace(&mut said, true) {
-                    tracing::warn!("the coordinator cannot take this worker yet: {error}; trying again");
+                if said.is_none_or(|said| said.elapsed() > REMIND) {
+                    said = Some(Instant::now());
+                    let help = match error {
+                        CallError::Away(_) => "; `trainer serve` starts one there, Ctrl-C ends this worker",
+                        _ => "",
+                    };
+                    tracing::warn!("waiting for the coordinator at {}: {error}{help}", client.url());
                 }
             }
             Err(error) => {
                 return Err(End::Refused(format!("the coordinator turned worker `{}` away: {error}", join.worker)));
             }
         }
-        // A worker that runs nothing and is to go need not wait for a coordinator first.
+        // An idle worker that is leaving does not wait for a coordinator.
         if shared.is_leaving() && shared.is_idle(false) {
             return Err(End::Left);
         }
@@ -173,13 +190,13 @@ async fn join(client: &Client, join: &Join, shared: &Shared) -> Result<Joined, E
     }
 }
 
-/// How long an answer to a poll is waited for: as long as the coordinator may wait, and a third of a lease. If the connection hangs, there
-/// is time for another one within the lease.
+/// Timeout of a poll: the longest wait of the coordinator plus a third of a lease. If a connection hangs, another one
+/// fits within the lease.
 fn patience(joined: &Joined) -> Duration {
     Duration::from_millis(joined.poll_ms + joined.lease_ms / 3)
 }
 
-/// Joins and polls until the worker may go.
+/// Joins and polls until the worker may leave.
 pub(crate) async fn follow(client: &Client, offer: &Join, shared: &Shared) -> End {
     let mut joined = match join(client, offer, shared).await {
         Ok(joined) => joined,
@@ -194,8 +211,8 @@ pub(crate) async fn follow(client: &Client, offer: &Join, shared: &Shared) -> En
         }
         let poll = shared.poll(joined.incarnation, version);
         let answer = tokio::select! {
-            // News of ours do not wait for news of theirs. The poll that is dropped may have been answered; the next one
-            // carries the old version and is answered again.
+            // A new report does not wait for new orders. The dropped poll may have been answered; the next one carries
+            // the old version and gets the same answer.
             () = shared.wake.notified() => {
                 sleep(SHORTEST).await;
                 continue;
@@ -219,7 +236,8 @@ pub(crate) async fn follow(client: &Client, offer: &Join, shared: &Shared) -> En
                     Err(end) => return end,
                 };
                 version = 0;
-                // A coordinator that forgets again at once is not asked in a tight loop.
+                // Doubles the pause, so that a coordinator that forgets the worker again at once is not polled in a
+                // tight loop.
                 pause = (pause * 2).min(LONGEST);
             }
             Err(error) if error.may_pass() => {

@@ -1,7 +1,7 @@
-//! The store's blobs over HTTP, in the name of one grant.
+//! Transfers of the store's blobs over HTTP, under one grant.
 //!
-//! Large blobs come and go in parts, and never lie in memory as a whole unless the stage asks for that. A cut transfer goes on
-//! where it was cut.
+//! Large blobs are sent and received in parts. They are in memory as a whole only if the stage asks for that. An
+//! interrupted transfer continues at the byte where it stopped.
 
 use std::sync::Arc;
 
@@ -9,12 +9,12 @@ use bytes::{Bytes, BytesMut};
 use checkpoint::{Blob, BlobError, Blobs};
 use protocol::Digest;
 use protocol::digest::Hasher;
-use protocol::message::Grant;
 
 use crate::active_assignment::ActiveAssignment;
 use crate::cache::{Arriving, Cache, Cached};
-use crate::client::{CallError, Client};
+use crate::client::{CallError, Client, Credential};
 use crate::failpoints;
+use crate::receipts::Receipts;
 use crate::retry::{self, GaveUp};
 
 /// [`Blobs`] of an attempt. Writes carry its grant; reads are verified and cached.
@@ -23,19 +23,21 @@ pub(crate) struct HttpBlobs {
     pub(crate) held: Arc<ActiveAssignment>,
     pub(crate) client: Client,
     pub(crate) cache: Arc<Cache>,
-    /// Whether the fail points of checkpoints are passed: in gangs.
+    /// Receipts of uploads.
+    pub(crate) receipts: Receipts,
+    /// True in gangs, whose uploads pass the fail points of checkpoints.
     pub(crate) gang: bool,
 }
 
-/// How often a blob that arrives damaged is fetched again.
+/// Number of times that a blob that arrives damaged is fetched again.
 const DAMAGED: u32 = 2;
-/// How much is sent in one request.
+/// Size of one part.
 const PART_BYTES: usize = 8 << 20;
-/// Blobs up to this length are sent without asking what is there.
+/// Blobs up to this length are sent without asking how much the store already has.
 const SMALL_BYTES: u64 = 64 << 10;
 
 impl HttpBlobs {
-    /// The blob, from the cache or fetched into it.
+    /// Returns the blob from the cache, after fetching it if necessary.
     fn cached(&self, digest: Digest) -> Result<Cached, BlobError> {
         if let Some(blob) = self.cache.get(digest) {
             return Ok(blob);
@@ -59,7 +61,7 @@ impl HttpBlobs {
         }
     }
 
-    /// Fetches what is missing. Bytes that have arrived stay in `arriving` when the connection is cut.
+    /// Fetches the missing bytes. Bytes that have arrived stay in `arriving` if the connection breaks.
     fn fetch(&self, digest: Digest, arriving: &mut Option<Arriving>) -> Result<(), CallError> {
         let offset = arriving.as_ref().map_or(0, Arriving::written);
         let mut download = self.client.wait(self.client.get_blob(digest, offset))?;
@@ -74,12 +76,14 @@ impl HttpBlobs {
         Ok(())
     }
 
-    /// Sends what is missing.
-    fn send(&self, grant: &Grant, digest: Digest, bytes: u64, pieces: &[&[u8]]) -> Result<(), CallError> {
+    /// Sends the bytes that the store lacks.
+    fn send(&self, credential: &Credential, digest: Digest, bytes: u64, pieces: &[&[u8]]) -> Result<(), CallError> {
         let mut offset = 0;
         if bytes > SMALL_BYTES {
-            let there = self.client.wait(self.client.staged(grant, digest))?;
+            let receipt = self.receipts.of(digest);
+            let there = self.client.wait(self.client.staged(credential, digest, receipt))?;
             if there.stored {
+                self.receipts.keep(digest, there.receipt);
                 return Ok(());
             }
             offset = there.staged;
@@ -90,8 +94,9 @@ impl HttpBlobs {
         loop {
             let part = cut(pieces, offset);
             let end = offset + part.len() as u64;
-            let there = self.client.wait(self.client.put_part(grant, digest, bytes, offset, part))?;
+            let there = self.client.wait(self.client.put_part(credential, digest, bytes, offset, part))?;
             if there.stored {
+                self.receipts.keep(digest, there.receipt);
                 return Ok(());
             }
             if there.staged != end || end == bytes {
@@ -138,8 +143,8 @@ impl Blobs for HttpBlobs {
         pieces.iter().for_each(|piece| hasher.update(piece));
         let digest = hasher.finish();
         let bytes = pieces.iter().map(|piece| piece.len() as u64).sum();
-        retry::until_ended(&self.held, &format!("uploading blob {digest}"), |grant| {
-            self.send(grant, digest, bytes, pieces)
+        retry::until_put_off(&self.held, &format!("uploading blob {digest}"), |credential| {
+            self.send(credential, digest, bytes, pieces)
         })
         .map_err(|gave_up| error(gave_up, None))?;
         if self.gang {
@@ -164,6 +169,7 @@ fn error(gave_up: GaveUp, wanted: Option<Digest>) -> BlobError {
         (GaveUp::Answer(CallError::Damaged(message)), _) => BlobError::Damaged(message),
         (GaveUp::Answer(CallError::Storage(message)), _) => BlobError::Storage(message),
         (GaveUp::Answer(CallError::Stale(message)), _) => BlobError::Refused(message),
+        (GaveUp::Answer(CallError::Refused(message)), _) => BlobError::Unfit(message),
         (GaveUp::Answer(error), _) => BlobError::Unavailable(error.to_string()),
     }
 }

@@ -1,8 +1,8 @@
-//! Blobs that were read before: small ones in memory, all of them in a folder if there is one.
+//! Cache of fetched blobs: small ones in memory, and all of them in a folder if one is configured.
 //!
-//! Files are named by their digest and verified whenever they are opened, so a folder may be shared by workers, cut short by a
-//! crash or emptied at any time. The least recently read go first once it is over its bound. A large blob lies in a file even
-//! where there is no folder: in a nameless one among the system's temporary files, which is gone once nobody reads it.
+//! Files are named by their digest and verified at every opening. So workers may share a folder, a crash may truncate
+//! its files, and it may be emptied at any time. Above the folder's limit, the least recently read files are deleted
+//! first. Without a folder, a large blob is in an unnamed temporary file, which disappears after its last reader.
 
 use std::collections::{HashMap, VecDeque};
 use std::fs::{self, File, OpenOptions};
@@ -21,14 +21,14 @@ use protocol::digest::Hasher;
 use crate::event_count::lock;
 use crate::mapped;
 
-/// Bounds, in bytes.
+/// Limits, in bytes.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Bounds {
-    /// Of all blobs in memory.
+    /// Total size of the blobs in memory.
     pub(crate) memory: usize,
-    /// Of one blob in memory.
+    /// Largest single blob in memory.
     pub(crate) small: usize,
-    /// Of all files.
+    /// Total size of the files.
     pub(crate) disk: u64,
 }
 
@@ -45,17 +45,17 @@ struct Memory {
     bytes: usize,
 }
 
-/// A cache of blobs.
+/// A cache of blobs; see the module.
 #[derive(Debug)]
 pub(crate) struct Cache {
     bounds: Bounds,
     memory: Mutex<Memory>,
-    /// Blobs in nameless files that were fetched before somebody needed them.
+    /// Prefetched blobs in unnamed files.
     ahead: Mutex<HashMap<Digest, Cached>>,
     folder: Option<PathBuf>,
-    /// The folder of the coordinator's store, if it is on this machine: its blobs are read in place.
+    /// Folder of the coordinator's store, if it is on this machine. Its blobs are read in place.
     store: Option<PathBuf>,
-    /// Bytes in the folder, as far as this process knows.
+    /// Bytes in the folder by this process's count.
     disk: Mutex<u64>,
 }
 
@@ -69,7 +69,7 @@ impl Cache {
         Ok(Self { bounds, memory: Mutex::default(), ahead: Mutex::default(), folder, store, disk: Mutex::new(bytes) })
     }
 
-    /// A blob that was read before, verified again.
+    /// Returns a cached blob after verifying it again.
     pub(crate) fn get(&self, digest: Digest) -> Option<Cached> {
         if let Some(blob) = lock(&self.memory).blobs.get(&digest) {
             return Some(Cached::Memory(blob.clone()));
@@ -87,13 +87,13 @@ impl Cache {
             remove(&path);
             return None;
         }
-        // Only the order of eviction rests on it.
+        // Only the order of eviction depends on this time.
         let _ = file.set_modified(SystemTime::now());
         let blob = Cached::File(CachedFile::new(digest, file).ok()?);
         self.keep_small(digest, blob).ok()
     }
 
-    /// A blob of the store on this machine. What is missing or damaged there is the coordinator's to say.
+    /// Opens a blob of the store on this machine. `None` if it is missing or damaged; the coordinator reports that.
     fn in_store(&self, digest: Digest) -> Option<CachedFile> {
         let mut file = File::open(checkpoint::blob_path(self.store.as_ref()?, digest)).ok()?;
         if file.metadata().is_ok_and(|data| !data.is_file()) || digest_of(&mut file).ok() != Some(digest) {
@@ -102,19 +102,19 @@ impl Cache {
         CachedFile::new(digest, file).ok()
     }
 
-    /// Keeps a blob that lies in a nameless file until [`forget_ahead`](Self::forget_ahead): somebody will read it soon.
+    /// Keeps a blob in an unnamed file until [`forget_ahead`](Self::forget_ahead), because a task will read it soon.
     pub(crate) fn keep_ahead(&self, digest: Digest, blob: &Cached) {
         if self.folder.is_none() && matches!(blob, Cached::File(_)) {
             lock(&self.ahead).insert(digest, blob.clone());
         }
     }
 
-    /// Lets go of what was kept ahead and is not among `wanted`.
+    /// Releases the prefetched blobs that are not among `wanted`.
     pub(crate) fn forget_ahead(&self, wanted: &[Digest]) {
         lock(&self.ahead).retain(|digest, _| wanted.contains(digest));
     }
 
-    /// A place for a blob that is being fetched, of `length` bytes if that is known.
+    /// Prepares the destination of a blob that is being fetched; `length` is its size if known.
     pub(crate) fn arriving(&self, digest: Digest, length: Option<u64>) -> io::Result<Arriving> {
         let small = length.is_some_and(|length| length <= self.bounds.small as u64);
         let place = if small {
@@ -128,7 +128,7 @@ impl Cache {
         Ok(Arriving { digest, place, hasher: Hasher::default(), written: 0 })
     }
 
-    /// Keeps a verified blob in memory. A cache that cannot be written is a slow one, not an error.
+    /// Keeps a verified blob. A cache that cannot be written makes reads slower but is no error.
     fn insert(&self, digest: Digest, blob: &Arc<[u8]>) {
         self.remember(digest, blob);
         let Some(path) = self.path(digest) else { return };
@@ -149,7 +149,7 @@ impl Cache {
         }
     }
 
-    /// Takes a blob that is small enough into memory.
+    /// Moves a blob into memory if it is small enough.
     fn keep_small(&self, digest: Digest, blob: Cached) -> Result<Cached, BlobError> {
         if blob.bytes() > self.bounds.small as u64 {
             return Ok(blob);
@@ -182,7 +182,7 @@ impl Cache {
         self.folder.as_ref().map(|folder| folder.join(&hex[..2]).join(&hex[2..]))
     }
 
-    /// Deletes the least recently read files until a tenth of the bound is free; returns what is left.
+    /// Deletes the least recently read files until a tenth of the limit is free. Returns the bytes that remain.
     fn evict(&self) -> u64 {
         let Some(folder) = &self.folder else { return 0 };
         let mut all = files(folder);
@@ -199,14 +199,14 @@ impl Cache {
     }
 }
 
-/// A verified blob.
+/// A verified blob in memory or in a file.
 #[derive(Debug, Clone)]
 pub(crate) enum Cached {
     Memory(Arc<[u8]>),
     File(CachedFile),
 }
 
-/// A verified blob in an open file. Nobody writes to it: files are replaced and removed, never changed.
+/// A verified blob in an open file. Files are replaced and removed, but their content never changes.
 #[derive(Debug, Clone)]
 pub(crate) struct CachedFile {
     digest: Digest,
@@ -222,7 +222,7 @@ impl CachedFile {
 }
 
 impl Cached {
-    /// All of it.
+    /// Reads the whole blob into memory.
     pub(crate) fn into_memory(self) -> Result<Arc<[u8]>, BlobError> {
         match self {
             Self::Memory(bytes) => Ok(bytes),
@@ -236,7 +236,7 @@ impl Cached {
         }
     }
 
-    /// All of it, without memory of this process's own where it lies in a file.
+    /// Returns the whole blob. A blob in a file is mapped and uses no memory of this process.
     pub(crate) fn into_bytes(self) -> Result<Bytes, BlobError> {
         match self {
             Self::Memory(bytes) => Ok(Bytes::from_owner(bytes)),
@@ -265,7 +265,7 @@ impl Blob for Cached {
     }
 }
 
-/// A blob on its way into the cache, hashed as it comes.
+/// A blob on its way into the cache, hashed while it arrives.
 #[derive(Debug)]
 pub(crate) struct Arriving {
     digest: Digest,
@@ -282,12 +282,12 @@ impl Arriving {
         Ok(())
     }
 
-    /// Bytes that have arrived.
+    /// Number of bytes that have arrived.
     pub(crate) fn written(&self) -> u64 {
         self.written
     }
 
-    /// The blob, or what it hashes to if that is not its name.
+    /// Verifies and returns the blob. If its digest differs from its name, returns the digest found.
     pub(crate) fn finish(self, cache: &Cache) -> Result<Result<Cached, Digest>, BlobError> {
         let found = self.hasher.finish();
         if found != self.digest {
@@ -313,7 +313,7 @@ impl Arriving {
     }
 }
 
-/// Where a blob arrives.
+/// Destination of an arriving blob.
 #[derive(Debug)]
 enum Place {
     Memory(Vec<u8>),
@@ -321,7 +321,7 @@ enum Place {
     Nameless(File),
 }
 
-/// A file that goes unless it was given its name.
+/// A file that is deleted unless it is renamed to its final name.
 #[derive(Debug)]
 struct Staged(PathBuf);
 
@@ -356,7 +356,8 @@ impl Place {
         }
     }
 
-    /// The whole blob's file, under its name if it has one. No fsync: what a crash cuts short is found out by its digest.
+    /// Returns the file of the whole blob, after renaming a named one. Without fsync: the digest reveals a file that a
+    /// crash truncates.
     fn publish(self) -> io::Result<File> {
         match self {
             Self::Memory(_) => Err(io::Error::other("a blob in memory has no file")),
@@ -369,7 +370,7 @@ impl Place {
     }
 }
 
-/// A part of a file name that nobody else uses.
+/// A unique part of a file name.
 fn unique() -> String {
     static NEXT: AtomicU64 = AtomicU64::new(0);
     format!("{}.{}.part", std::process::id(), NEXT.fetch_add(1, Ordering::Relaxed))
@@ -394,7 +395,7 @@ fn remove(path: &Path) {
     }
 }
 
-/// Path, length and time of the last read of all files two levels down. What vanishes meanwhile is left out.
+/// Path, length and last read of all files two levels down. Skips files that disappear during the listing.
 fn files(folder: &Path) -> Vec<(PathBuf, u64, SystemTime)> {
     let list = |path: &Path| fs::read_dir(path).into_iter().flatten().flatten();
     list(folder)

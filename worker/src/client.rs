@@ -1,86 +1,123 @@
-//! Calls to the coordinator. Says what an error means for the caller; whether to try again is the caller's.
+//! Calls to the coordinator. An error tells what the answer means; the caller decides about retries.
 //!
-//! One runtime with one thread drives all connections; stages and uploads are synchronous and wait on it.
+//! One runtime with one thread drives all connections. Stages and uploads are synchronous and block on it.
 
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
-use access::{Server, explain};
+use access::{Server, Token, explain};
 use bytes::Bytes;
-use protocol::Digest;
-use protocol::message::{ApiError, DesiredAssignments, Grant, Join, Joined, Poll};
+use protocol::message::{ApiError, DesiredAssignments, Gone, Grant, Join, Joined, Poll};
+use protocol::proof::{BlobStored, GRANT_HEADER, PROCESS_HEADER, Process, RECEIPT_HEADER, SECRET_HEADER};
+use protocol::{Digest, WorkerId};
 use reqwest::{RequestBuilder, Response, StatusCode};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use tokio::runtime::Handle;
 
-/// Why a call did not do what it should.
+use crate::event_count::lock;
+use crate::failpoints;
+
+/// Failure of a call.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub(crate) enum CallError {
-    /// The coordinator is away or overloaded: the same call may succeed later.
+    /// The coordinator is unreachable or overloaded. The same call may succeed later.
     #[error("{0}")]
     Away(String),
-    /// It has too much to do: the same call may succeed after this time.
+    /// The coordinator is busy. The same call may succeed after this time.
     #[error("{0}")]
     Busy(String, Duration),
-    /// It answered that it failed, by a fault of its own.
+    /// The coordinator reports an internal error.
     #[error("{0}")]
     Fault(String),
-    /// The grant is not the task's newest.
+    /// The grant is not the task's newest, or the coordinator does not recognise its secret.
     #[error("{0}")]
     Stale(String),
-    /// The coordinator's store is full or not writable: the same call may succeed once there is room.
+    /// Another process holds the worker's name, for at most the time of its lease.
+    #[error("{0}")]
+    NameHeld(String),
+    /// The coordinator's store is full or not writable. The same call may succeed once there is room.
     #[error("{0}")]
     Full(String),
-    /// What is fetched cannot be kept on this machine.
+    /// The fetched data cannot be stored on this machine.
     #[error("{0}")]
     Storage(String),
-    /// No such thing.
+    /// The object does not exist.
     #[error("{0}")]
     NotFound(String),
-    /// The store has the blob, and its bytes are wrong.
+    /// The store has the blob, but its bytes are damaged.
     #[error("{0}")]
     Damaged(String),
-    /// Wrong, and will stay so.
+    /// The run has reached its limit of this resource.
+    #[error("{0}")]
+    UsedUp(String),
+    /// The call is invalid; the same call never succeeds.
     #[error("{0}")]
     Refused(String),
 }
 
 impl CallError {
-    /// Whether the same call may succeed later, with nothing done about it by the caller.
+    /// Returns true if the same call may succeed later without any action of the caller.
     pub(crate) fn may_pass(&self) -> bool {
         matches!(self, Self::Away(_) | Self::Busy(..) | Self::Full(_) | Self::Fault(_))
     }
 }
 
-/// A coordinator, and the thread that talks to it.
+/// A connection to the coordinator, with the thread that drives it.
 #[derive(Debug, Clone)]
 pub(crate) struct Client {
     server: Server,
     runtime: Handle,
+    /// The secret of this process. Drawn at its start, and held in memory only.
+    secret: Token,
+    /// Identity of this process, as assigned by the coordinator.
+    process: Arc<Mutex<Option<Process>>>,
 }
 
-/// For calls with small bodies.
+/// A grant with its secret.
+#[derive(Clone, PartialEq, Eq)]
+pub(crate) struct Credential {
+    pub(crate) grant: Grant,
+    pub(crate) secret: String,
+}
+
+impl std::fmt::Debug for Credential {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Credential").field("grant", &self.grant).finish_non_exhaustive()
+    }
+}
+
+/// Timeout of calls with small bodies.
 const SHORT: Duration = Duration::from_secs(30);
-/// For blobs; a coordinator writes them to disk before it answers.
+/// Timeout of blob transfers; the coordinator writes a blob to disk before it answers.
 const LONG: Duration = Duration::from_secs(600);
 
 impl Client {
-    /// A client of `server`.
     pub(crate) fn new(server: Server, runtime: Handle) -> Self {
-        Self { server, runtime }
+        let secret = failpoints::secret().unwrap_or_else(Token::random);
+        Self { server, runtime, secret, process: Arc::default() }
+    }
+
+    /// The coordinator's address.
+    pub(crate) fn url(&self) -> &str {
+        self.server.url()
     }
 
     fn request(&self, method: reqwest::Method, path: &str, timeout: Duration) -> RequestBuilder {
         self.server.request(method, path).timeout(timeout)
     }
 
-    /// Runs one call from a thread that is not the runtime's.
+    /// Blocks on a call. The calling thread must not be the runtime's.
     pub(crate) fn wait<T>(&self, call: impl Future<Output = T>) -> T {
         self.runtime.block_on(call)
     }
 
+    /// Joins as this process. A repeated join, after a lost answer, shows the same secret.
     pub(crate) async fn join(&self, join: &Join) -> Result<Joined, CallError> {
-        answer(self.post("/v1/workers", join, SHORT).await?).await
+        let joined: Joined = answer(self.post("/v1/workers", self.secret.secret(), join, SHORT).await?).await?;
+        let process = Process { worker: join.worker.clone(), incarnation: joined.incarnation };
+        *lock(&self.process) = Some(process);
+        Ok(joined)
     }
 
     pub(crate) async fn poll(
@@ -89,40 +126,64 @@ impl Client {
         poll: &Poll,
         patience: Duration,
     ) -> Result<DesiredAssignments, CallError> {
-        answer(self.post(path, poll, patience).await?).await
+        answer(self.post(path, self.secret.secret(), poll, patience).await?).await
     }
 
-    /// A call whose answer says no more than that it was done.
-    pub(crate) async fn tell<T: Serialize + Sync>(&self, path: &str, what: &T) -> Result<(), CallError> {
-        self.post(path, what, SHORT).await.map(drop)
+    /// Reports that this process ends, so that its name and its work are free before its lease ends.
+    pub(crate) async fn leave(&self, worker: &WorkerId) -> Result<(), CallError> {
+        let Some(Process { incarnation, .. }) = lock(&self.process).clone() else { return Ok(()) };
+        let path = format!("/v1/workers/{worker}/gone");
+        self.post(&path, self.secret.secret(), &Gone { incarnation }, SHORT).await.map(drop)
     }
 
-    /// How much of a blob the coordinator has.
-    pub(crate) async fn staged(&self, grant: &Grant, digest: Digest) -> Result<Stored, CallError> {
+    /// Sends a write under a grant; a successful answer carries no data.
+    pub(crate) async fn tell<T: Serialize + Sync>(
+        &self,
+        path: &str,
+        credential: &Credential,
+        what: &T,
+    ) -> Result<(), CallError> {
+        self.post(path, &credential.secret, what, SHORT).await.map(drop)
+    }
+
+    /// Asks how much of a blob the coordinator has. Shows the receipt of an earlier upload, if there is one.
+    pub(crate) async fn staged(
+        &self,
+        credential: &Credential,
+        digest: Digest,
+        receipt: Option<String>,
+    ) -> Result<BlobStored, CallError> {
         let request = self.request(reqwest::Method::GET, &format!("/v1/blobs/{digest}/staged"), LONG);
-        answer(check(in_the_name_of(request, grant)?.send().await).await?).await
+        let mut request = in_the_name_of(request, credential)?;
+        if let Some(receipt) = receipt {
+            request = request.header(RECEIPT_HEADER, receipt);
+        }
+        answer(check(request.send().await).await?).await
     }
 
-    /// Sends what begins at `offset` of a blob of `bytes` bytes.
+    /// Sends a part that begins at `offset` of a blob of `bytes` bytes.
     pub(crate) async fn put_part(
         &self,
-        grant: &Grant,
+        credential: &Credential,
         digest: Digest,
         bytes: u64,
         offset: u64,
         part: Bytes,
-    ) -> Result<Stored, CallError> {
+    ) -> Result<BlobStored, CallError> {
         let request = self.request(reqwest::Method::PUT, &format!("/v1/blobs/{digest}"), LONG);
-        let request = in_the_name_of(request, grant)?.header("content-type", "application/octet-stream");
+        let request = in_the_name_of(request, credential)?.header("content-type", "application/octet-stream");
         let request = request.header("x-stride-bytes", bytes).header("x-stride-offset", offset);
         answer(check(request.body(part).send().await).await?).await
     }
 
-    /// What begins at `offset` of a blob.
+    /// Requests a blob from `offset` to its end.
     pub(crate) async fn get_blob(&self, digest: Digest, offset: u64) -> Result<Download, CallError> {
         let mut request = self.request(reqwest::Method::GET, &format!("/v1/blobs/{digest}"), LONG);
         if offset > 0 {
             request = request.header("range", format!("bytes={offset}-"));
+        }
+        if let Some(process) = &*lock(&self.process) {
+            request = request.header(PROCESS_HEADER, header(process)?).header(SECRET_HEADER, self.secret.secret());
         }
         let response = check(request.send().await).await?;
         match (offset, response.status()) {
@@ -131,25 +192,24 @@ impl Client {
         }
     }
 
-    async fn post<T: Serialize + Sync>(&self, path: &str, what: &T, timeout: Duration) -> Result<Response, CallError> {
-        check(self.request(reqwest::Method::POST, path, timeout).json(what).send().await).await
+    async fn post<T: Serialize + Sync>(
+        &self,
+        path: &str,
+        secret: &str,
+        what: &T,
+        timeout: Duration,
+    ) -> Result<Response, CallError> {
+        let request = self.request(reqwest::Method::POST, path, timeout).header(SECRET_HEADER, secret);
+        check(request.json(what).send().await).await
     }
 }
 
-/// What the coordinator says of a blob that is sent to it.
-#[derive(Debug, Clone, Copy, serde::Serialize, serde::Deserialize)]
-pub(crate) struct Stored {
-    pub(crate) stored: bool,
-    /// Bytes that have arrived, if not all have.
-    pub(crate) staged: u64,
-}
-
-/// A blob on its way here.
+/// A blob that is being downloaded.
 #[derive(Debug)]
 pub(crate) struct Download(Response);
 
 impl Download {
-    /// How many bytes are to come, if the coordinator says so.
+    /// The number of bytes to come, if the coordinator reports it.
     pub(crate) fn length(&self) -> Option<u64> {
         self.0.content_length()
     }
@@ -160,9 +220,13 @@ impl Download {
     }
 }
 
-fn in_the_name_of(request: RequestBuilder, grant: &Grant) -> Result<RequestBuilder, CallError> {
-    let grant = serde_json::to_string(grant).map_err(|e| CallError::Refused(e.to_string()))?;
-    Ok(request.header("x-stride-grant", grant))
+fn in_the_name_of(request: RequestBuilder, credential: &Credential) -> Result<RequestBuilder, CallError> {
+    Ok(request.header(GRANT_HEADER, header(&credential.grant)?).header(SECRET_HEADER, &credential.secret))
+}
+
+/// Serialises a header value as JSON.
+fn header(value: &impl Serialize) -> Result<String, CallError> {
+    serde_json::to_string(value).map_err(|e| CallError::Refused(e.to_string()))
 }
 
 async fn answer<T: DeserializeOwned>(response: Response) -> Result<T, CallError> {
@@ -190,11 +254,14 @@ async fn check(sent: Result<Response, reqwest::Error>) -> Result<Response, CallE
         None => error.message,
     };
     Err(match (status, error.code.as_str()) {
-        (_, "stale-fence") => CallError::Stale(message),
+        (_, "stale-fence" | "unproven") => CallError::Stale(message),
+        (_, "name-held") => CallError::NameHeld(message),
         (_, "storage") | (StatusCode::INSUFFICIENT_STORAGE, _) => CallError::Full(message),
         (_, "not-found") | (StatusCode::NOT_FOUND, _) => CallError::NotFound(message),
         (_, "damaged") => CallError::Damaged(message),
-        // What has arrived is asked for again.
+        (_, "arrived-damaged") => CallError::Fault(message),
+        (_, "used-up") => CallError::UsedUp(message),
+        // The next call asks again how much has arrived.
         (StatusCode::RANGE_NOT_SATISFIABLE, "offset") => CallError::Away(message),
         (StatusCode::TOO_MANY_REQUESTS, _) => CallError::Busy(message, after),
         (StatusCode::REQUEST_TIMEOUT, _) => CallError::Away(message),

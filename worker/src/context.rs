@@ -1,4 +1,4 @@
-//! What a stage may ask of the world, over HTTP and TCP.
+//! Implementation of a stage's context over HTTP and TCP.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -8,8 +8,10 @@ use std::time::{Duration, Instant};
 use burn::tensor::Device;
 use checkpoint::{BlobError, Blobs};
 use protocol::message::{CommitCheckpoint, Progress, StageTask};
+use protocol::proof::Vouched;
 use protocol::{ArtifactKind, Digest, Manifest};
 use stages::context::{Adopted, AttemptContext, ContextError, Exchange, GangContext, Rendezvous};
+use stages::external::DataAccess;
 
 use crate::active_assignment::ActiveAssignment;
 use crate::blobs::HttpBlobs;
@@ -21,49 +23,73 @@ use crate::gang::member::Phase;
 use crate::gang::mesh::{Halt, Mesh};
 use crate::gang::tree;
 use crate::process;
+use crate::receipts::Receipts;
 use crate::retry::{self, GaveUp};
 use crate::telemetry_buffer::{Sender, TelemetryBuffer};
 
-/// One attempt's view of the coordinator and, in a gang, of its peers.
+/// Access of one attempt to the coordinator and, in a gang, to its peers.
 #[derive(Debug)]
 pub(crate) struct HttpContext {
     task: StageTask,
     device: Device,
+    data: Arc<DataAccess>,
     held: Arc<ActiveAssignment>,
     client: Client,
     blobs: Arc<HttpBlobs>,
     telemetry: Arc<TelemetryBuffer>,
     mesh: Option<Arc<Mesh>>,
     behind: Option<Behind>,
+    /// End of the last exchange or rendezvous.
+    computes_since: Instant,
     gang: bool,
     _sender: Sender,
 }
 
-/// A peer's state that is on its way to a member that came to the rendezvous with `applied`.
+/// Transfer of a peer's state to a member that came to the rendezvous with `applied` steps.
 #[derive(Debug)]
 struct Behind {
     mesh: Arc<Mesh>,
     source: usize,
+    /// Steps applied to that state.
+    step: u64,
     applied: Option<u64>,
     begun: Instant,
 }
 
 impl HttpContext {
-    pub(crate) fn new(held: Arc<ActiveAssignment>, client: Client, cache: Arc<Cache>, device: Device) -> Self {
+    pub(crate) fn new(
+        held: Arc<ActiveAssignment>,
+        client: Client,
+        cache: Arc<Cache>,
+        data: Arc<DataAccess>,
+        device: Device,
+    ) -> Self {
         let assignment = held.assignment();
         let gang = matches!(assignment.role, protocol::message::Role::Member { .. });
-        let blobs = Arc::new(HttpBlobs { held: held.clone(), client: client.clone(), cache, gang });
+        let blobs = Arc::new(HttpBlobs {
+            held: held.clone(),
+            client: client.clone(),
+            cache,
+            receipts: Receipts::default(),
+            gang,
+        });
         let (telemetry, sender) = TelemetryBuffer::open(held.clone(), client.clone());
         let task = assignment.stage;
-        Self { task, device, held, client, blobs, telemetry, mesh: None, behind: None, gang, _sender: sender }
+        let (mesh, behind, computes_since) = (None, None, Instant::now());
+        Self { task, device, data, held, client, blobs, telemetry, mesh, behind, computes_since, gang, _sender: sender }
     }
 
-    /// Waits until everything recorded and logged is stored.
+    /// Waits until all recorded metrics and log lines are stored.
     pub(crate) fn flush(&self) -> Result<(), ContextError> {
         self.telemetry.flush().map_err(given_up)
     }
 
-    /// Lets the peers go, saying goodbye: to the next generation, or for good.
+    /// Receipts that prove the uploads of a manifest by this attempt.
+    pub(crate) fn receipts(&self, manifest: Digest) -> BTreeMap<Digest, String> {
+        self.blobs.receipts.for_manifest(manifest)
+    }
+
+    /// Says goodbye to the peers and closes the connections. The goodbye names the next generation, if there is one.
     fn part(&mut self) {
         if let Some(mesh) = self.mesh.take() {
             let next = match &self.held.assignment().role {
@@ -76,7 +102,7 @@ impl HttpContext {
         }
     }
 
-    /// After a peer is gone: waits for the coordinator's next generation.
+    /// Waits for the coordinator's next generation after the loss of a peer.
     fn await_regroup(&mut self, mesh: &Mesh) -> Result<(), ContextError> {
         let begun = Instant::now();
         let mut warned = begun;
@@ -108,20 +134,21 @@ impl HttpContext {
         }
     }
 
-    /// What a barrier that was not reached means: `Ok` if it is tried again with other members.
+    /// Handles a barrier that was not reached. Returns `Ok` if it is tried again with other members.
     fn halted(&mut self, mesh: &Mesh, halt: Halt) -> Result<(), ContextError> {
         match halt {
             Halt::Ended(reason) => {
                 self.part();
                 Err(ContextError::GrantEnded(reason))
             }
-            Halt::Disagree(message) => Err(ContextError::Unavailable(message)),
-            Halt::Regroup | Halt::Peer => self.await_regroup(mesh),
+            Halt::Fault(message) => Err(ContextError::Fault(message)),
+            Halt::Regroup | Halt::Peer | Halt::Disagree(_) => self.await_regroup(mesh),
         }
     }
 
-    /// Says that the members are at one state, of which `adopted` bytes came here in so many seconds.
-    fn met(&self, mesh: &Mesh, adopted: Option<(usize, f64)>) {
+    /// Logs that the members agree on a state. `adopted` holds the bytes and the seconds of a transfer to this member.
+    fn met(&mut self, mesh: &Mesh, adopted: Option<(usize, f64)>) {
+        self.computes_since = Instant::now();
         tracing::info!(
             task = %mesh.config.task,
             generation = %mesh.config.generation,
@@ -135,7 +162,7 @@ impl HttpContext {
         );
     }
 
-    /// A member that asks for blobs between two steps is about to save.
+    /// Marks this member as saving if it asks for blobs between two steps.
     fn saves(&self) {
         if self.held.busy().phase() == Phase::Working {
             self.held.busy().set(Phase::Saving);
@@ -162,6 +189,10 @@ impl AttemptContext for HttpContext {
         self.device.clone()
     }
 
+    fn data(&self) -> Arc<DataAccess> {
+        self.data.clone()
+    }
+
     fn blobs(&self) -> Arc<dyn Blobs> {
         self.saves();
         self.blobs.clone()
@@ -181,7 +212,9 @@ impl AttemptContext for HttpContext {
     }
 
     fn put_manifest(&mut self, manifest: &Manifest) -> Result<Digest, ContextError> {
-        self.blobs.put(manifest.to_bytes()).map_err(blob_error)
+        let digest = self.blobs.put(manifest.to_bytes()).map_err(blob_error)?;
+        self.blobs.receipts.note(digest, manifest);
+        Ok(digest)
     }
 
     fn progress(&mut self, done: u64, total: u64, unit: &str, metrics: &[(&str, f64)]) {
@@ -198,7 +231,8 @@ impl AttemptContext for HttpContext {
         self.telemetry.log(line);
     }
 
-    /// In a gang a wish to stop is not said here: all members must hear it after the same step, from an exchange.
+    /// In a gang, drain requests are not reported here: all members must learn of them after the same step, from an
+    /// exchange.
     fn interrupted(&self) -> bool {
         self.held.ended().is_some() || (!self.gang && self.held.drain())
     }
@@ -216,6 +250,7 @@ impl GangContext for HttpContext {
 
     fn rendezvous(&mut self, applied: Option<u64>, state: &[&[u8]]) -> Result<Rendezvous, ContextError> {
         self.held.busy().set(Phase::Working);
+        self.held.set_holds(applied);
         loop {
             self.check()?;
             if let Some(newer) = self.held.take_mesh() {
@@ -227,13 +262,13 @@ impl GangContext for HttpContext {
             };
             let held = self.held.clone();
             let generation = mesh.config.generation;
-            // The rows that are not known to be stored travel behind the state, and their length behind them.
+            // Rows that may not be stored yet follow the state, and their length follows them.
             let kept = self.telemetry.kept();
             let length = (kept.len() as u64).to_le_bytes();
             let offered: Vec<&[u8]> = state.iter().copied().chain([&kept[..], &length[..]]).collect();
             match exchange::rendezvous(&mesh, applied, &offered, &|| held.halt(generation)) {
-                Ok(Met::Behind(source)) => {
-                    self.behind = Some(Behind { mesh, source, applied, begun: Instant::now() });
+                Ok(Met::Behind(source, step)) => {
+                    self.behind = Some(Behind { mesh, source, step, applied, begun: Instant::now() });
                     return Ok(Rendezvous::Behind);
                 }
                 Ok(Met::Keep) => {
@@ -246,14 +281,17 @@ impl GangContext for HttpContext {
     }
 
     fn adopt(&mut self, state: &mut [&mut [u8]]) -> Result<Adopted, ContextError> {
-        let Some(Behind { mesh, source, applied, begun }) = self.behind.take() else { return Ok(Adopted::Cut) };
+        let Some(Behind { mesh, source, step, applied, begun }) = self.behind.take() else { return Ok(Adopted::Cut) };
         let held = self.held.clone();
         let generation = mesh.config.generation;
         let directly = applied.is_none();
         match exchange::adopt(&mesh, source, state, directly, &|| held.halt(generation)) {
             Ok(rest) => {
-                let rows = rows(&rest).ok_or_else(|| malformed("is cut short"))?;
-                self.telemetry.take_over(rows, applied).map_err(|e| malformed(&e.to_string()))?;
+                let rows = rows(&rest).ok_or_else(|| "is cut short".to_owned());
+                let taken = rows.and_then(|rows| self.telemetry.take_over(rows, applied).map_err(|e| e.to_string()));
+                // The peer's bytes may already overwrite this member's own state, so this try has failed.
+                taken.map_err(|why| ContextError::Fault(format!("a peer's list of recorded values {why}")))?;
+                self.held.set_holds(Some(step));
                 let bytes = state.iter().map(|piece| piece.len()).sum::<usize>() + rest.len();
                 self.met(&mesh, Some((bytes, begun.elapsed().as_secs_f64())));
                 Ok(Adopted::Whole)
@@ -271,8 +309,10 @@ impl GangContext for HttpContext {
 
     fn exchange(&mut self, step: u64, slices: usize, parts: &[(usize, Vec<f32>)]) -> Result<Exchange, ContextError> {
         self.check()?;
+        let saved = self.held.busy().phase() == Phase::Saving;
         self.held.busy().set(Phase::Working);
         failpoints::pace();
+        let computed = self.computes_since.elapsed();
         let Some(mesh) = self.mesh.clone() else { return Ok(Exchange::Regroup) };
         let generation = mesh.config.generation;
         if self.held.halt(generation).is_some() {
@@ -285,17 +325,20 @@ impl GangContext for HttpContext {
             let part = parts.iter().find(|(at, _)| *at == slice).map(|(_, part)| part.as_slice());
             let part = part.filter(|part| own.first().is_none_or(|(_, first): &(_, &[f32])| first.len() == part.len()));
             let Some(part) = part else {
-                return Err(ContextError::Unavailable(format!(
+                return Err(ContextError::Fault(format!(
                     "step {step}: slice {slice} of this member's {share:?} is missing or of another length; a fault of the stage"
                 )));
             };
             own.push((slice..slice + 1, part));
         }
-        let contribution =
-            Contribution { step, slices, parts: own, drain: self.held.drain(), durable: self.telemetry.durable() };
+        let (drain, durable) = (self.held.drain(), self.telemetry.durable());
+        let contribution = Contribution { step, slices, parts: own, drain, saved, computed, durable };
         let held = self.held.clone();
-        match exchange::exchange(&mesh, &contribution, &|| held.halt(generation)) {
+        let exchanged = exchange::exchange(&mesh, &contribution, &|| held.halt(generation));
+        self.computes_since = Instant::now();
+        match exchanged {
             Ok(total) => {
+                self.held.set_holds(Some(step + 1));
                 self.telemetry.forget(total.durable);
                 Ok(Exchange::Sum { sum: total.sum, drain: total.drain })
             }
@@ -314,7 +357,7 @@ impl GangContext for HttpContext {
         let Some(mesh) = self.mesh.clone() else {
             return Err(ContextError::Unavailable("a stage that is not a gang's holds no state for others".to_owned()));
         };
-        // What this member logged is stored before rank 0 ends the attempt for all.
+        // Store this member's log before rank 0 ends the attempt for all.
         self.flush()?;
         let held = self.held.clone();
         let generation = mesh.config.generation;
@@ -324,7 +367,11 @@ impl GangContext for HttpContext {
     }
 
     fn can_save(&self) -> bool {
-        !self.held.is_away()
+        !self.held.is_away() && !self.held.is_put_off()
+    }
+
+    fn may_postpone(&mut self, may: bool) {
+        self.held.set_postponable(may);
     }
 
     fn commit_checkpoint(
@@ -334,14 +381,18 @@ impl GangContext for HttpContext {
         metrics: &BTreeMap<String, f64>,
     ) -> Result<(), ContextError> {
         self.flush()?;
-        // Uploaded by the stage before; storing it again costs one call and makes the commit stand on its own.
+        // The stage has uploaded it before. Storing it again costs one call and makes the commit independent of that
+        // upload.
         let digest = self.put_manifest(manifest)?;
         let metrics: BTreeMap<String, f64> =
             metrics.iter().filter(|(_, v)| v.is_finite()).map(|(k, v)| (k.clone(), *v)).collect();
+        let receipts = self.receipts(digest);
         failpoints::hit("checkpoint::before_commit");
-        retry::until_ended(&self.held, &format!("committing the checkpoint of step {step}"), |grant| {
-            let commit = CommitCheckpoint { grant: grant.clone(), step, manifest: digest, metrics: metrics.clone() };
-            self.client.wait(self.client.tell("/v1/checkpoints", &commit))
+        retry::until_put_off(&self.held, &format!("committing the checkpoint of step {step}"), |credential| {
+            let (grant, metrics) = (credential.grant.clone(), metrics.clone());
+            let commit = CommitCheckpoint { grant, step, manifest: digest, metrics };
+            let vouched = Vouched { what: commit, receipts: receipts.clone() };
+            self.client.wait(self.client.tell("/v1/checkpoints", credential, &vouched))
         })
         .map_err(given_up)?;
         failpoints::hit("checkpoint::after_commit");
@@ -350,20 +401,17 @@ impl GangContext for HttpContext {
     }
 }
 
-/// The kept rows, of what came behind a peer's state: their length follows them.
+/// Extracts the kept rows from the bytes that follow a peer's state; their length is at the end.
 fn rows(behind: &[u8]) -> Option<&[u8]> {
     let (rows, length) = behind.split_at_checked(behind.len().checked_sub(8)?)?;
     (u64::from_le_bytes(length.try_into().ok()?) == rows.len() as u64).then_some(rows)
-}
-
-fn malformed(why: &str) -> ContextError {
-    ContextError::Unavailable(format!("a peer's list of recorded values {why}; is it the same build?"))
 }
 
 fn given_up(gave_up: GaveUp) -> ContextError {
     match gave_up {
         GaveUp::Ended(reason) | GaveUp::Answer(CallError::Stale(reason)) => ContextError::GrantEnded(reason),
         GaveUp::Answer(CallError::Storage(message)) => ContextError::Storage(message),
+        GaveUp::Answer(CallError::Refused(message)) => ContextError::Refused(message),
         GaveUp::Answer(error) => ContextError::Unavailable(error.to_string()),
     }
 }
@@ -371,8 +419,9 @@ fn given_up(gave_up: GaveUp) -> ContextError {
 fn blob_error(error: BlobError) -> ContextError {
     match error {
         BlobError::Refused(reason) => ContextError::GrantEnded(reason),
+        BlobError::Unfit(message) => ContextError::Refused(message),
         BlobError::Storage(message) => ContextError::Storage(message),
-        BlobError::Unavailable(message) => ContextError::Unavailable(message),
+        BlobError::Unreachable(message) | BlobError::Unavailable(message) => ContextError::Unavailable(message),
         error @ (BlobError::NotFound(_) | BlobError::Corrupt { .. } | BlobError::Damaged(_)) => {
             ContextError::Damaged(error.to_string())
         }

@@ -1,15 +1,16 @@
-//! Waking threads that wait for any of several things: a frame, a newer generation, the end of a grant.
+//! An event count: wakes threads that wait for any of several events, such as a frame, a newer generation or the end of
+//! a grant.
 
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-/// Locks, whatever happened to the thread that held the lock before: our critical sections leave whole values.
+/// Locks a mutex and ignores poisoning, because our critical sections never leave a value half changed.
 pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// A counter that is waited on. Take a [`ticket`](EventCount::ticket), look at what you wait for, then [`wait`](EventCount::wait): a
-/// ring in between is not missed.
+/// A counter of events to wait on. Take a [`ticket`](EventCount::ticket), check the condition, then call
+/// [`wait`](EventCount::wait). A notification in between is not missed.
 #[derive(Debug, Default)]
 pub(crate) struct EventCount {
     rung: Mutex<u64>,
@@ -17,18 +18,18 @@ pub(crate) struct EventCount {
 }
 
 impl EventCount {
-    /// Wakes all who wait.
+    /// Wakes all waiting threads.
     pub(crate) fn notify(&self) {
         *lock(&self.rung) += 1;
         self.changed.notify_all();
     }
 
-    /// How often it was rung.
+    /// The number of notifications so far.
     pub(crate) fn ticket(&self) -> u64 {
         *lock(&self.rung)
     }
 
-    /// Returns once it was rung after `ticket` was taken, or after `at_most`.
+    /// Waits for a notification after `ticket`, for at most `at_most`.
     pub(crate) fn wait(&self, ticket: u64, at_most: Duration) {
         let guard = lock(&self.rung);
         drop(

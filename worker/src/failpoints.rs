@@ -1,12 +1,15 @@
-//! Points at which tests kill a worker: `checkpoint::{before,after}_{upload,commit}` and `outcome::{before,after}_report`.
+//! Points at which tests kill a worker: `checkpoint::{before,after}_{upload,commit}` and
+//! `outcome::{before,after}_report`.
 //!
-//! Built only with the feature `failpoints`. `STRIDE_WORKER_FAILPOINT=name`, or `name@3` for the third time it gets there,
-//! has the process end as by `kill -9` at one of them. The registry has points and a variable of its own.
+//! They exist only with the feature `failpoints`. `STRIDE_WORKER_FAILPOINT=name` kills the process there as `kill -9`
+//! would; `name@3` kills it at the third hit. The registry has its own points and its own variable.
 //!
-//! `STRIDE_WORKER_PACE=25` has every training step take 25 ms at the least, so that a test which stops something in the middle
-//! of a stage finds a middle on a fast machine too.
+//! `STRIDE_WORKER_SECRET=text` sets the secret of the process, so that a test can send calls as this worker.
+//!
+//! `STRIDE_WORKER_PACE=25` makes every training step take at least 25 ms, so that a test can stop a stage in its middle
+//! on a fast machine too.
 
-/// Every point, in the order in which an attempt reaches them. An upload is one blob of a gang's stage.
+/// All points, in the order in which an attempt reaches them. An upload is one blob of a gang's stage.
 pub const ALL: [&str; 6] = [
     "checkpoint::before_upload",
     "checkpoint::after_upload",
@@ -20,10 +23,10 @@ pub const ALL: [&str; 6] = [
 #[cfg_attr(not(feature = "failpoints"), allow(dead_code, reason = "its reader is then empty"))]
 const PACE: &str = "exchange::pace";
 
-/// Arms what the two variables name; called once when a worker starts. Does nothing without the feature.
+/// Activates the points that the variables name; called once when a worker starts. Does nothing without the feature.
 ///
 /// # Panics
-/// If a variable names no known point or no number: a test would otherwise pass without having killed anything.
+/// If a variable names no known point or no number. Otherwise a test would pass without killing anything.
 pub fn arm_from_env() {
     #[cfg(feature = "failpoints")]
     {
@@ -43,7 +46,7 @@ pub fn arm_from_env() {
         let kill = move || {
             if seen.fetch_add(1, Ordering::SeqCst) + 1 == nth {
                 let _ = nix::sys::signal::kill(nix::unistd::Pid::this(), nix::sys::signal::Signal::SIGKILL);
-                // The signal is on its way; nothing may happen after it.
+                // Nothing may run until the signal arrives.
                 loop {
                     std::thread::park();
                 }
@@ -53,13 +56,29 @@ pub fn arm_from_env() {
     }
 }
 
-/// Gets to a point.
+/// The secret that a test sets for this process.
+///
+/// # Panics
+/// If it is no valid secret.
+#[cfg(feature = "failpoints")]
+pub(crate) fn secret() -> Option<access::Token> {
+    let text = std::env::var("STRIDE_WORKER_SECRET").ok()?;
+    Some(text.parse().expect("STRIDE_WORKER_SECRET: a secret of plain ASCII"))
+}
+
+/// Returns `None`, so that the process draws its own secret.
+#[cfg(not(feature = "failpoints"))]
+pub(crate) fn secret() -> Option<access::Token> {
+    None
+}
+
+/// Passes a point.
 pub(crate) fn hit(name: &'static str) {
     debug_assert!(ALL.contains(&name));
     fail::fail_point!(name);
 }
 
-/// Gets to the exchange of a training step.
+/// Passes the point of the exchange of a training step.
 pub(crate) fn pace() {
     fail::fail_point!(PACE);
 }

@@ -1,4 +1,4 @@
-//! The life of a worker process.
+//! The life cycle of a worker process.
 
 use std::net::{IpAddr, SocketAddr, ToSocketAddrs, UdpSocket};
 use std::path::PathBuf;
@@ -11,6 +11,7 @@ use burn::tensor::Device;
 use protocol::WorkerId;
 use protocol::message::{Join, PROTOCOL_VERSION};
 use protocol::stage::Backend;
+use stages::external::{DataAccess, open_roots};
 use tokio::runtime;
 use tokio::signal::unix::{SignalKind, signal};
 
@@ -19,59 +20,86 @@ use crate::cache::{Bounds, Cache};
 use crate::client::Client;
 use crate::gang::endpoint::Endpoint;
 use crate::gang::member::Timing;
+use crate::sandbox::Sandbox;
+use crate::stage_limits::StageLimits;
 use crate::stage_thread::{self, Bench, Kinds};
 use crate::{failpoints, kinds, process};
 
-/// How long the coordinator may take to hear that we leave.
+/// Timeout of the call that reports the end of the worker.
 const FAREWELL: Duration = Duration::from_secs(2);
 
-/// How a worker takes part.
+/// Files outside the store that pipelines may name.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Files {
+    /// All files that the process may read.
+    Anywhere,
+    /// Files below these folders.
+    Beneath(Vec<PathBuf>),
+}
+
+impl Files {
+    fn open(&self) -> Result<DataAccess, JoinError> {
+        match self {
+            Self::Anywhere => Ok(DataAccess::anywhere(process::host_name())),
+            Self::Beneath(folders) => {
+                let roots = open_roots(folders).map_err(JoinError::Usage)?;
+                Ok(DataAccess::beneath(roots, process::host_name()))
+            }
+        }
+    }
+}
+
+/// Settings of a worker.
 #[derive(Debug, Clone)]
 pub struct Options {
-    /// The coordinator.
     pub server: Server,
-    /// The worker's name, unique among live workers; host and process id if there is none.
+    /// The worker's name, unique among live workers. `None`: host and process id.
     pub name: Option<WorkerId>,
-    /// Where to compute.
     pub backend: Backend,
-    /// Which device of that backend.
+    /// Number of the device of that backend.
     pub device: usize,
-    /// Keep downloaded blobs in this folder.
+    /// Folder that keeps downloaded blobs.
     pub cache: Option<PathBuf>,
-    /// The folder of the coordinator's store, if it is on this machine.
+    /// Folder of the coordinator's store, if it is on this machine.
     pub store: Option<PathBuf>,
-    /// Where peers reach this worker, `host:port`; the address from which the coordinator is reached if `None`.
+    /// Files outside the store that its stages may read.
+    pub files: Files,
+    /// Close all other files to the process.
+    pub sandbox: bool,
+    /// Address at which peers reach this worker, `host:port`. `None`: the address from which the coordinator is
+    /// reached.
     pub peer_address: Option<String>,
-    /// Be killed when the parent dies, and leave Ctrl-C to it.
+    /// Die with the parent process, and leave Ctrl-C to it.
     pub die_with_parent: bool,
-    /// How long saving and saying goodbye may take once the process was asked to end; then it ends at once.
+    pub limits: StageLimits,
+    /// Time for saving and for the goodbye after a request to end. The process then exits at once.
     pub leave_within: Duration,
 }
 
-/// Why a worker ended other than in good order.
+/// Failure of a worker.
 #[derive(Debug, thiserror::Error)]
 pub enum JoinError {
-    /// The options cannot be followed.
+    /// The options are invalid.
     #[error("{0}")]
     Usage(String),
-    /// The coordinator does not want this worker.
+    /// The coordinator refuses this worker.
     #[error("{0}")]
     Refused(String),
-    /// The machine does not give what a worker needs.
+    /// The system lacks something that a worker needs.
     #[error("{what}: {source}")]
     System {
-        /// What was asked for.
+        /// The operation that failed.
         what: &'static str,
-        /// Why it failed.
+        /// The system's error.
         source: std::io::Error,
     },
-    /// A thread of ours panicked.
+    /// A thread of the worker panicked.
     #[error("a thread of the worker has panicked")]
     Fault,
 }
 
 impl JoinError {
-    /// What the process exits with: 2 for wrong usage, 3 for our fault, 1 otherwise.
+    /// Exit code of the process: 2 for wrong usage, 3 for our fault, 1 otherwise.
     pub fn exit_code(&self) -> u8 {
         match self {
             Self::Usage(_) => 2,
@@ -81,24 +109,38 @@ impl JoinError {
     }
 }
 
-/// Plain lines on standard error, chosen by `RUST_LOG`; standard output stays free. Does nothing if there is a log already.
+/// Logs plain lines to standard error, filtered by `RUST_LOG`; standard output stays free. Does nothing if a logger is
+/// already set.
 pub fn init_logging() {
     let filter = tracing_subscriber::EnvFilter::try_from_default_env()
         .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("info"));
     let log = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).with_ansi(false);
-    // A second subscriber is refused; the first one's lines are as good. A line that nobody reads any more is dropped, without a panic.
+    // A second subscriber is refused, and the first one is as good. A line that cannot be written is dropped without a
+    // panic.
     let _ = log.log_internal_errors(false).try_init();
 }
 
-/// Works for a coordinator until that says to leave or the process is asked to end.
+/// Works for a coordinator until it asks the worker to leave or the process is asked to end.
 ///
-/// To be called from `main` before other threads are started, after [`tune_allocator`](process::tune_allocator).
-/// SIGTERM, and SIGINT unless a parent takes care of it, drains it: what runs saves a checkpoint and is released. If that is not over
-/// after [`Options::leave_within`], be it that no coordinator is there to take the checkpoint, the process ends as it is with exit code 1:
-/// what was acknowledged is stored, and the task goes on from there.
+/// Call this from `main` before other threads start, after [`tune_allocator`](process::tune_allocator).
+/// SIGTERM drains the worker: the running stage saves a checkpoint and is released. SIGINT does the same unless a
+/// parent handles it. If draining takes longer than [`Options::leave_within`], for example because the coordinator is
+/// unreachable, the process exits with code 1. Acknowledged work is stored, and the task continues from there.
 pub fn join(options: Options) -> Result<(), JoinError> {
     if options.die_with_parent {
         process::belong_to_parent();
+    }
+    if options.sandbox {
+        let read = match &options.files {
+            Files::Anywhere => vec![PathBuf::from("/")],
+            Files::Beneath(folders) => folders.clone(),
+        };
+        let read = read.into_iter().chain(options.store.clone()).collect();
+        if let Some(cache) = &options.cache {
+            std::fs::create_dir_all(cache).map_err(|source| JoinError::System { what: "the blob cache", source })?;
+        }
+        let sandbox = Sandbox { read, write: options.cache.iter().cloned().collect() };
+        sandbox.enter().map_err(|error| JoinError::Usage(error.to_string()))?;
     }
     failpoints::arm_from_env();
     stage_thread::log_panics();
@@ -122,6 +164,7 @@ fn work(options: Options, device: Device, kinds: Arc<dyn Kinds>, timing: Timing)
             options.server.url()
         );
     }
+    let data = Arc::new(options.files.open()?);
     let runtime = runtime::Builder::new_multi_thread().worker_threads(1).thread_name("http").enable_all().build();
     let runtime = runtime.map_err(system("the HTTP thread"))?;
     let client = Client::new(options.server.clone(), runtime.handle().clone());
@@ -139,14 +182,14 @@ fn work(options: Options, device: Device, kinds: Arc<dyn Kinds>, timing: Timing)
         let run = move || shared.preparation.run(&client, &cache);
         thread::Builder::new().name("prepare".to_owned()).spawn(run).map_err(system("the thread that fetches ahead"))?
     };
-    let bench = Bench { kinds, client: client.clone(), cache, device };
+    let bench = Bench { kinds, client: client.clone(), cache, data, device, limits: options.limits.clone() };
     let stage = {
         let shared = shared.clone();
         let run = move || {
             process::compute_here();
             stage_thread::run(&shared, &bench);
         };
-        // Graphs of some thousand nodes are dropped recursively.
+        // Graphs of several thousand nodes are dropped recursively.
         thread::Builder::new()
             .name("stage".to_owned())
             .stack_size(64 << 20)
@@ -167,10 +210,9 @@ fn work(options: Options, device: Device, kinds: Arc<dyn Kinds>, timing: Timing)
     preparer.join().map_err(|_| JoinError::Fault)?;
     match end {
         End::Left => {
-            // Spares the coordinator the wait for our lease to run out; if it does not hear it, that is what happens.
-            let path = format!("/v1/workers/{}/gone", offer.worker);
-            let told = runtime.block_on(async { tokio::time::timeout(FAREWELL, client.tell(&path, &())).await });
-            if !matches!(told, Ok(Ok(()))) {
+            // Spares the coordinator the wait for the end of our lease. If this call is lost, the lease simply expires.
+            let left = runtime.block_on(async { tokio::time::timeout(FAREWELL, client.leave(&offer.worker)).await });
+            if !matches!(left, Ok(Ok(()))) {
                 tracing::debug!("the coordinator did not hear that this worker leaves");
             }
             Ok(())
@@ -179,7 +221,7 @@ fn work(options: Options, device: Device, kinds: Arc<dyn Kinds>, timing: Timing)
     }
 }
 
-/// Where to listen for peers, and what to tell them if it is not that.
+/// The address to listen on for peers, and the address to announce if it is another one.
 fn peer_address(options: &Options) -> Result<(SocketAddr, Option<String>), JoinError> {
     if let Some(address) = &options.peer_address {
         let port = address.rsplit_once(':').and_then(|(_, port)| port.parse::<u16>().ok());
@@ -227,7 +269,7 @@ fn watch_signals(shared: Arc<Shared>, owned: bool, leave_within: Duration) -> st
             if !shared.is_leaving() {
                 tracing::info!("draining: what runs is saved and released");
                 shared.leave();
-                // A thread, so that nothing that waits on the runtime or for the coordinator puts it off.
+                // A separate thread, so that nothing that waits on the runtime or for the coordinator delays the exit.
                 thread::spawn(move || {
                     thread::sleep(leave_within);
                     tracing::error!(

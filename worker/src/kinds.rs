@@ -4,7 +4,7 @@ use stages::context::{AttemptContext, GangContext, Outcome, Part, StageError};
 
 use crate::stage_thread::Kinds;
 
-/// The kinds of the crate `stages`.
+/// The stage kinds of the crate `stages`.
 #[derive(Debug)]
 pub(crate) struct Stages;
 

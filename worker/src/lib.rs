@@ -1,11 +1,15 @@
-//! The data plane: a process that takes assignments from a coordinator, runs their stages and uploads what they make.
+//! The data plane: a process that takes assignments from a coordinator, runs their stages and uploads the results.
 //!
-//! Its threads: one computes (`stage_thread`), one drives all HTTP, on which the poll (`assignments`) lives, one fetches ahead what
-//! the next task needs (`prepare`), one a running attempt sends metrics and logs (`telemetry_buffer`), and a few short-stacked ones
-//! serve the connections of a gang (`gang::mesh`). What binds them is `active_assignment::ActiveAssignment`: an assignment, its
-//! newest grant, and whether it has ended.
+//! Threads of a worker:
+//! - one computes (`stage_thread`);
+//! - one drives all HTTP, including the poll (`assignments`);
+//! - one prefetches the inputs of the next task (`prepare`);
+//! - one per running attempt sends metrics and logs (`telemetry_buffer`);
+//! - a few with small stacks serve the connections of a gang (`gang::mesh`).
 //!
-//! Not its job: what a stage computes (`stages`), and every decision about who does what (the coordinator's).
+//! They share `active_assignment::ActiveAssignment`: an assignment, its newest grant, and whether it has ended.
+//!
+//! Not its job: the computation of a stage (`stages`), and the distribution of work (the coordinator).
 
 mod active_assignment;
 mod assignments;
@@ -22,11 +26,15 @@ mod kinds;
 mod mapped;
 mod prepare;
 pub mod process;
+mod receipts;
 mod retry;
+mod sandbox;
+mod stage_limits;
 mod stage_thread;
 mod telemetry_buffer;
 #[cfg(test)]
 mod tests;
 
 pub use cli::JoinArgs;
-pub use join::{JoinError, Options, init_logging, join};
+pub use join::{Files, JoinError, Options, init_logging, join};
+pub use stage_limits::StageLimits;

@@ -13,7 +13,7 @@ enum Command {
 }
 
 fn main() -> ExitCode {
-    // First of all: the allocator can be tuned only while there is one thread.
+    // First, because the allocator can be tuned only while there is one thread.
     worker::process::tune_allocator();
     let Command::Join(args) = Command::parse();
     worker::init_logging();

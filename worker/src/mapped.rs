@@ -1,4 +1,4 @@
-//! Files as bytes: the pages are the machine's, shared by all processes that read the file.
+//! Files as mapped bytes: all processes that read a file share its pages.
 #![allow(unsafe_code, reason = "a mapping is sound only while nobody changes the file, which no type can say")]
 
 use std::fs::File;
@@ -7,16 +7,16 @@ use std::io;
 use bytes::Bytes;
 use memmap2::{Advice, Mmap};
 
-/// The content of a blob's file. Files of blobs are written under another name, given theirs once they are whole, and removed or
-/// replaced later, never changed; pages of a removed file stay as long as they are mapped. Somebody who cuts a file short
-/// by hand ends the processes that read it; they start again and find the blob damaged.
+/// Maps the content of a blob's file. A blob is written under another name and renamed once it is whole. Later it is
+/// removed or replaced but never changed. Pages of a removed file stay as long as they are mapped. If a user truncates
+/// a file by hand, the processes that read it die; after a restart they find the blob damaged.
 pub(crate) fn file(file: &File) -> io::Result<Bytes> {
     if file.metadata()?.len() == 0 {
         return Ok(Bytes::new());
     }
-    // SAFETY: see above.
+    // SAFETY: files of blobs never change, see above.
     let map = unsafe { Mmap::map(file)? };
-    // Examples come in a random order; what is around them is not read with them.
+    // Examples are read in random order, so read-ahead does not help.
     map.advise(Advice::Random)?;
     Ok(Bytes::from_owner(map))
 }

@@ -1,37 +1,44 @@
-//! Fetches ahead what tasks need that this worker may be given, so that a gang that takes it in does not wait for its downloads.
+//! Prefetches the inputs of tasks that this worker may get, so that a gang does not wait for the downloads of a new
+//! member.
 //!
-//! The coordinator says for which tasks ([`Prepare`]); a thread of its own fetches and verifies their inputs into the cache, and the
-//! next poll says which of them are there. A task that is not named any more is forgotten at once, in the middle of a download too.
+//! The coordinator names the tasks ([`Prepare`]). A separate thread fetches their inputs into the cache and verifies
+//! them, and the next poll reports the tasks that are ready. A task that is no longer named is forgotten at once, even
+//! during a download.
+//!
+//! A task is ready only once every member of its gang answers here. So a gang does not stop for a joiner that cannot
+//! reach it.
 
+use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use checkpoint::BlobError;
-use protocol::message::Prepare;
-use protocol::{Digest, Manifest, TaskId};
+use protocol::message::{Member, Prepare};
+use protocol::{Digest, Manifest, TaskId, WorkerId};
 use tokio::sync::{Notify, watch};
 
 use crate::cache::{Arriving, Cache, Cached};
 use crate::client::{CallError, Client};
 use crate::event_count::lock;
+use crate::gang::handshake::{self, HandshakeError};
 
-/// Between two tries to fetch something.
+/// Pause between two tries to fetch a blob.
 const PAUSE: Duration = Duration::from_secs(1);
-/// After so many tries in a row something that is not there is taken for lost.
+/// Consecutive tries after which a missing blob counts as lost.
 const MISSED: u32 = 5;
 
-/// What is to be fetched ahead, and what is there. The poll sets one and reads the other.
+/// Tasks to prefetch, and tasks that are ready. The poll sets the first and reads the second.
 #[derive(Debug)]
 pub(crate) struct Preparation {
     /// `None` once the worker leaves.
     wanted: watch::Sender<Option<Vec<Prepare>>>,
-    /// What is there, with the digests of all of it.
+    /// Tasks that are ready, with the digests of all their inputs.
     ready: Mutex<Vec<(Prepare, Vec<Digest>)>>,
-    /// Wakes the poll, which says what is ready.
+    /// Wakes the poll, which reports the ready tasks.
     wake: Arc<Notify>,
 }
 
-/// Why a task is not prepared.
+/// Reason why a task is not prepared.
 #[derive(Debug, thiserror::Error)]
 enum Stopped {
     #[error("something else is wanted now")]
@@ -46,6 +53,8 @@ enum Stopped {
     Damaged(Digest),
     #[error("{0} is not a manifest: {1}")]
     Manifest(Digest, serde_json::Error),
+    #[error("its member `{0}` does not answer at {1}: {2}")]
+    Peer(WorkerId, String, HandshakeError),
 }
 
 type News = watch::Receiver<Option<Vec<Prepare>>>;
@@ -55,7 +64,7 @@ impl Preparation {
         Self { wanted: watch::Sender::new(Some(Vec::new())), ready: Mutex::default(), wake }
     }
 
-    /// Sets what is to be there; what is not among it is forgotten.
+    /// Sets the tasks to prepare; forgets ready tasks that are not among them.
     pub(crate) fn want(&self, tasks: &[Prepare]) {
         lock(&self.ready).retain(|(ready, _)| tasks.contains(ready));
         self.wanted.send_if_modified(|wanted| match wanted {
@@ -67,70 +76,99 @@ impl Preparation {
         });
     }
 
-    /// Nothing will be wanted any more.
+    /// Ends prefetching for good.
     pub(crate) fn end(&self) {
         lock(&self.ready).clear();
         self.wanted.send_replace(None);
     }
 
-    /// Tasks whose inputs are there.
+    /// Tasks whose inputs are in the cache.
     pub(crate) fn ready(&self) -> Vec<TaskId> {
         lock(&self.ready).iter().map(|(ready, _)| ready.task.clone()).collect()
     }
 
-    /// Fetches what is wanted, until [`end`](Self::end). The body of a thread.
+    /// Fetches the wanted inputs until [`end`](Self::end). The body of a thread.
     pub(crate) fn run(&self, client: &Client, cache: &Cache) {
         let mut news = self.wanted.subscribe();
-        let mut missed = 0;
+        let mut missed: BTreeMap<TaskId, u32> = BTreeMap::new();
         loop {
             let Some(wanted) = news.borrow_and_update().clone() else { return };
-            let missing = wanted.into_iter().find(|task| !lock(&self.ready).iter().any(|(ready, _)| ready == task));
-            let Some(task) = missing else {
-                // The sender is ours, so it is there.
+            missed.retain(|task, _| wanted.iter().any(|wanted| wanted.task == *task));
+            let missing = wanted.into_iter().filter(|task| !lock(&self.ready).iter().any(|(ready, _)| ready == task));
+            let missing: Vec<Prepare> = missing.collect();
+            if missing.is_empty() {
+                // `changed` cannot fail, because we hold the sender.
                 let _ = client.wait(news.changed());
                 continue;
-            };
-            // Trials of a sweep read the same things.
-            let has_all = |ready: &Prepare| (&ready.inputs, ready.resume) == (&task.inputs, task.resume);
-            let known = lock(&self.ready).iter().find(|(ready, _)| has_all(ready)).map(|(_, all)| all.clone());
-            let prepared = match known.map_or_else(|| prepare(&task, client, cache, &mut news), Ok) {
-                // The attempt that reads it reports the damage; fetching ahead has nobody to report to.
-                Err(Stopped::Call(CallError::Damaged(why))) => {
-                    tracing::warn!(task = %task.task, "not all of its inputs can be fetched ahead: {why}");
-                    Ok(Vec::new())
-                }
-                Err(Stopped::Call(CallError::NotFound(why))) if missed >= MISSED => {
-                    tracing::warn!(task = %task.task, "not all of its inputs can be fetched ahead: {why}");
-                    Ok(Vec::new())
-                }
-                prepared => prepared,
-            };
-            missed = if matches!(prepared, Err(Stopped::Call(CallError::NotFound(_)))) { missed + 1 } else { 0 };
-            match prepared {
-                Ok(all) => {
-                    tracing::info!(task = %task.task, "its inputs are here");
-                    // Not if it is not wanted any more: then its blobs are just cached.
-                    if news.borrow().as_ref().is_some_and(|wanted| wanted.contains(&task)) {
-                        let mut ready = lock(&self.ready);
-                        ready.push((task, all));
-                        // What was kept for a task before these has been read.
-                        let wanted: Vec<Digest> = ready.iter().flat_map(|(_, all)| all).copied().collect();
-                        cache.forget_ahead(&wanted);
-                        drop(ready);
-                        self.wake.notify_one();
+            }
+            // A task that cannot be prepared yet does not delay the others.
+            let mut is_later = false;
+            for task in missing {
+                let misses = missed.entry(task.task.clone()).or_default();
+                match self.prepare(&task, misses, client, cache, &mut news) {
+                    Ok(all) => self.is_ready(task, all, cache, &news),
+                    Err(Stopped::News) => break,
+                    Err(error) => {
+                        tracing::debug!(task = %task.task, "it cannot be prepared yet: {error}");
+                        is_later = true;
                     }
                 }
-                Err(Stopped::News) => {}
-                Err(error) => {
-                    tracing::debug!(task = %task.task, "its inputs cannot be fetched ahead yet: {error}");
-                    let _ = client.wait(async { tokio::time::timeout(PAUSE, news.changed()).await });
-                }
             }
+            if is_later {
+                let _ = client.wait(async { tokio::time::timeout(PAUSE, news.changed()).await });
+            }
+        }
+    }
+
+    /// Fetches the inputs of a task and checks that its members answer. Returns the digests of the inputs.
+    fn prepare(
+        &self,
+        task: &Prepare,
+        missed: &mut u32,
+        client: &Client,
+        cache: &Cache,
+        news: &mut News,
+    ) -> Result<Vec<Digest>, Stopped> {
+        // Trials of a sweep read the same inputs.
+        let has_all = |ready: &Prepare| (&ready.inputs, ready.resume) == (&task.inputs, task.resume);
+        let known = lock(&self.ready).iter().find(|(ready, _)| has_all(ready)).map(|(_, all)| all.clone());
+        let prepared = match known.map_or_else(|| prepare(task, client, cache, news), Ok) {
+            // The attempt that reads the blob reports the damage; prefetching cannot.
+            Err(Stopped::Call(CallError::Damaged(why))) => {
+                tracing::warn!(task = %task.task, "not all of its inputs can be fetched ahead: {why}");
+                Ok(Vec::new())
+            }
+            Err(Stopped::Call(CallError::NotFound(why))) if *missed >= MISSED => {
+                tracing::warn!(task = %task.task, "not all of its inputs can be fetched ahead: {why}");
+                Ok(Vec::new())
+            }
+            prepared => prepared,
+        };
+        *missed = if matches!(prepared, Err(Stopped::Call(CallError::NotFound(_)))) { *missed + 1 } else { 0 };
+        let all = prepared?;
+        for Member { worker, peer_address, .. } in &task.peers {
+            let answers = handshake::probe(peer_address);
+            answers.map_err(|error| Stopped::Peer(worker.clone(), peer_address.clone(), error))?;
+        }
+        Ok(all)
+    }
+
+    fn is_ready(&self, task: Prepare, all: Vec<Digest>, cache: &Cache, news: &News) {
+        tracing::info!(task = %task.task, "its inputs are here");
+        // If the task is no longer wanted, its blobs are merely cached.
+        if news.borrow().as_ref().is_some_and(|wanted| wanted.contains(&task)) {
+            let mut ready = lock(&self.ready);
+            ready.push((task, all));
+            // Blobs kept for earlier tasks have been read by now.
+            let wanted: Vec<Digest> = ready.iter().flat_map(|(_, all)| all).copied().collect();
+            cache.forget_ahead(&wanted);
+            drop(ready);
+            self.wake.notify_one();
         }
     }
 }
 
-/// Fetches the manifests that `task` names, and the files they list; gives all their digests.
+/// Fetches the manifests that `task` names and the files that they list. Returns all their digests.
 fn prepare(task: &Prepare, client: &Client, cache: &Cache, news: &mut News) -> Result<Vec<Digest>, Stopped> {
     let mut all = Vec::new();
     for digest in task.inputs.values().copied().chain(task.resume) {
@@ -146,7 +184,8 @@ fn prepare(task: &Prepare, client: &Client, cache: &Cache, news: &mut News) -> R
     Ok(all)
 }
 
-/// A blob from the cache, or fetched into it. A transfer that is cut goes on as long as each try brings something.
+/// Returns a blob from the cache, after fetching it if necessary. Continues an interrupted transfer as long as each try
+/// brings more bytes.
 fn fetch(digest: Digest, client: &Client, cache: &Cache, news: &mut News) -> Result<Cached, Stopped> {
     if let Some(blob) = cache.get(digest) {
         return Ok(blob);
@@ -182,7 +221,7 @@ fn go_on(
     Ok(())
 }
 
-/// Waits for a call. News ends it: dropping a download ends that.
+/// Waits for a call, unless the wanted tasks change. Dropping a download ends it.
 fn unless_news<T>(
     client: &Client,
     news: &mut News,

@@ -1,8 +1,8 @@
-//! What is set once for the whole process, before it has threads: allocator, group, what happens when the parent dies.
+//! Settings of the whole process, made before it has threads: allocator, process group, and death with the parent.
 
-/// Keeps freed memory instead of handing it back to the kernel after every tensor: each operation allocates buffers of
-/// megabytes, and glibc would map, zero and unmap them every time (a fifth of a training step). One arena, so that what a
-/// thread frees another finds. Must be called before any thread is started; does nothing without glibc.
+/// Keeps freed memory instead of returning it to the kernel after every tensor. Each operation allocates buffers of
+/// megabytes, and glibc would map, zero and unmap them every time (a fifth of a training step). With one arena, a
+/// thread can reuse memory that another one has freed. Call it before any thread starts; it does nothing without glibc.
 pub fn tune_allocator() {
     #[cfg(all(target_os = "linux", target_env = "gnu"))]
     {
@@ -22,8 +22,8 @@ pub fn tune_allocator() {
     }
 }
 
-/// Hands freed memory back after all, between two tasks: the one that packed a dataset has held gigabytes, and the next may
-/// need none of them while other workers of the machine do.
+/// Returns freed memory to the kernel between two tasks. A task that packed a dataset has held gigabytes, and the next
+/// one may need none of them while other workers of the machine do.
 pub(crate) fn give_memory_back() {
     #[cfg(all(target_os = "linux", target_env = "gnu"))]
     {
@@ -33,8 +33,8 @@ pub(crate) fn give_memory_back() {
     }
 }
 
-/// Binds this process to the one that started it: it is killed when that dies, and is not reached by a Ctrl-C in the
-/// terminal, which the parent turns into an orderly end.
+/// Binds this process to its parent. It is killed when the parent dies. A Ctrl-C in the terminal does not reach it; the
+/// parent turns that into an orderly end.
 pub(crate) fn belong_to_parent() {
     #[cfg(target_os = "linux")]
     {
@@ -45,7 +45,7 @@ pub(crate) fn belong_to_parent() {
             tracing::warn!("cannot ask to be killed with the parent: {error}");
         }
         if nix::unistd::getppid() != parent {
-            // It died in between.
+            // The parent died in between.
             std::process::exit(1);
         }
     }
@@ -55,23 +55,43 @@ pub(crate) fn belong_to_parent() {
     }
 }
 
-/// The most memory that this process has had resident, in bytes, where the system says so.
+/// Resident memory of this process in bytes, without mapped files. `None` if the system does not report it.
+pub(crate) fn memory() -> Option<u64> {
+    let status = std::fs::read_to_string("/proc/self/status").ok()?;
+    let resident = status.lines().find_map(|line| line.strip_prefix("RssAnon:"))?;
+    Some(resident.trim().strip_suffix(" kB")?.parse::<u64>().ok()? << 10)
+}
+
+/// Memory of this machine or of this process's container in bytes. `None` if the system does not report it.
+pub(crate) fn machine_memory() -> Option<u64> {
+    let machine = std::fs::read_to_string("/proc/meminfo").ok()?;
+    let machine = machine.lines().find_map(|line| line.strip_prefix("MemTotal:"))?;
+    let machine = machine.trim().strip_suffix(" kB")?.parse::<u64>().ok()? << 10;
+    let container = std::fs::read_to_string("/sys/fs/cgroup/memory.max").ok().and_then(|text| text.trim().parse().ok());
+    Some(container.map_or(machine, |container: u64| container.min(machine)))
+}
+
+/// Peak resident memory of this process in bytes. `None` if the system does not report it.
 pub(crate) fn peak_memory() -> Option<u64> {
     let status = std::fs::read_to_string("/proc/self/status").ok()?;
     let peak = status.lines().find_map(|line| line.strip_prefix("VmHWM:"))?;
     Some(peak.trim().strip_suffix(" kB")?.parse::<u64>().ok()? << 10)
 }
 
-/// A name for a worker that was given none: host and process.
+/// The name of this machine; empty if the system does not report it.
+pub(crate) fn host_name() -> String {
+    std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default().trim().to_owned()
+}
+
+/// Default name of a worker: host and process id.
 pub(crate) fn default_name() -> String {
-    let host = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
-    let host: String = host.trim().chars().filter(|c| c.is_ascii_alphanumeric() || *c == '-').take(40).collect();
+    let host: String = host_name().chars().filter(|c| c.is_ascii_alphanumeric() || *c == '-').take(40).collect();
     let host = if host.starts_with(|c: char| c.is_ascii_alphanumeric()) { host } else { "worker".to_owned() };
     format!("{host}-{}", std::process::id())
 }
 
-/// Makes the calling thread the one that computes. Tensor kernels split their work over rayon's pool; with one thread, and
-/// that the caller, everything runs in place. `RAYON_NUM_THREADS` asks for more.
+/// Makes the calling thread the one that computes. Tensor kernels split their work over rayon's pool. If the pool has
+/// only the calling thread, everything runs in place. `RAYON_NUM_THREADS` sets a larger pool.
 pub fn compute_here() {
     let threads = std::env::var("RAYON_NUM_THREADS").ok().and_then(|n| n.parse::<usize>().ok()).filter(|n| *n > 0);
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads.unwrap_or(1)).use_current_thread().build_global();

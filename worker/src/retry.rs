@@ -1,32 +1,55 @@
-//! Trying again, for as long as the grant holds: a coordinator that restarts, or whose disk is full, is waited for, however long it takes.
+//! Retries calls for as long as the grant holds. A coordinator that restarts or whose disk is full is waited for
+//! without a limit.
 
 use std::time::{Duration, Instant};
 
-use protocol::message::Grant;
-
 use crate::active_assignment::ActiveAssignment;
-use crate::client::CallError;
+use crate::client::{CallError, Credential};
 
-/// Why a call in the name of a grant was given up.
+/// Reason why a call under a grant was given up.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum GaveUp {
     /// The grant has ended.
     Ended(String),
-    /// The call's answer is final.
+    /// The answer is final.
     Answer(CallError),
 }
 
-/// Answers of "my fault" that are taken before they are believed.
+/// Consecutive answers "internal error" after which the error is final.
 const FAULTS: u32 = 8;
 
 /// Longest pause between two tries.
 const LONGEST: Duration = Duration::from_secs(1);
 
-/// Calls until it succeeds, is refused for good, or the grant has ended. `call` is given the newest grant each time.
+/// Time to try a call that may also be made later.
+const PATIENCE: Duration = Duration::from_secs(2);
+
+/// Calls until success, a final refusal or the end of the grant. `call` gets the newest grant each time.
 pub(crate) fn until_ended<T>(
     held: &ActiveAssignment,
     what: &str,
-    mut call: impl FnMut(&Grant) -> Result<T, CallError>,
+    call: impl FnMut(&Credential) -> Result<T, CallError>,
+) -> Result<T, GaveUp> {
+    until(held, what, |_| false, call)
+}
+
+/// Like [`until_ended`], for a part of a checkpoint. If the checkpoint may be saved later, a part that cannot be stored
+/// now is put off.
+pub(crate) fn until_put_off<T>(
+    held: &ActiveAssignment,
+    what: &str,
+    call: impl FnMut(&Credential) -> Result<T, CallError>,
+) -> Result<T, GaveUp> {
+    let done = until(held, what, |tried| tried >= PATIENCE && held.may_put_off(), call);
+    held.was_put_off(matches!(&done, Err(GaveUp::Answer(error)) if error.may_pass()));
+    done
+}
+
+fn until<T>(
+    held: &ActiveAssignment,
+    what: &str,
+    is_put_off: impl Fn(Duration) -> bool,
+    mut call: impl FnMut(&Credential) -> Result<T, CallError>,
 ) -> Result<T, GaveUp> {
     let begun = Instant::now();
     let mut warned = begun;
@@ -36,8 +59,8 @@ pub(crate) fn until_ended<T>(
         if let Some(reason) = held.ended() {
             return Err(GaveUp::Ended(reason));
         }
-        let grant = held.grant();
-        match call(&grant) {
+        let credential = held.credential();
+        match call(&credential) {
             Ok(done) => {
                 if warned != begun {
                     tracing::info!("{what}: done after {:.0} s", begun.elapsed().as_secs_f64());
@@ -45,12 +68,13 @@ pub(crate) fn until_ended<T>(
                 return Ok(done);
             }
             Err(CallError::Stale(message)) => {
-                tracing::debug!(task = %grant.task, "{what}: {message}");
-                held.after_stale(&grant).map_err(GaveUp::Ended)?;
+                tracing::debug!(task = %credential.grant.task, "{what}: {message}");
+                held.after_stale(&credential).map_err(GaveUp::Ended)?;
             }
             Err(CallError::Fault(message)) if faults == FAULTS => {
                 return Err(GaveUp::Answer(CallError::Fault(message)));
             }
+            Err(error) if error.may_pass() && is_put_off(begun.elapsed()) => return Err(GaveUp::Answer(error)),
             Err(error) if error.may_pass() => {
                 faults += u32::from(matches!(error, CallError::Fault(_)));
                 if warned == begun || warned.elapsed() > Duration::from_secs(10) {

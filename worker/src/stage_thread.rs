@@ -1,15 +1,20 @@
-//! The thread that computes: one assignment after the other, and how each ended.
+//! The thread that computes: runs one assignment after the other and reports how each ended.
 
 use std::any::Any;
 use std::backtrace::{Backtrace, BacktraceStatus};
 use std::cell::RefCell;
+use std::collections::BTreeMap;
 use std::panic::{self, AssertUnwindSafe};
 use std::sync::Arc;
 use std::time::Duration;
 
 use burn::tensor::Device;
+use protocol::Digest;
 use protocol::message::{FailureClass, ReportOutcome, Role, TaskOutcome};
+use protocol::proof::Vouched;
 use stages::context::{AttemptContext, ContextError, GangContext, Outcome, Part, StageError};
+use stages::external;
+use stages::external::DataAccess;
 
 use crate::active_assignment::ActiveAssignment;
 use crate::assignments::Shared;
@@ -19,23 +24,26 @@ use crate::context::HttpContext;
 use crate::failpoints;
 use crate::process;
 use crate::retry::{self, GaveUp};
+use crate::stage_limits::{self, StageLimits};
 
-/// The stage kinds, as far as a worker knows them. Tests bring their own.
+/// Interface of the stage kinds to a worker. Tests implement their own.
 pub(crate) trait Kinds: Send + Sync {
     fn alone(&self, context: &mut dyn AttemptContext) -> Result<Outcome, StageError>;
     fn part(&self, context: &mut dyn AttemptContext, part: Part) -> Result<Outcome, StageError>;
     fn gang(&self, context: &mut dyn GangContext) -> Result<Outcome, StageError>;
 }
 
-/// What the thread needs besides assignments.
+/// Resources of the stage thread.
 pub(crate) struct Bench {
     pub(crate) kinds: Arc<dyn Kinds>,
     pub(crate) client: Client,
     pub(crate) cache: Arc<Cache>,
+    pub(crate) data: Arc<DataAccess>,
     pub(crate) device: Device,
+    pub(crate) limits: StageLimits,
 }
 
-/// Runs assignments until the poll says that it is over.
+/// Runs assignments until the poll ends.
 pub(crate) fn run(shared: &Shared, bench: &Bench) {
     loop {
         let ticket = shared.work.ticket();
@@ -56,52 +64,79 @@ fn attempt(held: &Arc<ActiveAssignment>, bench: &Bench) {
     let assignment = held.assignment();
     let grant = &assignment.grant;
     tracing::info!(task = %grant.task, attempt = %grant.attempt, fence = %grant.fence, kind = assignment.stage.settings.kind(), "begin");
-    let mut context = HttpContext::new(held.clone(), bench.client.clone(), bench.cache.clone(), bench.device.clone());
+    let mut context = HttpContext::new(
+        held.clone(),
+        bench.client.clone(),
+        bench.cache.clone(),
+        bench.data.clone(),
+        bench.device.clone(),
+    );
+    let part = |part, context: &mut HttpContext| bench.kinds.part(context, part).map(Done::Stage);
     let stage = AssertUnwindSafe(|| match assignment.role {
-        Role::Alone => bench.kinds.alone(&mut context),
-        Role::Shard { index, of } => {
-            bench.kinds.part(&mut context, Part::Shard { index: index as usize, of: of as usize })
-        }
-        Role::Merge { shards } => bench.kinds.part(&mut context, Part::Merge { shards }),
-        Role::Member { .. } => bench.kinds.gang(&mut context),
+        Role::Alone => bench.kinds.alone(&mut context).map(Done::Stage),
+        Role::Shard { index, of } => part(Part::Shard { index: index as usize, of: of as usize }, &mut context),
+        Role::Merge { shards } => part(Part::Merge { shards }, &mut context),
+        Role::Member { .. } => bench.kinds.gang(&mut context).map(Done::Stage),
+        Role::Resolve => external::digests(&context).map(Done::Resolved),
     });
-    let result = panic::catch_unwind(stage).unwrap_or_else(|payload| Err(StageError::Fault(panic_message(&*payload))));
+    let caught = stage_limits::within(&bench.limits, held, &bench.client, || panic::catch_unwind(stage));
+    let result = caught.unwrap_or_else(|payload| Err(StageError::Fault(panic_message(&*payload))));
     let Some(outcome) = outcome(result, held, &context) else { return };
 
     failpoints::hit("outcome::before_report");
-    let reported = report(held, bench, &outcome);
+    let receipts = match &outcome {
+        TaskOutcome::Finished { output, .. } => context.receipts(*output),
+        TaskOutcome::Resolved { .. } | TaskOutcome::Yielded { .. } | TaskOutcome::Failed { .. } => BTreeMap::new(),
+    };
+    let reported = report(held, bench, &outcome, &receipts);
     failpoints::hit("outcome::after_report");
     match reported {
         Ok(()) => tracing::info!(task = %grant.task, attempt = %grant.attempt, "end: {}", summary(&outcome)),
         Err(GaveUp::Ended(reason)) => tracing::info!(task = %grant.task, "the outcome came too late: {reason}"),
         Err(GaveUp::Answer(error)) => {
             tracing::error!(task = %grant.task, "the outcome was refused: {error}");
-            // Said by nobody, the end would be waited for as long as this worker lives.
-            let class = if matches!(error, CallError::Storage(_)) {
-                FailureClass::Storage
-            } else {
-                FailureClass::Infrastructure
+            // Without this report, the coordinator would wait for the end as long as this worker lives.
+            let class = match error {
+                CallError::Storage(_) => FailureClass::Storage,
+                CallError::Refused(_) => FailureClass::Refused,
+                _ => FailureClass::Infrastructure,
             };
             let message = format!("what it made was refused: {error}");
-            if let Err(GaveUp::Answer(error)) = report(held, bench, &TaskOutcome::Failed { class, message }) {
+            if let Err(GaveUp::Answer(error)) =
+                report(held, bench, &TaskOutcome::Failed { class, message }, &BTreeMap::new())
+            {
                 tracing::error!(task = %grant.task, "so was the failure: {error}");
             }
         }
     }
 }
 
-fn report(held: &ActiveAssignment, bench: &Bench, outcome: &TaskOutcome) -> Result<(), GaveUp> {
-    retry::until_ended(held, "reporting the outcome", |grant| {
-        let report = ReportOutcome { grant: grant.clone(), outcome: outcome.clone() };
-        bench.client.wait(bench.client.tell("/v1/outcomes", &report))
+fn report(
+    held: &ActiveAssignment,
+    bench: &Bench,
+    outcome: &TaskOutcome,
+    receipts: &BTreeMap<Digest, String>,
+) -> Result<(), GaveUp> {
+    retry::until_ended(held, "reporting the outcome", |credential| {
+        let report = ReportOutcome { grant: credential.grant.clone(), outcome: outcome.clone() };
+        let vouched = Vouched { what: report, receipts: receipts.clone() };
+        bench.client.wait(bench.client.tell("/v1/outcomes", credential, &vouched))
     })
 }
 
-/// What to report; nothing if the grant has ended, or if it is for rank 0 to say.
-fn outcome(result: Result<Outcome, StageError>, held: &ActiveAssignment, context: &HttpContext) -> Option<TaskOutcome> {
+/// Result of an assignment.
+enum Done {
+    /// Outcome of a stage.
+    Stage(Outcome),
+    /// Digests of the data outside the store that a stage's settings name.
+    Resolved(BTreeMap<String, Digest>),
+}
+
+/// The outcome to report. `None` if the grant has ended, or if rank 0 reports it.
+fn outcome(result: Result<Done, StageError>, held: &ActiveAssignment, context: &HttpContext) -> Option<TaskOutcome> {
     let task = held.grant().task;
     let result = match result {
-        // What was recorded belongs to the outcome; without it the outcome is not reported.
+        // Recorded values belong to the outcome; without them the outcome is not reported.
         Ok(outcome) => context.flush().map(|()| outcome).map_err(StageError::from),
         Err(error) => Err(error),
     };
@@ -114,11 +149,12 @@ fn outcome(result: Result<Outcome, StageError>, held: &ActiveAssignment, context
             tracing::info!(%task, "end; rank 0 reports");
             None
         }
-        Ok(Outcome::Finished { output, metrics }) => {
+        Ok(Done::Resolved(digests)) => Some(TaskOutcome::Resolved { digests }),
+        Ok(Done::Stage(Outcome::Finished { output, metrics })) => {
             let metrics = metrics.into_iter().filter(|(_, value)| value.is_finite()).collect();
             Some(TaskOutcome::Finished { output, metrics })
         }
-        Ok(Outcome::Yielded { at }) => Some(TaskOutcome::Yielded { at }),
+        Ok(Done::Stage(Outcome::Yielded { at })) => Some(TaskOutcome::Yielded { at }),
         Err(StageError::Context(ContextError::GrantEnded(reason))) => {
             tracing::info!(%task, "dropped: {reason}");
             None
@@ -126,7 +162,8 @@ fn outcome(result: Result<Outcome, StageError>, held: &ActiveAssignment, context
         Err(error) => {
             let message = error.to_string();
             tracing::error!(%task, "{message}");
-            // So that the lines before the failure are there to be read. If they cannot be stored, the failure still is.
+            // Store the lines before the failure first, so that they can be read. If that fails, the failure is still
+            // reported.
             if let Err(error) = context.flush() {
                 tracing::warn!(%task, "the last lines of a failed attempt are lost: {error}");
             }
@@ -139,7 +176,7 @@ fn outcome(result: Result<Outcome, StageError>, held: &ActiveAssignment, context
     }
 }
 
-/// Device back ends panic when an allocation fails; there is no type to match.
+/// Recognises a failed allocation. Device backends panic with a text, without a type to match.
 fn is_out_of_memory(message: &str) -> bool {
     let message = message.to_ascii_lowercase();
     message.contains("out of memory") || message.contains("outofmemory")
@@ -148,6 +185,7 @@ fn is_out_of_memory(message: &str) -> bool {
 fn summary(outcome: &TaskOutcome) -> String {
     match outcome {
         TaskOutcome::Finished { output, .. } => format!("finished, {}", output.short()),
+        TaskOutcome::Resolved { digests } => format!("{} digests", digests.len()),
         TaskOutcome::Yielded { at } => format!("yielded at {at}"),
         TaskOutcome::Failed { class, .. } => format!("failed, {class:?}"),
     }
@@ -157,7 +195,7 @@ thread_local! {
     static WHERE: RefCell<Option<String>> = const { RefCell::new(None) };
 }
 
-/// Has panics logged with their place, and remembers it for the report.
+/// Installs a hook that logs panics with their place and remembers the place for the report.
 pub(crate) fn log_panics() {
     panic::set_hook(Box::new(|info| {
         let place = info.location().map_or_else(|| "an unknown place".to_owned(), ToString::to_string);

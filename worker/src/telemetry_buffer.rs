@@ -1,12 +1,15 @@
-//! Metrics and log lines on their way to the coordinator.
+//! Buffer of metrics and log lines on their way to the coordinator.
 //!
-//! The stage puts them here and goes on; a thread sends them in batches, again and again until they are acknowledged. A row
-//! is named by (task, attempt, key, step) and a line by (worker, number), so a batch that arrives twice is stored once.
+//! The stage adds to it without waiting. A thread sends batches and repeats each until it is acknowledged. A row is
+//! identified by (task, attempt, key, step) and a line by (worker, number), so a batch that arrives twice is stored
+//! once.
 //!
-//! In a gang every member keeps the rows and only rank 0 sends them. Rank 0 tells the others with every exchange up to which
-//! step all is stored; they forget that. So when rank 0 dies, the next one has what had not arrived: no hole, and no
-//! double, since both computed the same numbers. Who takes over a peer's state takes over the rows that the peer keeps: those of the
-//! steps that it did not apply itself, which it would lack if it is rank 0 or becomes it.
+//! In a gang every member keeps the rows and only rank 0 sends them. With every exchange, rank 0 announces the step up
+//! to which all rows are stored, and the others forget those rows. So if rank 0 dies, the next rank 0 has the rows that
+//! had not arrived. Rows are neither missing nor doubled, because all members compute the same numbers.
+//!
+//! A member that takes over a peer's state also takes over the peer's rows of the steps that it did not apply itself.
+//! It would lack them if it is rank 0 or becomes it.
 
 use std::collections::VecDeque;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -21,27 +24,30 @@ use crate::client::{CallError, Client};
 use crate::event_count::lock;
 use crate::retry::{self, GaveUp};
 
-/// Rows kept while the coordinator is away. About a day at ten values a second; beyond it the oldest are dropped.
+/// Rows kept while the coordinator is unreachable: about a day at ten values a second. The oldest rows beyond it are
+/// dropped.
 const MAX_ROWS: usize = 1 << 20;
 /// Lines kept, and bytes in them.
 const MAX_LINES: usize = 1 << 17;
-/// A longer line is cut.
+/// Longest line in bytes; the rest is cut.
 const MAX_LINE: usize = 64 << 10;
 /// Rows in one batch.
 const BATCH_ROWS: usize = 2000;
+/// Lines in one batch.
+const BATCH_LINES: usize = 5000;
 /// Bytes of lines in one batch.
 const BATCH_BYTES: usize = 512 << 10;
-/// How often what has gathered is sent.
+/// Interval between two batches.
 const PERIOD: Duration = Duration::from_millis(500);
 
-/// Lines of a process are numbered through, whatever attempt they belong to, in a range of the process's own: one attempt
-/// may see several processes of one worker, and one process several stints at one attempt.
+/// Numbers of lines continue through all attempts of a process and start in a range of the process's own. One attempt
+/// may see several processes of one worker, and one process may work on an attempt several times.
 static LINES: AtomicU64 = AtomicU64::new(0);
 
 #[derive(Debug, Default)]
 struct State {
     rows: VecDeque<MetricRow>,
-    /// First unsent line's number, and the lines.
+    /// Unsent lines with their numbers.
     lines: VecDeque<(u64, String)>,
     newest_step: u64,
     dropped: u64,
@@ -49,7 +55,7 @@ struct State {
 }
 
 impl State {
-    /// Takes over those of a peer's rows, oldest first, that are of steps after `applied`; all, if none was applied here.
+    /// Takes over a peer's rows, oldest first, of the steps after `applied`; all rows if no step was applied here.
     fn take_over(&mut self, rows: Vec<MetricRow>, applied: Option<u64>) {
         let missed = rows.into_iter().filter(|row| applied.is_none_or(|applied| row.step > applied));
         for row in missed {
@@ -59,7 +65,7 @@ impl State {
     }
 }
 
-/// What is on its way for one assignment.
+/// Unsent rows and lines of one assignment.
 #[derive(Debug)]
 pub(crate) struct TelemetryBuffer {
     state: Mutex<State>,
@@ -70,7 +76,7 @@ pub(crate) struct TelemetryBuffer {
 }
 
 impl TelemetryBuffer {
-    /// Starts the thread that sends.
+    /// Creates the buffer and starts the thread that sends.
     pub(crate) fn open(held: Arc<ActiveAssignment>, client: Client) -> (Arc<Self>, Sender) {
         let telemetry = Arc::new(Self {
             state: Mutex::default(),
@@ -85,15 +91,15 @@ impl TelemetryBuffer {
         (telemetry.clone(), Sender { telemetry, thread: Some(thread) })
     }
 
-    /// Takes values of a step. What is not a number cannot be kept as one and is left out.
+    /// Records values of a step. Values that are not finite are recorded as NaN.
     pub(crate) fn record(&self, step: u64, metrics: &[(&str, f64)]) {
         let mut state = lock(&self.state);
         for &(key, value) in metrics {
-            if value.is_finite() {
-                state.rows.push_back(MetricRow { step, key: key.to_owned(), value });
-            } else {
-                tracing::warn!("`{key}` of step {step} is {value} and is not recorded");
+            if !value.is_finite() {
+                tracing::warn!("`{key}` of step {step} is {value} and is recorded as NaN");
             }
+            let value = if value.is_finite() { value } else { f64::NAN };
+            state.rows.push_back(MetricRow { step, key: key.to_owned(), value });
         }
         state.newest_step = state.newest_step.max(step);
         while state.rows.len() > MAX_ROWS {
@@ -108,23 +114,23 @@ impl TelemetryBuffer {
         }
     }
 
-    /// All rows that are kept here, for a peer that takes over this member's state; see [`Self::take_over`].
+    /// Serialises all kept rows, for a peer that takes over this member's state; see [`Self::take_over`].
     pub(crate) fn kept(&self) -> Vec<u8> {
         let rows: Vec<MetricRow> = lock(&self.state).rows.iter().cloned().collect();
         serde_json::to_vec(&rows).expect("rows serialise")
     }
 
-    /// Takes over what a peer keeps of the steps after `applied`, which are in the state that came with it.
+    /// Takes over a peer's rows of the steps after `applied`, which are part of the state that came with them.
     ///
     /// # Errors
-    /// If `kept` is not what [`Self::kept`] gives; nothing is changed then.
+    /// If `kept` is not a result of [`Self::kept`]; nothing is changed then.
     pub(crate) fn take_over(&self, kept: &[u8], applied: Option<u64>) -> Result<(), serde_json::Error> {
         let rows = serde_json::from_slice(kept)?;
         lock(&self.state).take_over(rows, applied);
         Ok(())
     }
 
-    /// Takes a log line.
+    /// Adds a log line.
     pub(crate) fn log(&self, line: &str) {
         let mut end = line.len().min(MAX_LINE);
         while !line.is_char_boundary(end) {
@@ -144,20 +150,20 @@ impl TelemetryBuffer {
         }
     }
 
-    /// The last step of which everything recorded is stored, as far as is certain.
+    /// The last step up to which all recorded rows are known to be stored.
     pub(crate) fn durable(&self) -> u64 {
         let state = lock(&self.state);
         state.rows.iter().map(|row| row.step).min().unwrap_or(state.newest_step).saturating_sub(1)
     }
 
-    /// Everything up to `step` is stored by rank 0.
+    /// Forgets the rows up to `step`, which rank 0 has stored.
     pub(crate) fn forget(&self, step: u64) {
         if !self.held.leads() {
             lock(&self.state).rows.retain(|row| row.step > step);
         }
     }
 
-    /// Waits until all that was put here before is stored.
+    /// Waits until everything recorded so far is stored.
     pub(crate) fn flush(&self) -> Result<(), GaveUp> {
         loop {
             let ticket = self.held.event_count().ticket();
@@ -166,7 +172,7 @@ impl TelemetryBuffer {
                 if let Some(error) = &state.failed {
                     return Err(GaveUp::Answer(error.clone()));
                 }
-                // Others keep rows for the case that rank 0 dies; they are not waited for.
+                // Other members only keep rows in case rank 0 dies, so those are not waited for.
                 if state.lines.is_empty() && (state.rows.is_empty() || !self.held.leads()) {
                     return Ok(());
                 }
@@ -211,7 +217,7 @@ impl TelemetryBuffer {
         }
     }
 
-    /// Sends one batch of each; whether there may be more.
+    /// Sends one batch of rows and one of lines. Returns true if there may be more.
     fn send(&self) -> Result<bool, GaveUp> {
         let (rows, lines) = {
             let state = lock(&self.state);
@@ -226,32 +232,34 @@ impl TelemetryBuffer {
                 .enumerate()
                 .take_while(|&(i, (number, line))| {
                     bytes += line.len();
-                    // Numbers of a batch are without gaps; another attempt's line in between ends it.
-                    (i == 0 || bytes <= BATCH_BYTES) && *number == state.lines[0].0 + i as u64
+                    // The numbers in a batch have no gaps; a line of another attempt in between ends it.
+                    (i == 0 || bytes <= BATCH_BYTES && i < BATCH_LINES) && *number == state.lines[0].0 + i as u64
                 })
                 .map(|(_, line)| line.clone())
                 .collect();
             (rows, lines)
         };
         if !rows.is_empty() {
-            retry::until_ended(&self.held, "sending metrics", |grant| {
-                let batch = MetricBatch { grant: grant.clone(), rows: rows.clone() };
-                self.client.wait(self.client.tell("/v1/metrics", &batch))
-            })?;
+            let sent = retry::until_ended(&self.held, "sending metrics", |credential| {
+                let batch = MetricBatch { grant: credential.grant.clone(), rows: rows.clone() };
+                self.client.wait(self.client.tell("/v1/metrics", credential, &batch))
+            });
+            stored_or_left_out(sent)?;
             let mut state = lock(&self.state);
             for row in &rows {
-                // A drop for lack of room may have been faster.
-                if state.rows.front() == Some(row) {
+                // The row may already be dropped for lack of room.
+                if state.rows.front().is_some_and(|first| is_same(first, row)) {
                     state.rows.pop_front();
                 }
             }
         }
         if let Some((first, _)) = lines.first() {
-            retry::until_ended(&self.held, "sending logs", |grant| {
+            let sent = retry::until_ended(&self.held, "sending logs", |credential| {
                 let lines = lines.iter().map(|(_, line)| line.clone()).collect();
-                let batch = LogBatch { grant: grant.clone(), first: *first, lines };
-                self.client.wait(self.client.tell("/v1/logs", &batch))
-            })?;
+                let batch = LogBatch { grant: credential.grant.clone(), first: *first, lines };
+                self.client.wait(self.client.tell("/v1/logs", credential, &batch))
+            });
+            stored_or_left_out(sent)?;
             let last = first + lines.len() as u64;
             let mut state = lock(&self.state);
             while state.lines.front().is_some_and(|(number, _)| *number < last) {
@@ -266,7 +274,18 @@ impl TelemetryBuffer {
     }
 }
 
-/// Ends the thread when dropped. What is not sent by then is not sent; flush before.
+/// Drops a batch beyond the run's limit; the work continues without it.
+fn stored_or_left_out(sent: Result<(), GaveUp>) -> Result<(), GaveUp> {
+    match sent {
+        Err(GaveUp::Answer(CallError::UsedUp(why))) => {
+            tracing::warn!("left out: {why}");
+            Ok(())
+        }
+        sent => sent,
+    }
+}
+
+/// Ends the thread when dropped. Unsent data is lost; flush before.
 #[derive(Debug)]
 pub(crate) struct Sender {
     telemetry: Arc<TelemetryBuffer>,
@@ -285,6 +304,11 @@ impl Drop for Sender {
     }
 }
 
+/// Compares by bits: NaN differs from itself, and its row would be sent without end.
+fn is_same(one: &MetricRow, other: &MetricRow) -> bool {
+    (one.step, &one.key, one.value.to_bits()) == (other.step, &other.key, other.value.to_bits())
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -298,11 +322,11 @@ mod tests {
         let rows = |steps: std::ops::Range<u64>| -> Vec<MetricRow> {
             steps.map(|step| MetricRow { step, key: "loss".to_owned(), value: 1.0 }).collect()
         };
-        // Rank 0 applied 5, has stored up to 3, and missed the sixth step, which a peer applied.
+        // Rank 0 applied step 5, has stored the rows up to 3, and missed step 6, which a peer applied.
         let mut lead = State { rows: rows(4..6).into(), newest_step: 5, ..State::default() };
         lead.take_over(rows(2..7), Some(5));
         assert_eq!((steps(&lead), lead.newest_step), (vec![4, 5, 6], 6));
-        // A joiner has nothing yet.
+        // A joiner has no rows yet.
         let mut joiner = State::default();
         joiner.take_over(rows(4..7), None);
         assert_eq!((steps(&joiner), joiner.newest_step), (vec![4, 5, 6], 6));

@@ -1,4 +1,4 @@
-//! A worker against a coordinator of a few lines that can be told to misbehave.
+//! A worker against a fake coordinator that can be made to misbehave.
 
 mod blobs;
 mod fake;
@@ -28,11 +28,13 @@ use crate::client::Client;
 use crate::event_count::lock;
 use crate::gang::endpoint::Endpoint;
 use crate::gang::member::Timing;
+use crate::process;
+use crate::stage_limits::StageLimits;
 use crate::stage_thread::{self, Bench, Kinds};
 
 pub(crate) use self::fake::server_at;
 
-/// A stage of a test.
+/// Body of a test's stage.
 type Script = Box<dyn Fn(&mut dyn GangContext) -> Result<Outcome, StageError> + Send + Sync>;
 
 struct Scripted(Script);
@@ -64,6 +66,10 @@ struct Worker {
 
 impl Worker {
     fn start(script: Script) -> Self {
+        Self::start_within(script, StageLimits { memory: None, ..StageLimits::default() })
+    }
+
+    fn start_within(script: Script, limits: StageLimits) -> Self {
         let fake: Arc<Fake> = Arc::default();
         let server = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build();
         let server = server.expect("a runtime");
@@ -82,8 +88,14 @@ impl Worker {
             let (shared, client, cache) = (shared.clone(), client.clone(), cache.clone());
             thread::spawn(move || shared.preparation.run(&client, &cache))
         };
-        let bench =
-            Bench { kinds: Arc::new(Scripted(script)), client: client.clone(), cache, device: Device::default() };
+        let bench = Bench {
+            kinds: Arc::new(Scripted(script)),
+            client: client.clone(),
+            cache,
+            data: Arc::default(),
+            device: Device::default(),
+            limits,
+        };
         let stage = {
             let shared = shared.clone();
             thread::spawn(move || stage_thread::run(&shared, &bench))
@@ -107,7 +119,7 @@ impl Worker {
         Self { fake, shared, member, stage, poll, preparer, _server: server }
     }
 
-    /// Grants the task anew under the next fence.
+    /// Grants the task again under the next fence.
     fn grant(&self, attempt: u64) {
         let member = self.member.clone();
         self.fake.desired(|coordinator| {
@@ -124,7 +136,7 @@ impl Worker {
         }
     }
 
-    /// Lets the worker go and returns all that the coordinator was told.
+    /// Lets the worker leave and returns everything that the coordinator has received.
     fn leave(self) -> FakeState {
         self.fake.desired(|coordinator| coordinator.leave = true);
         assert_eq!(self.poll.join().expect("no panic"), End::Left);
@@ -143,6 +155,7 @@ fn assignment(member: &Member, attempt: u64, fence: u64) -> Assignment {
             worker: WorkerId::from("w0"),
             incarnation: Incarnation(1),
         },
+        secret: format!("the-secret-of-fence-{fence}"),
         stage: StageTask {
             run: RunId::from("run"),
             name: StageName::from("stage"),
@@ -161,12 +174,44 @@ fn assignment(member: &Member, attempt: u64, fence: u64) -> Assignment {
     }
 }
 
+/// A stage that allocates memory until it is stopped. The failure names the amount, and the stage stops because its
+/// grant ends.
+#[test]
+fn a_stage_beyond_its_memory_fails_for_good_and_stops() {
+    let more = 64 << 20;
+    let limits = StageLimits {
+        memory: process::memory().map(|bytes| bytes + more),
+        grace: Duration::from_secs(60),
+        ..StageLimits::default()
+    };
+    let script: Script = Box::new(move |context| {
+        let mut taken = Vec::new();
+        while !context.interrupted() {
+            if taken.len() < 64 {
+                taken.push(vec![1_u8; 16 << 20]);
+            }
+            thread::sleep(Duration::from_millis(5));
+        }
+        Ok(Outcome::Yielded { at: taken.len() as u64 })
+    });
+    let worker = Worker::start_within(script, limits);
+    worker.grant(1);
+    worker.wait("the failure is reported", |coordinator| !coordinator.outcomes.is_empty());
+    worker.fake.desired(|coordinator| coordinator.assignments.clear());
+    let received = worker.leave();
+    let [report] = received.outcomes.as_slice() else { panic!("{:?}", received.outcomes) };
+    let TaskOutcome::Failed { class: FailureClass::OutOfMemory, message } = &report.outcome else {
+        panic!("{report:?}")
+    };
+    assert!(message.contains("expected at most") && message.contains("--stage-memory"), "{message}");
+}
+
 fn finished(context: &mut dyn GangContext) -> Result<Outcome, StageError> {
     let output = context.put_manifest(&Manifest::new(ArtifactKind::Report, serde_json::json!({"done": true})))?;
     Ok(Outcome::Finished { output, metrics: BTreeMap::from([("loss".to_owned(), 0.5)]) })
 }
 
-/// Trains `steps` steps as a gang of the workers that there are; a checkpoint every tenth.
+/// Trains `steps` steps as a gang of the current workers, with a checkpoint every tenth step.
 fn train(context: &mut dyn GangContext, steps: u64, pause: Duration) -> Result<Outcome, StageError> {
     context.rendezvous(None, &[])?;
     let mut step = 0;
@@ -197,7 +242,7 @@ fn train(context: &mut dyn GangContext, steps: u64, pause: Duration) -> Result<O
     finished(context)
 }
 
-/// Sampled: one stage of three saves; every third write is done and its answer lost.
+/// Sampled: one stage of three saves. Every third write is done but its answer is lost.
 #[test]
 fn p9_everything_arrives_once_though_answers_are_lost() {
     let worker = Worker::start(Box::new(|context| train(context, 100, Duration::ZERO)));
@@ -207,13 +252,25 @@ fn p9_everything_arrives_once_though_answers_are_lost() {
     let coordinator = worker.leave();
     let steps: Vec<u64> = coordinator.metrics.keys().filter(|(_, key)| key == "loss").map(|(step, _)| *step).collect();
     assert_eq!(steps, (1..=100).collect::<Vec<_>>());
-    assert_eq!(coordinator.metrics.len(), 100, "what is not a number is left out");
+    assert_eq!(coordinator.metrics.len(), 100);
+    assert_eq!(coordinator.odd.len(), 100, "what is not a number comes as such");
     assert_eq!(
         coordinator.logs.values().cloned().collect::<Vec<_>>(),
         (1..=10).map(|i| format!("saving at {}", i * 10)).collect::<Vec<_>>()
     );
     assert!(matches!(coordinator.outcomes[..], [ReportOutcome { outcome: TaskOutcome::Finished { .. }, .. }]));
     assert_eq!(coordinator.joins, 1);
+}
+
+#[test]
+fn a_name_that_another_process_has_is_waited_for() {
+    let worker = Worker::start(Box::new(finished));
+    worker.wait("the first join", |coordinator| coordinator.joins == 1);
+    worker.fake.name_held.store(3, Ordering::SeqCst);
+    lock(&worker.fake.coordinator).forget = true;
+    worker.wait("the second join", |coordinator| coordinator.joins == 2);
+    assert_eq!(worker.fake.name_held.load(Ordering::SeqCst), 0);
+    worker.leave();
 }
 
 #[test]
@@ -290,7 +347,7 @@ fn a_newer_generation_is_taken_on_by_the_same_attempt() {
     }));
     worker.grant(1);
     worker.wait("some steps", |coordinator| coordinator.metrics.len() > 3);
-    // The fence moves first: writes under the old one are refused until the next orders say why.
+    // The fence moves first: writes under the old one are refused until the next orders explain it.
     worker.grant(1);
     worker.wait("an outcome", |coordinator| !coordinator.outcomes.is_empty());
     let coordinator = worker.leave();
@@ -321,7 +378,7 @@ fn a_write_under_an_old_fence_ends_the_attempt_once_orders_say_so() {
     let worker = Worker::start(Box::new(|context| train(context, u64::MAX, Duration::from_millis(1))));
     worker.grant(1);
     worker.wait("some steps", |coordinator| coordinator.metrics.len() > 3);
-    // Somebody else holds the task now: the store knows, this worker does not yet.
+    // Another worker holds the task now: the store has the newer fence, but this worker has no newer orders yet.
     lock(&worker.fake.coordinator).fence = 9;
     thread::sleep(Duration::from_millis(700));
     let stored = lock(&worker.fake.coordinator).metrics.len();
@@ -389,6 +446,21 @@ fn an_outcome_that_is_refused_is_a_failure_and_not_silence() {
     };
     assert_eq!(*class, FailureClass::Infrastructure);
     assert!(message.contains("not-found"), "{message}");
+}
+
+/// A state that the store does not accept. Each try would train to its first save and fail there.
+#[test]
+fn what_is_refused_for_good_is_not_tried_again() {
+    let worker = Worker::start(Box::new(finished));
+    lock(&worker.fake.coordinator).unfit = true;
+    worker.grant(1);
+    worker.wait("an outcome", |coordinator| !coordinator.outcomes.is_empty());
+    let coordinator = worker.leave();
+    let TaskOutcome::Failed { class, message } = &coordinator.outcomes[0].outcome else {
+        panic!("{:?}", coordinator.outcomes)
+    };
+    assert_eq!(*class, FailureClass::Refused);
+    assert!(message.contains("too-large"), "{message}");
 }
 
 #[test]

@@ -1,7 +1,7 @@
 //! The artifact container over bytes: manifests, aligned tensors, limits.
 //!
-//! An artifact is a [`Manifest`](protocol::Manifest) that lists blobs; tensors are safetensors, everything else is JSON.
-//! Nothing in it is executable on load. Not its job: where blobs live, and whether they may be written.
+//! An artifact is a [`Manifest`](protocol::Manifest) that lists blobs; tensors are safetensors, everything else is
+//! JSON. Loading an artifact executes no code. Other crates decide where blobs are stored and which writes are allowed.
 
 pub mod model;
 pub mod published;
@@ -14,76 +14,82 @@ use std::sync::Arc;
 use bytes::Bytes;
 use protocol::Digest;
 
-/// Why a blob could not be read or written.
+/// Error of reading or writing a blob.
 #[derive(Debug, thiserror::Error)]
 pub enum BlobError {
-    /// No such blob.
+    /// The blob does not exist.
     #[error("blob {0} is not in the store")]
     NotFound(Digest),
-    /// The bytes do not hash to the name.
+    /// The bytes do not hash to the blob's digest.
     #[error("blob {expected} is corrupt: its bytes hash to {found}")]
     Corrupt {
-        /// The name.
+        /// Digest of the blob.
         expected: Digest,
-        /// What the bytes hash to.
+        /// Digest of the bytes.
         found: Digest,
     },
-    /// The store found the bytes damaged and does not hand them out; the message names the blob.
+    /// The store refuses to return bytes that it found damaged; the message names the blob.
     #[error("{0}")]
     Damaged(String),
     /// The grant has ended.
     #[error("write refused: {0}")]
     Refused(String),
-    /// Full or not writable.
+    /// The store refuses such bytes from any caller.
+    #[error("{0}")]
+    Unfit(String),
+    /// The disk is full or not writable.
     #[error("{0}")]
     Storage(String),
-    /// Anything else, after retries.
+    /// The blobs' backend does not answer; the same call may succeed later.
+    #[error("{0}")]
+    Unreachable(String),
+    /// Any other error, after retries.
     #[error("{0}")]
     Unavailable(String),
 }
 
 /// Content-addressed bytes. Reads are verified.
 ///
-/// What may be large goes through [`put_pieces`](Self::put_pieces) and [`open`](Self::open), which hold no second copy of it.
+/// Large blobs should use [`put_pieces`](Self::put_pieces) and [`open`](Self::open), which hold no second copy.
 pub trait Blobs: Send + Sync + fmt::Debug {
-    /// The bytes named `digest`, in memory.
+    /// Returns the bytes named `digest` in memory.
     fn get(&self, digest: Digest) -> Result<Arc<[u8]>, BlobError>;
 
-    /// Stores bytes and returns their name. Storing the same bytes twice stores them once.
+    /// Stores bytes and returns their digest. Equal bytes are stored once.
     fn put(&self, bytes: Vec<u8>) -> Result<Digest, BlobError>;
 
-    /// Stores the bytes that `pieces` are one after the other.
+    /// Stores the concatenation of `pieces`.
     fn put_pieces(&self, pieces: &[&[u8]]) -> Result<Digest, BlobError> {
         self.put(pieces.concat())
     }
 
-    /// The blob named `digest`, verified, to be read where it is needed.
+    /// Verifies and opens the blob named `digest` for reading in parts.
     fn open(&self, digest: Digest) -> Result<Box<dyn Blob>, BlobError> {
         Ok(Box::new(self.get(digest)?))
     }
 
-    /// The blob named `digest`, verified, as bytes that need no memory of this process where a file of the machine has them. For what
-    /// is read again and again, such as a dataset.
+    /// Verifies and maps the blob named `digest`. The bytes need no memory of this process if a local file has them.
+    /// For blobs that are read repeatedly, such as a dataset.
     fn map(&self, digest: Digest) -> Result<Bytes, BlobError> {
         Ok(Bytes::from_owner(self.get(digest)?))
     }
 }
 
-/// Where a blob lies below the folder of a store that keeps its blobs beside its database.
+/// Returns the path of a blob in the folder of a store that keeps its blobs beside its database.
 pub fn blob_path(store: &Path, digest: Digest) -> PathBuf {
     let hex = digest.hex();
     store.join(BLOBS).join(&hex[..2]).join(&hex[2..])
 }
 
-/// The folder of all blobs, below that of their store.
+/// The folder of all blobs, relative to their store's.
 pub const BLOBS: &str = "blobs/sha256";
 
 /// A verified blob.
 pub trait Blob: Send + fmt::Debug {
-    /// Its length.
+    /// Returns the blob's length.
     fn bytes(&self) -> u64;
 
-    /// Fills `out` with what begins at `offset`; a blob that ends before that is an error.
+    /// Fills `out` with the bytes from `offset` on; a blob that is too short is an error.
     fn read_at(&self, offset: u64, out: &mut [u8]) -> Result<(), BlobError>;
 }
 
@@ -105,7 +111,7 @@ impl Blob for Arc<[u8]> {
     }
 }
 
-/// The error of a read that a blob is too short for.
+/// Error of a read past the end of a blob.
 pub fn past_the_end(offset: u64, wanted: usize, bytes: u64) -> BlobError {
     BlobError::Unavailable(format!("a blob of {bytes} bytes has no {wanted} bytes at {offset}"))
 }

@@ -1,13 +1,14 @@
-//! What a model is: a generator, and the parts that it draws with.
+//! Models: a generator and the parts that it uses.
 //!
-//! A part is an artifact by itself, in a role: a denoiser, the VAE whose latents it makes, the text encoder that it was trained with. The
-//! model's manifest lists the files of all its parts, each in a folder of its role, with the part's own manifest beside them:
-//! `denoiser/manifest.json`, `denoiser/model.safetensors`, `vae/manifest.json`. So what keeps, checks, copies or removes artifacts needs
-//! to know nothing of models, and weights that ten students share are stored once.
+//! A part is an artifact in a role: a denoiser, the VAE of its latents, the text encoder that it was trained with. The
+//! model's manifest lists the files of all parts, each in a folder named after its role, with the part's own manifest:
+//! `denoiser/manifest.json`, `denoiser/model.safetensors`, `vae/manifest.json`. Code that keeps, checks, copies or
+//! removes artifacts therefore needs no knowledge of models, and weights that ten students share are stored once.
 //!
-//! Meta: `generator`, which names what draws; `format`, the skeleton of its motions; `parts`, role to the digest of the part's manifest;
-//! `sampler`, how to draw when nobody says, if the model was measured. A part says in its own meta what it was made for, as
-//! `fits: {role: digest}`; parts that do not fit each other make no model. Not its job: opening a part, which its generator does.
+//! Keys of the meta: `generator`, the generator's name; `format`, the skeleton of its motions; `parts`, role to the
+//! digest of the part's manifest; `sampler`, the default settings if the model was measured. A part's own meta names
+//! the parts it was made for as `fits: {role: digest}`; parts that do not fit form no model. The generator opens the
+//! parts, not this module.
 
 use std::collections::BTreeMap;
 
@@ -16,54 +17,54 @@ use protocol::stage::{DataFormat, Sampler};
 use protocol::{ArtifactKind, Digest, Manifest};
 use serde::{Deserialize, Serialize};
 
-/// The file of a part's folder that holds its manifest.
+/// File name of the manifest in a part's folder.
 const MANIFEST: &str = "manifest.json";
 
-/// Parts by role: the digests of their manifests.
+/// Digests of the parts' manifests by role.
 pub type Parts = BTreeMap<Role, Digest>;
 
-/// Why there is no such model.
+/// Reason why an artifact is not a valid model.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum ModelError {
-    /// It is something else.
-    #[error("an artifact of kind {0:?} is no model")]
+    /// The artifact has another kind.
+    #[error("an artifact of kind {0:?} is not a model")]
     NotAModel(ArtifactKind),
-    /// Its manifest does not read.
-    #[error("the manifest of the {what} is not one that this build writes: {why}")]
+    /// The manifest cannot be read.
+    #[error("cannot parse the manifest of the {what}: {why}")]
     Malformed {
-        /// Model, or part.
+        /// The model or part.
         what: String,
-        /// What reading it said.
+        /// Error of the reader.
         why: String,
     },
-    /// It has no such part.
+    /// The model lacks a part.
     #[error("the model has no part `{missing}`; it has {}", have.join(", "))]
     Missing {
-        /// What was looked for.
+        /// The missing part.
         missing: Role,
-        /// What there is.
+        /// Its parts.
         have: Vec<String>,
     },
-    /// It has no part of a kind, or several.
+    /// The model has no part of a kind, or several.
     #[error("the model has {} of kind `{}`; its parts: {}", if *several { "several parts" } else { "no part" }, word(*kind), have.join(", "))]
     OfKind {
-        /// What was looked for.
+        /// The requested kind.
         kind: ArtifactKind,
-        /// Whether there are several.
+        /// True if there are several.
         several: bool,
-        /// What there is.
+        /// Its parts.
         have: Vec<String>,
     },
-    /// A part was made for another one than the model has.
+    /// A part was made for another part than the model's.
     #[error("the part `{role}` was made for the `{needs}` {wanted}, but the model has {found}")]
     Unfit {
         /// The part.
         role: Role,
-        /// What it needs.
+        /// Role of the part that it needs.
         needs: Role,
-        /// Which one.
+        /// Digest of the needed part.
         wanted: String,
-        /// What is in its place.
+        /// Description of the part in the model.
         found: String,
     },
 }
@@ -71,19 +72,19 @@ pub enum ModelError {
 /// The meta of an artifact of kind `model`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Model {
-    /// What draws from it: a name in the table of generators.
+    /// Name of the generator in the table of generators.
     pub generator: String,
     /// The skeleton of its motions.
     pub format: DataFormat,
-    /// What it draws with.
+    /// The parts that the generator uses.
     pub parts: Parts,
-    /// How it is drawn from when nobody says otherwise: as it was measured.
+    /// Default settings for sampling: those of the evaluation.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub sampler: Option<Sampler>,
 }
 
 impl Model {
-    /// What a manifest says of its model.
+    /// Reads a model from its manifest.
     pub fn read(manifest: &Manifest) -> Result<Self, ModelError> {
         if manifest.kind != ArtifactKind::Model {
             return Err(ModelError::NotAModel(manifest.kind));
@@ -91,17 +92,17 @@ impl Model {
         Self::deserialize(&manifest.meta).map_err(|e| malformed("model", &e))
     }
 
-    /// The manifest's digest of a part that the model cannot do without.
+    /// Returns the digest of a required part's manifest.
     pub fn part(&self, role: &Role) -> Result<Digest, ModelError> {
         let have = || self.parts.keys().map(|role| format!("`{role}`")).collect();
         self.parts.get(role).copied().ok_or_else(|| ModelError::Missing { missing: role.clone(), have: have() })
     }
 }
 
-/// The one part of a kind that a model has, with its role and its digest. `read` gives a part's manifest by digest.
+/// Returns the only part of a kind, with its role and digest. `read` returns a part's manifest by digest.
 ///
 /// # Errors
-/// What `read` says; inside, that there is none, or which of several is meant is not known.
+/// The outer error is one of `read`. The inner one means that the model has no such part or several.
 pub fn part_of_kind<E>(
     model: &Model,
     kind: ArtifactKind,
@@ -118,28 +119,28 @@ pub fn part_of_kind<E>(
     Ok(found.filter(|_| !several).ok_or(ModelError::OfKind { kind, several, have }))
 }
 
-/// A kind as it stands in a manifest.
+/// Returns a kind's name in manifests.
 fn word(kind: ArtifactKind) -> String {
     let word = serde_json::to_value(kind).expect("a kind is a word");
     word.as_str().unwrap_or_default().to_owned()
 }
 
-/// What an evaluation says in its report's meta, as `drawn`: which model it measured, and how it drew from it.
+/// Entry `drawn` in the meta of an evaluation's report: the measured model and its sampler.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Drawn {
-    /// The model's manifest.
+    /// Digest of the model's manifest.
     pub model: Digest,
-    /// How it was drawn from.
+    /// Settings of the sampler.
     pub sampler: Sampler,
 }
 
-/// A model of these parts that nobody has measured yet.
+/// Makes a model of these parts that has no default sampler yet.
 pub fn assemble(generator: &str, format: DataFormat, parts: &BTreeMap<Role, Manifest>) -> Result<Manifest, ModelError> {
     let model = Model { generator: generator.to_owned(), format, parts: BTreeMap::new(), sampler: None };
     complete(Manifest::new(ArtifactKind::Model, serde_json::Value::Null), model, parts)
 }
 
-/// `model` with `sampler` as its own and `more` parts. A part takes the place of one in the same role.
+/// Extends `model` by a default `sampler` and by `more` parts. A part replaces one with the same role.
 pub fn extend(
     model: &Manifest,
     sampler: Option<&Sampler>,
@@ -169,7 +170,8 @@ fn complete(mut manifest: Manifest, mut model: Model, more: &BTreeMap<Role, Mani
     Ok(manifest)
 }
 
-/// Puts a part's files and its manifest into the folder `role` of `whole`; the digest of the part's manifest, which must be stored too.
+/// Adds a part's files and manifest to the folder `role` of `whole`. Returns the digest of the part's manifest, which
+/// must be stored too.
 pub fn add_part(whole: &mut Manifest, role: &Role, part: &Manifest) -> Digest {
     let bytes = part.to_bytes();
     let digest = Digest::of(&bytes);
@@ -178,7 +180,7 @@ pub fn add_part(whole: &mut Manifest, role: &Role, part: &Manifest) -> Digest {
     digest
 }
 
-/// The parts that `part` was made for, by role.
+/// Returns the parts that `part` was made for, by role.
 pub fn fits(role: &Role, part: &Manifest) -> Result<Parts, ModelError> {
     let fits = part.meta.get("fits").map(Parts::deserialize).transpose();
     Ok(fits.map_err(|e| malformed(&format!("part `{role}`"), &e))?.unwrap_or_default())
@@ -247,7 +249,7 @@ mod tests {
         assert_eq!(model.sampler.as_ref(), Some(&sampler));
         assert_eq!(model.parts.len(), 5);
         assert!(extended.files.contains_key("control-2/model.safetensors"));
-        // What is replaced leaves no file behind.
+        // A replaced part leaves no file.
         let other = BTreeMap::from([(control, Manifest::new(ArtifactKind::Denoiser, json!({})))]);
         let replaced = extend(&extended, None, &other).unwrap();
         assert!(!replaced.files.contains_key("control-2/model.safetensors"));

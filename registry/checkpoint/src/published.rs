@@ -1,8 +1,8 @@
-//! A model's weights in the files that its authors' code reads: which tensors of which part go where, and under which names.
+//! Export of a model's weights to files for the code of the papers: tensors and names of each file.
 //!
-//! Our parts keep weights under the published names already, one file a part (`model.safetensors`), and what an imported file had besides
-//! (tables of positions, masks) in `constants.safetensors`. A layout says in how many files these go, what stands before the names there, and under
-//! which key of a torch file they lie. Not its job: where a part's bytes come from.
+//! Our parts already use the published names, with one file a part (`model.safetensors`). Other tensors of an imported
+//! file (tables of positions, masks) are in `constants.safetensors`. A layout defines the number of files, the prefix
+//! of the names, and the key in a torch file. The caller provides the bytes of the parts.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::{Seek, Write};
@@ -14,21 +14,21 @@ use safetensors::{SafeTensors, serialize};
 use crate::model::Model;
 use crate::torch;
 
-/// The files of a part that hold tensors.
+/// Files of a part with tensors.
 const FILES: [&str; 2] = ["model.safetensors", "constants.safetensors"];
 
-/// Why there is no such export.
+/// Reason why an export is not possible.
 #[derive(Debug, thiserror::Error)]
 pub enum ExportError {
-    /// The layout has no place for such a model, or the part is not what the layout is for.
+    /// The layout cannot hold such a model, or a part has another network.
     #[error("{0}")]
     Unfit(String),
-    /// A part's file is not what it should be.
+    /// A part's file is damaged.
     #[error("`{file}`: {why}")]
     Damaged {
-        /// The file, as the manifest calls it.
+        /// The file's name in the manifest.
         file: String,
-        /// What reading it said.
+        /// Error of the reader.
         why: String,
     },
     /// The file cannot be written.
@@ -36,68 +36,70 @@ pub enum ExportError {
     Write(#[from] std::io::Error),
 }
 
-/// In whose files weights are written.
+/// File layouts of exported weights.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Layout {
-    /// MLD's and MotionLCM's: one torch file, `{"state_dict": {vae.*, denoiser.*, controlnet.*, traj_encoder.*}}`.
+    /// Layout of MLD and MotionLCM: one torch file,
+    /// `{"state_dict": {vae.*, denoiser.*, controlnet.*, traj_encoder.*}}`.
     MotionLcm,
-    /// MoMask's: `rvq.tar`, `masked.tar` and `residual.tar`, each with its network under the key that the authors' code looks for.
+    /// Layout of MoMask: `rvq.tar`, `masked.tar` and `residual.tar`, each with its network under the key that the
+    /// authors' code reads.
     Momask,
-    /// T2M-GPT's: `vqvae.pth` and `transformer.pth`.
+    /// Layout of T2M-GPT: `vqvae.pth` and `transformer.pth`.
     T2mGpt,
-    /// MDM's: one torch file, the network alone.
+    /// Layout of MDM: one torch file with only the network.
     Mdm,
-    /// One safetensors file of any model: each part's names with its role before them, which for a latent model are MotionLCM's names.
+    /// One safetensors file of any model. The role precedes each part's names, which gives MotionLCM's names for a
+    /// latent model.
     Safetensors,
 }
 
-/// Where the names of a part's network lead.
+/// Renaming of one network of a part.
 #[derive(Debug, Clone, PartialEq, Eq)]
 struct Names {
     /// The part's role.
     role: &'static str,
-    /// What its names begin with in our file.
+    /// Prefix of the names in our file.
     from: &'static str,
-    /// What they begin with instead.
+    /// Prefix in the exported file.
     to: String,
-    /// A name that the network has; of a part without it nothing is written.
+    /// A name that identifies the network; a part without it is skipped.
     marker: &'static str,
-    /// Whether a part without it is refused instead.
+    /// True if a part without it is refused instead.
     needed: bool,
 }
 
 /// One file of a layout.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Planned {
-    /// What it is called where a layout has several.
+    /// File name, used if a layout has several files.
     pub name: &'static str,
-    /// The key of a torch file's dict under which the tensors are; `None` of a bare dict.
+    /// Key of the tensors in a torch file's dict; `None` if they are the dict itself.
     key: Option<&'static str>,
     torch: bool,
-    /// Our files, by the names of the manifest, with where their tensors' names lead.
+    /// Our files, by their names in the manifest, with their renaming.
     files: Vec<(String, Names)>,
 }
 
-/// What is written, and the roles that the layout has no place for.
+/// Planned files, and roles that the layout cannot hold.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Plan {
-    /// Files.
     pub files: Vec<Planned>,
-    /// Parts that hold weights and are in none of them.
+    /// Parts with weights that no file holds.
     pub left_out: Vec<String>,
 }
 
-/// What came of writing a file.
+/// Summary of a written file.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Written {
-    /// Tensors in it.
+    /// Number of tensors.
     pub tensors: usize,
-    /// Networks of parts that the layout has no place for, as `control/feedback`.
+    /// Networks of parts that the layout cannot hold, as `control/feedback`.
     pub left_out: BTreeSet<String>,
 }
 
 impl Layout {
-    /// Its word on the command line.
+    /// Returns the layout's name on the command line.
     pub fn name(self) -> &'static str {
         match self {
             Self::MotionLcm => "motionlcm",
@@ -108,7 +110,8 @@ impl Layout {
         }
     }
 
-    /// Its files: name, key and networks. A file whose networks the model has not is not written, unless one is needed.
+    /// Returns the layout's files: name, key and networks. A file without any of its networks is not written, unless
+    /// one is required.
     fn files(self) -> Vec<(&'static str, Option<&'static str>, Vec<Names>)> {
         let names = |role, from, to: &str, marker, needed| Names { role, from, to: to.to_owned(), marker, needed };
         match self {
@@ -152,10 +155,10 @@ impl Layout {
         }
     }
 
-    /// What is written of a model, or of a part by itself.
+    /// Plans the files of a model, or of a single part.
     ///
     /// # Errors
-    /// If the layout has no place for anything of it.
+    /// Returns an error if the layout can hold no part of it.
     pub fn plan(self, manifest: &Manifest) -> Result<Plan, ExportError> {
         let places = places(manifest)?;
         let mut plan = Plan { files: Vec::new(), left_out: Vec::new() };
@@ -188,16 +191,17 @@ impl Layout {
         if plan.files.iter().all(|file| file.files.is_empty()) {
             let has: Vec<&str> = places.keys().copied().collect();
             return Err(ExportError::Unfit(format!(
-                "the layout `{}` has no place for its parts, {}; `safetensors` takes all",
+                "the layout `{}` cannot hold its parts ({}); `safetensors` holds all",
                 self.name(),
-                if has.is_empty() { "none of which holds weights".to_owned() } else { has.join(", ") }
+                if has.is_empty() { "none has weights".to_owned() } else { has.join(", ") }
             )));
         }
         Ok(plan)
     }
 }
 
-/// The roles that hold weights of a model's own, and their files. Text encoders and evaluators are others' work, and stay where they are.
+/// Returns the roles with weights that belong to the model, and their files. Text encoders and evaluators are published
+/// elsewhere and left out.
 fn places(manifest: &Manifest) -> Result<BTreeMap<&'static str, Vec<String>>, ExportError> {
     const ROLES: [&str; 7] = ["control", "decoder", "denoiser", "generator", "length", "tokenizer", "vae"];
     let own = match manifest.kind {
@@ -208,7 +212,7 @@ fn places(manifest: &Manifest) -> Result<BTreeMap<&'static str, Vec<String>>, Ex
         ArtifactKind::Vae => Some("vae"),
         ArtifactKind::Tokenizer => Some("tokenizer"),
         ArtifactKind::FlowDecoder => Some("decoder"),
-        other => return Err(ExportError::Unfit(format!("{} is nothing that a layout has a place for", other.noun()))),
+        other => return Err(ExportError::Unfit(format!("no layout can hold {}", other.noun()))),
     };
     let mut places = BTreeMap::new();
     for role in ROLES {
@@ -226,17 +230,18 @@ fn places(manifest: &Manifest) -> Result<BTreeMap<&'static str, Vec<String>>, Ex
 }
 
 impl Planned {
-    /// Our files that it is made of.
+    /// Returns the names of our files that it needs.
     pub fn reads(&self) -> impl Iterator<Item = &str> {
         let mut names: Vec<&str> = self.files.iter().map(|(file, _)| file.as_str()).collect();
         names.dedup();
         names.into_iter()
     }
 
-    /// Writes it to what `open` gives; `bytes` holds every file that it [reads](Self::reads). A file of no tensors is not opened.
+    /// Writes the file to the writer of `open`; `bytes` holds every file of [`reads`](Self::reads). A file without
+    /// tensors is not opened.
     ///
     /// # Errors
-    /// If one of them is no safetensors file, or of another network than the layout is for.
+    /// Returns an error if an input is not a safetensors file, or has another network than the layout.
     pub fn write<W: Write + Seek>(
         &self,
         open: impl FnOnce() -> std::io::Result<W>,
@@ -265,7 +270,7 @@ impl Planned {
                 }
                 let role = names.role;
                 return Err(ExportError::Unfit(format!(
-                    "the part `{role}` has no tensor `{marker}`, and so is of another network than this layout is for"
+                    "the part `{role}` has no tensor `{marker}`, so its network does not match this layout"
                 )));
             }
             for (name, view) in tensors.iter() {
@@ -292,9 +297,9 @@ impl Planned {
         Ok(Written { tensors: count, left_out })
     }
 
-    /// What a tensor is called there.
+    /// Returns a tensor's name in the exported file.
     fn renamed(&self, names: &Names, rest: &str) -> String {
-        // T2M-GPT's one codebook has no number.
+        // The single codebook of T2M-GPT has no number.
         if self.key == Some("net") && rest == "quantizer.layers.0.codebook" {
             return format!("{}quantizer.codebook", names.to);
         }
@@ -312,14 +317,14 @@ mod tests {
 
     use super::*;
 
-    /// A safetensors file of tensors [1] with these names.
+    /// Makes a safetensors file of tensors of shape [1] with these names.
     fn file(names: &[&str]) -> Vec<u8> {
         let number = 1.5_f32.to_le_bytes();
         let view = |name: &&str| ((*name).to_owned(), TensorView::new(Dtype::F32, vec![1], &number).unwrap());
         serialize(names.iter().map(view), None).unwrap()
     }
 
-    /// A model of parts with these tensors, and the bytes of its files.
+    /// Makes a model of parts with these tensors, and the bytes of its files.
     fn model(generator: &str, parts: &[(&str, &[&str])]) -> (Manifest, BTreeMap<String, Vec<u8>>) {
         let digests: BTreeMap<&str, Digest> =
             parts.iter().map(|(role, _)| (*role, Digest::of(role.as_bytes()))).collect();
@@ -366,7 +371,7 @@ mod tests {
         assert!(count == 5 && text.contains("state_dict") && expected.iter().all(|name| text.contains(name)));
         assert!(plan.left_out.is_empty(), "a text encoder is somebody else's: {:?}", plan.left_out);
 
-        // Feedback is ours: theirs has no place for it, ours has.
+        // The network `feedback` is ours: the published layout cannot hold it, ours can.
         let control = [control[0], control[1], "feedback.change.weight"];
         let parts = [parts[0], parts[1], ("control", &control[..])];
         let (manifest, bytes) = model("latent-diffusion", &parts);
@@ -384,9 +389,12 @@ mod tests {
         let (manifest, bytes) = model("feature-diffusion", &[("denoiser", &["embed_timestep.time_embed.0.weight"])]);
         let plan = Layout::MotionLcm.plan(&manifest).unwrap();
         let said = written(&plan.files[0], &bytes).unwrap_err().to_string();
-        assert!(said.contains("`time_embedding.linear_1.weight`") && said.contains("another network"), "{said}");
+        assert!(
+            said.contains("`time_embedding.linear_1.weight`") && said.contains("does not match this layout"),
+            "{said}"
+        );
         let said = Layout::Momask.plan(&manifest).unwrap_err().to_string();
-        assert!(said.contains("`momask` has no place for its parts, denoiser"), "{said}");
+        assert!(said.contains("`momask` cannot hold its parts (denoiser)"), "{said}");
         let plan = Layout::Mdm.plan(&manifest).unwrap();
         assert_eq!(written(&plan.files[0], &bytes).unwrap().0, 1);
 
@@ -398,7 +406,7 @@ mod tests {
         assert_eq!(plan.left_out, ["length"]);
         let (_, out) = written(&plan.files[0], &bytes).unwrap();
         assert!(String::from_utf8_lossy(&out).contains("vqvae.quantizer.codebook"), "one codebook has no number there");
-        // A masked generator of one codebook has no second network.
+        // A masked generator with one codebook has no second network.
         let parts: [(&str, &[&str]); 2] = [("tokenizer", &book), ("generator", &["mask.token_emb.weight"])];
         let (manifest, bytes) = model("tokens", &parts);
         let plan = Layout::Momask.plan(&manifest).unwrap();

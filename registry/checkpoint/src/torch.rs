@@ -1,7 +1,8 @@
-//! Weights as `torch.save` writes them: an uncompressed zip archive with a pickle, which lists the tensors, and a file of numbers for each of them.
+//! Writer of weights in the format of `torch.save`: an uncompressed zip archive with a pickle that lists the tensors,
+//! and a file of numbers for each.
 //!
-//! The pickle holds a dict from names to tensors, or a dict with that under a key: protocol 2 and the few opcodes that PyTorch's own
-//! reader with `weights_only` allows. The same tensors always give the same bytes.
+//! The pickle holds a dict from names to tensors, or that dict under a key. It uses protocol 2 and only the opcodes
+//! that PyTorch's reader with `weights_only` allows. The same tensors always give the same bytes.
 
 use std::collections::BTreeMap;
 use std::io::{self, Seek, Write};
@@ -10,7 +11,7 @@ use safetensors::tensor::TensorView;
 use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, DateTime, ZipWriter};
 
-/// The archive's one folder, as PyTorch calls it where a file has no name.
+/// Folder in the archive; PyTorch uses this name for unnamed files.
 const FOLDER: &str = "archive";
 /// PyTorch aligns tensors so that they can be mapped.
 const ALIGNMENT: u16 = 64;
@@ -18,14 +19,13 @@ const ALIGNMENT: u16 = 64;
 /// A tensor of 32-bit floats.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Tensor<'a> {
-    /// Its shape.
     pub shape: Vec<usize>,
-    /// Its numbers, row by row, little-endian.
+    /// Its numbers in row-major order, little-endian.
     pub bytes: &'a [u8],
 }
 
 impl<'a> Tensor<'a> {
-    /// What a safetensors file holds.
+    /// Wraps a tensor of a safetensors file.
     pub fn of(view: &TensorView<'a>) -> Self {
         Self { shape: view.shape().to_vec(), bytes: view.data() }
     }
@@ -34,7 +34,7 @@ impl<'a> Tensor<'a> {
 /// Writes `tensors` as one dict, or under `key` in another.
 ///
 /// # Errors
-/// If `out` cannot be written.
+/// Returns an error if `out` cannot be written.
 pub fn write<W: Write + Seek>(out: W, key: Option<&str>, tensors: &BTreeMap<String, Tensor<'_>>) -> io::Result<()> {
     let mut archive = ZipWriter::new(out);
     let plain = SimpleFileOptions::default()
@@ -54,7 +54,7 @@ pub fn write<W: Write + Seek>(out: W, key: Option<&str>, tensors: &BTreeMap<Stri
     archive.finish().map_err(io::Error::other)?.flush()
 }
 
-/// The pickle of the dict, whose tensor number i is the file `data/i`.
+/// Pickles the dict; the numbers of tensor i are in the file `data/i`.
 fn pickle(key: Option<&str>, tensors: &BTreeMap<String, Tensor<'_>>) -> Vec<u8> {
     let mut out = Pickle(vec![0x80, 2]);
     if let Some(key) = key {
@@ -90,7 +90,7 @@ impl Pickle {
             self.0.push(b'J');
             self.0.extend(number.to_le_bytes());
         } else {
-            // Eight bytes and one of zeros, so that it is not read as a negative number.
+            // Eight bytes and a zero byte, so that it is not read as a negative number.
             self.0.extend([0x8a, 9]);
             self.0.extend((number as u64).to_le_bytes());
             self.0.push(0);
@@ -103,7 +103,7 @@ impl Pickle {
         self.0.push(b't');
     }
 
-    /// `_rebuild_tensor_v2(storage, offset, shape, strides, requires_grad, hooks)`.
+    /// Writes a call of `_rebuild_tensor_v2(storage, offset, shape, strides, requires_grad, hooks)`.
     fn tensor(&mut self, number: usize, tensor: &Tensor<'_>) {
         let mut strides = vec![1; tensor.shape.len()];
         for axis in (1..strides.len()).rev() {

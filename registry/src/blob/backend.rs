@@ -1,4 +1,4 @@
-//! What a place for bytes must do.
+//! Interface of a place that stores bytes.
 
 use std::collections::BTreeSet;
 use std::fmt;
@@ -7,86 +7,99 @@ use std::io::Read;
 use checkpoint::BlobError;
 use protocol::Digest;
 
-/// A blob as a listing shows it.
+/// A blob in a listing.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Entry {
-    /// Its name.
     pub digest: Digest,
-    /// Its length.
+    /// Length in bytes.
     pub bytes: u64,
-    /// When it was last put, in milliseconds since 1970.
+    /// Time of the last put, in milliseconds since 1970.
     pub put_ms: i64,
 }
 
-/// What a backend says of a blob without reading it.
+/// Metadata of a blob, known without reading it.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Stat {
-    /// Its length.
+    /// Length in bytes.
     pub bytes: u64,
-    /// When it was last put, in milliseconds since 1970.
+    /// Time of the last put, in milliseconds since 1970.
     pub put_ms: i64,
-    /// Another text after every change of the bytes, in one line.
+    /// One line of text that differs after every change of the bytes.
     pub stamp: String,
 }
 
-/// Where bytes lie. Calls block, and may come from many threads; one digest may be put by two of them at once.
+/// A reason why a place does not answer.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Problem {
+    /// Start of the problem, in milliseconds since 1970.
+    pub since_ms: i64,
+    /// Description of the failure.
+    pub what: String,
+}
+
+/// A place for bytes. Calls block and may come from many threads; two threads may put one digest at the same time.
 pub trait Backend: Send + Sync + fmt::Debug {
-    /// A place for a blob of `bytes` bytes to arrive at.
+    /// Opens a staging area for a blob of `bytes` bytes.
     fn stage(&self, bytes: u64) -> Result<Box<dyn Staged>, BlobError>;
-    /// The bytes as they lie there from byte `from` on, unverified.
+    /// Reads the stored bytes from byte `from` on, unverified.
     fn read(&self, digest: Digest, from: u64) -> Result<Box<dyn Read + Send>, BlobError>;
-    /// What is known without reading it, if it is there.
+    /// Returns the metadata of a blob, or `None` if it does not exist.
     fn stat(&self, digest: Digest) -> Result<Option<Stat>, BlobError>;
-    /// Marks a blob that is there as put just now, and makes sure that it would survive a loss of power.
+    /// Sets the put time of an existing blob to now and makes the blob durable.
     fn touch(&self, digest: Digest) -> Result<Stat, BlobError>;
-    /// Removes it; it need not be there.
+    /// Removes a blob if it exists.
     fn remove(&self, digest: Digest) -> Result<(), BlobError>;
-    /// Takes away its name but keeps the bytes for somebody to look at; it need not be there.
+    /// Moves a blob, if it exists, out of its name and keeps the bytes for inspection.
     fn put_aside(&self, digest: Digest) -> Result<(), BlobError>;
-    /// All blobs, in no particular order. What else lies there is left out.
+    /// Lists all blobs in no particular order. Leaves out other files.
     fn list(&self) -> Result<Vec<Entry>, BlobError>;
-    /// Whether there is no blob.
+    /// Returns true if there is no blob.
     fn is_empty(&self) -> Result<bool, BlobError>;
-    /// What lies among the blobs and is not the store's.
+    /// Lists files among the blobs that do not belong to the store.
     fn strays(&self) -> Result<Vec<String>, BlobError>;
-    /// What was put aside.
+    /// Lists the blobs that were put aside.
     fn aside(&self) -> Result<Vec<String>, BlobError>;
-    /// Where the marker lies, in words.
+    /// Describes the marker's location for messages.
     fn marker_place(&self) -> String;
-    /// The marker, a text of one line that stands beside the blobs and says whose they are.
+    /// Reads the marker: a line of text beside the blobs that names the store they belong to.
     fn marker(&self) -> Result<Option<String>, BlobError>;
-    /// Puts a marker in the place of `old`, `None` for none; `false`, and nothing is changed, if there is not `old`. Of two that
-    /// try this at once one is told `false`.
+    /// Replaces the marker if it equals `old`, where `None` means no marker. Otherwise returns `false` and changes
+    /// nothing. If two callers try at once, one gets `false`.
     fn set_marker(&self, old: Option<&str>, marker: &str) -> Result<bool, BlobError>;
 
-    /// As [`stage`](Self::stage), in place of what is staged under a name of 64 hexadecimal digits. A backend that can keeps what has
-    /// arrived when it is dropped, and when the process ends.
+    /// Returns the current problem of the place, as seen in the last calls.
+    fn problem(&self) -> Option<Problem> {
+        None
+    }
+
+    /// Opens a staging area under a name of 64 hexadecimal digits and replaces an older one of that name. A backend
+    /// that can keeps the bytes when the value is dropped or the process ends.
     fn stage_as(&self, name: &str, bytes: u64) -> Result<Box<dyn Staged>, BlobError> {
         let _ = name;
         self.stage(bytes)
     }
-    /// Goes on with what is staged under a name, if there is something, and gives what has arrived to `read`.
+    /// Continues the staged bytes of a name, if there are any, and passes the arrived bytes to `read`.
     fn staged_as(&self, name: &str, read: &mut dyn FnMut(&[u8])) -> Result<Option<Box<dyn Staged>>, BlobError> {
         let _ = (name, read);
         Ok(None)
     }
-    /// Forgets what is staged under a name, if there is something.
+    /// Deletes the staged bytes of a name, if there are any.
     fn unstage(&self, name: &str) -> Result<(), BlobError> {
         let _ = name;
         Ok(())
     }
-    /// Forgets what is staged under other names than these.
+    /// Deletes all named staged bytes except those of `names`.
     fn unstage_but(&self, names: &BTreeSet<String>) -> Result<(), BlobError> {
         let _ = names;
         Ok(())
     }
 }
 
-/// A blob on its way into a [`Backend`]. It is gone if it is dropped.
+/// A blob being written to a [`Backend`]. Dropping it deletes the bytes.
 pub trait Staged: Send + fmt::Debug {
     /// Appends bytes.
     fn write(&mut self, bytes: &[u8]) -> Result<(), BlobError>;
-    /// Gives it its name; returns once it would survive a loss of power. `false`, and nothing is changed, if a blob has that
-    /// name already. Never shows a part of it under the name.
+    /// Gives the blob its name and returns when it is durable. Returns `false` and changes nothing if the name is
+    /// taken. The name never shows part of a blob.
     fn commit(self: Box<Self>, digest: Digest) -> Result<bool, BlobError>;
 }

@@ -1,4 +1,4 @@
-//! Uploads that have begun: bytes that are hashed as they arrive, and the table of those that wait for their next request.
+//! Unfinished uploads: bytes that are hashed as they arrive, and the table of uploads between two requests.
 
 use std::collections::{BTreeMap, HashMap};
 use std::sync::Mutex;
@@ -10,50 +10,62 @@ use protocol::{Digest, Incarnation, TaskId, WorkerId};
 
 use super::backend::Staged;
 use super::holds::Holds;
+use super::seen::SMALL_BYTES;
 
-/// Bytes that arrive in parts and are hashed on the way. They are gone if it is dropped.
+/// An upload that is hashed as it arrives. Dropping it deletes the bytes.
 #[derive(Debug)]
 pub struct Upload {
     pub(super) staged: Box<dyn Staged>,
     pub(super) hasher: Hasher,
     pub(super) written: u64,
-    /// How many bytes there may be.
+    /// The announced length.
     pub(super) bytes: u64,
+    /// The bytes so far, while they are few and all came to this process.
+    pub(super) content: Option<Vec<u8>>,
 }
 
 impl Upload {
-    /// Appends bytes, on disk or where blobs lie.
+    /// Starts an upload of at most `bytes` bytes.
+    pub(super) fn new(staged: Box<dyn Staged>, bytes: u64) -> Self {
+        Self { staged, hasher: Hasher::default(), written: 0, bytes, content: Some(Vec::new()) }
+    }
+
+    /// Appends bytes to the staging area.
     pub fn write(&mut self, bytes: &[u8]) -> Result<(), BlobError> {
         let written = self.written + bytes.len() as u64;
         if written > self.bytes {
-            return Err(BlobError::Refused(format!("more bytes came than the {} that were announced", self.bytes)));
+            return Err(BlobError::Refused(format!("received more bytes than the announced {}", self.bytes)));
         }
         self.staged.write(bytes)?;
         self.hasher.update(bytes);
         self.written = written;
+        self.content = self.content.take().filter(|_| written <= SMALL_BYTES).map(|mut content| {
+            content.extend_from_slice(bytes);
+            content
+        });
         Ok(())
     }
 
-    /// Bytes that have arrived.
+    /// Returns the number of bytes that have arrived.
     pub fn written(&self) -> u64 {
         self.written
     }
 
-    /// Whether all announced bytes have arrived.
+    /// Returns true if all announced bytes have arrived.
     pub fn is_complete(&self) -> bool {
         self.written == self.bytes
     }
 }
 
-/// Whose upload it is. The fence is left out: it grows when a gang regroups, and its lead uploads on.
+/// Owner of an upload. Has no fence, because the fence grows when a gang regroups while its lead continues the upload.
 pub(super) type Holder = (TaskId, WorkerId, Incarnation);
 
-/// Uploads of one process, and the blobs that are kept from collection before a row names them.
+/// Uploads of one process, and blobs that collection must keep before a row names them.
 #[derive(Debug)]
 pub(super) struct Uploads {
     pub(super) begun: Mutex<HashMap<(Holder, Digest), Begun>>,
     pub(super) held: Mutex<Holds>,
-    /// Blobs that somebody in this process is about to name in a row, and how many do.
+    /// Blobs that callers in this process are about to name in a row, with the number of callers.
     pub(super) protected: Mutex<BTreeMap<Digest, usize>>,
     pub(super) since: Instant,
 }
@@ -69,9 +81,9 @@ impl Uploads {
 pub(super) struct Begun {
     /// `None` while a request writes to it, and while it waits.
     pub(super) upload: Option<Upload>,
-    /// All of it has arrived and could not be stored: the bytes are where they arrived, for the next request to take up.
+    /// True if all bytes have arrived but could not be stored. They stay in the staging area for the next request.
     pub(super) waits: bool,
-    /// `None` if it was begun by an earlier process, which was told.
+    /// The announced length; `None` if an earlier process began the upload.
     pub(super) bytes: Option<u64>,
     pub(super) touched: Instant,
 }

@@ -1,5 +1,5 @@
-//! The calls by which a folder of blobs changes. All writes go through here, so that a test can stand between the store and
-//! the disk and drop what was not synced, as a loss of power does.
+//! File system calls that change a folder of blobs. All writes go through this trait, so that a test can drop unsynced
+//! writes as a power loss does.
 
 use std::fmt;
 use std::fs::{self, File, FileTimes, OpenOptions};
@@ -10,31 +10,31 @@ use std::time::SystemTime;
 
 use nix::fcntl::OFlag;
 
-/// A file system, as far as blobs need one. Reads do not pass through it: what is written is readable at once.
+/// The file system operations that blobs need. Reads bypass the trait, because written bytes are readable at once.
 pub trait Disk: Send + Sync + fmt::Debug {
-    /// Makes a file that is not there yet.
+    /// Creates a file that does not exist yet.
     fn create(&self, path: &Path) -> io::Result<Box<dyn DiskFile>>;
-    /// Opens a file that is there, for its times and its sync.
+    /// Opens an existing file to set its times or sync it.
     fn open(&self, path: &Path) -> io::Result<Box<dyn DiskFile>>;
-    /// Gives a file another name, in place of whatever has it.
+    /// Renames a file and replaces the target.
     fn rename(&self, from: &Path, to: &Path) -> io::Result<()>;
     /// Removes a file's name.
     fn remove(&self, path: &Path) -> io::Result<()>;
-    /// Makes a folder; it may be there.
+    /// Creates a folder; it may exist.
     fn create_dir(&self, path: &Path) -> io::Result<()>;
-    /// Makes the names in a folder outlive a loss of power.
+    /// Makes the names in a folder durable.
     fn sync_dir(&self, path: &Path) -> io::Result<()>;
 }
 
 /// An open file of a [`Disk`].
 pub trait DiskFile: Write + Send + fmt::Debug {
-    /// Makes the file's bytes and times outlive a loss of power.
+    /// Makes the file's bytes and times durable.
     fn sync(&mut self) -> io::Result<()>;
-    /// Sets the time of the last change.
+    /// Sets the modification time.
     fn set_modified(&mut self, at: SystemTime) -> io::Result<()>;
 }
 
-/// The operating system's.
+/// The operating system's file system.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Os;
 
@@ -81,7 +81,7 @@ fn is_dir(path: &Path) -> bool {
     fs::symlink_metadata(path).is_ok_and(|metadata| metadata.is_dir())
 }
 
-/// Opens a regular file. Symbolic links are not followed, and a pipe that somebody put there does not block.
+/// Opens a regular file. Does not follow symbolic links and does not block on a named pipe.
 pub(crate) fn regular(options: &mut OpenOptions, path: &Path) -> io::Result<File> {
     let file = options.custom_flags((OFlag::O_NOFOLLOW | OFlag::O_NONBLOCK).bits()).open(path);
     let file = file.map_err(|error| match nix::errno::Errno::from_raw(error.raw_os_error().unwrap_or_default()) {
@@ -97,22 +97,22 @@ pub(crate) fn regular(options: &mut OpenOptions, path: &Path) -> io::Result<File
     Err(io::Error::new(io::ErrorKind::InvalidInput, "it is not a regular file"))
 }
 
-/// Makes the names in a folder outlive a loss of power.
+/// Makes the names in a folder durable.
 pub(crate) fn sync_dir(dir: &Path) -> io::Result<()> {
     fs::File::open(dir)?.sync_all()
 }
 
-/// Bytes that this user may still write where `path` lies.
+/// Returns the bytes that this user may still write to the file system of `path`.
 pub(crate) fn free_bytes(path: &Path) -> io::Result<u64> {
     let stat = nix::sys::statvfs::statvfs(path)?;
     #[expect(clippy::useless_conversion, reason = "the fields' width differs between targets")]
     Ok(u64::from(stat.blocks_available()).saturating_mul(u64::from(stat.fragment_size())))
 }
 
-/// Replaces a small file: after a loss of power it holds the old bytes or the new ones.
+/// Replaces a small file atomically: after a power loss it holds either the old bytes or the new ones.
 pub(crate) fn write_whole(path: &Path, bytes: &[u8]) -> io::Result<()> {
     let fresh = path.with_extension("new");
-    // New, so that nothing that lay under the name is written through.
+    // Create a new file, so that a link or pipe under this name is not written through.
     let _ = fs::remove_file(&fresh);
     let mut file = OpenOptions::new().write(true).create_new(true).open(&fresh)?;
     file.write_all(bytes)?;

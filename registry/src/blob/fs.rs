@@ -1,11 +1,11 @@
-//! Blobs in a folder: `blobs/sha256/ab/cdef...` holds the bytes whose digest begins with `ab`.
+//! Blobs in a folder: `blobs/sha256/ab/cdef...` holds the bytes whose digest starts with `ab`.
 //!
-//! A blob arrives in `staging/`, is synced, renamed to its name, and its folder synced: under a name there is never a part
-//! of a blob, and once it is committed the blob outlives a loss of power. A name that is taken is not given again; what
-//! lies there is put aside first, in `quarantine/`, if it is damaged. What a killed process left in `staging/` is removed by
-//! the next one that opens the store, but for uploads that go on; it holds the store's lock, so nobody is writing there.
+//! A blob arrives in `staging/`, is synced, renamed to its name, and its folder is synced. A name therefore never shows
+//! part of a blob, and a committed blob survives a power loss. An existing name is not overwritten; a damaged file
+//! under it is first moved to `quarantine/`. The next process that opens the store removes files in `staging/` that a
+//! killed process left, except resumable uploads. That process holds the store's lock, so no other one writes there.
 //!
-//! Files that are not ours are left alone and never opened: a symbolic link is not followed, a pipe does not block.
+//! Foreign files are left alone and never opened: symbolic links are not followed, and a named pipe does not block.
 
 use std::collections::BTreeSet;
 use std::fs::{self, OpenOptions};
@@ -26,7 +26,7 @@ pub(super) use super::disk_error::error;
 use super::staging::{Part, Staging};
 use crate::clock;
 
-/// Blobs in a folder.
+/// Backend that stores blobs in a folder.
 #[derive(Debug)]
 pub struct Folder(Arc<Inner>);
 
@@ -36,18 +36,18 @@ struct Inner {
     blobs: PathBuf,
     staging: Staging,
     disk: Arc<dyn Disk>,
-    /// Held while a name is looked at and taken.
+    /// Held while a name is checked and taken.
     naming: Mutex<()>,
 }
 
 impl Folder {
-    /// Opens `dir/blobs` and `dir/staging`, making them where they are missing, and clears the latter. Only for the holder
-    /// of the store's lock.
+    /// Opens `dir/blobs` and `dir/staging`, creates them if missing, and clears the latter. Only for the holder of the
+    /// store's lock.
     pub fn open(dir: &Path) -> io::Result<Self> {
         Self::open_on(dir, Arc::new(Os))
     }
 
-    /// Opens a folder of another file system than the operating system's.
+    /// Opens a folder through another [`Disk`] than the operating system's.
     pub fn open_on(dir: &Path, disk: Arc<dyn Disk>) -> io::Result<Self> {
         let blobs = dir.join(checkpoint::BLOBS);
         fs::create_dir_all(&blobs)?;
@@ -57,7 +57,7 @@ impl Folder {
         Ok(Self(Arc::new(Inner { dir: dir.to_owned(), blobs, staging, disk, naming: Mutex::default() })))
     }
 
-    /// For reading only: makes and clears nothing.
+    /// Opens the folder read-only: creates and clears nothing.
     pub fn to_read(dir: &Path) -> Self {
         let disk: Arc<dyn Disk> = Arc::new(Os);
         let staging = Staging::to_read(dir.join("staging"), Arc::clone(&disk));
@@ -75,7 +75,7 @@ impl Inner {
         self.dir.join("blobs/IDENTITY")
     }
 
-    /// The blob's file, if it is there and a file.
+    /// Returns the metadata of a blob's file, or `None` if there is no regular file.
     fn metadata(&self, path: &Path) -> Result<Option<fs::Metadata>, BlobError> {
         let shard = path.parent().unwrap_or(&self.blobs);
         let found = fs::symlink_metadata(shard).and_then(|shard| {
@@ -103,7 +103,7 @@ impl Inner {
             }
             self.disk.sync_dir(&folder)?;
             tracing::warn!(
-                "`{}` is not the blob that its name says; it was put aside as `{}`",
+                "the content of `{}` does not match its name; it was moved to `{}`",
                 path.display(),
                 aside.display()
             );
@@ -253,7 +253,7 @@ impl Backend for Folder {
         let path = self.0.marker();
         let blobs = self.0.dir.join("blobs");
         fs::create_dir_all(&blobs).map_err(|e| error("make", &blobs, &e))?;
-        // Two processes that open stores on the same folder of blobs at once.
+        // Two processes may open stores on the same folder of blobs at once.
         let lock = blobs.join("marking");
         let failed = |e: io::Error| error("lock", &lock, &e);
         let file = OpenOptions::new().create(true).truncate(false).write(true).open(&lock).map_err(failed)?;
@@ -270,7 +270,7 @@ fn is_absent(e: &io::Error) -> bool {
     matches!(e.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory)
 }
 
-/// Calls `see` with all entries of the folder of blobs, and with the digest of those that are blobs.
+/// Calls `see` for every entry of the blob folder, with a digest if the entry is a blob.
 fn for_all(blobs: &Path, mut see: impl FnMut(&fs::DirEntry, Option<Digest>)) -> io::Result<()> {
     let is_hex = |name: &str, len| name.len() == len && name.bytes().all(|b| b.is_ascii_hexdigit());
     for shard in fs::read_dir(blobs)? {
@@ -291,7 +291,7 @@ fn for_all(blobs: &Path, mut see: impl FnMut(&fs::DirEntry, Option<Digest>)) -> 
     Ok(())
 }
 
-/// A blob that arrives.
+/// A blob being written.
 #[derive(Debug)]
 struct StagedFile {
     part: Part,
@@ -313,11 +313,11 @@ impl Staged for StagedFile {
         let shard = path.parent().unwrap_or(&folder.blobs);
         let mut made = folder.disk.create_dir(shard);
         if made.as_ref().is_err_and(|e| e.kind() == ErrorKind::AlreadyExists) {
-            // Something that is no folder has its name.
+            // A file that is not a folder has the shard's name.
             folder.put_aside(shard)?;
             made = folder.disk.create_dir(shard);
         }
-        // Always synced: the thread that made the shard may not have synced it yet.
+        // Always synced: the thread that created the shard may not have synced it yet.
         let made = made.and_then(|()| folder.disk.sync_dir(&folder.blobs));
         made.map_err(|e| error("make", shard, &e))?;
         {
@@ -337,7 +337,8 @@ impl Staged for StagedFile {
     }
 }
 
-/// The inode and the time of its last change are in the stamp, so that a changed file is noticed whose time was set back.
+/// Includes the inode and the change time in the stamp, so that a change is noticed even if the modification time was
+/// reset.
 fn stat(metadata: &fs::Metadata) -> Stat {
     let stamp = format!(
         "{}-{}.{:09}-{}.{:09}-{}",

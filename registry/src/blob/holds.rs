@@ -1,8 +1,8 @@
-//! What tasks that are still held have stored and no row names yet.
+//! Blobs that held tasks have stored and no row names yet.
 //!
-//! A coordinator may be restarted while its workers go on, so this is kept in a file as well: a line with a digest and a task for
-//! each. A line that does not read is skipped. The file is not synced: what a loss of power takes of it has the grace that every fresh
-//! blob has from collection.
+//! Workers continue while a coordinator restarts, so this table is also kept in a file, one line with digest and task
+//! for each blob. Unreadable lines are skipped. The file is not synced: blobs whose lines a power loss takes still have
+//! the grace period of fresh blobs.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, OpenOptions};
@@ -18,17 +18,17 @@ use super::disk::regular;
 pub(super) struct Holds {
     tasks: BTreeMap<TaskId, BTreeSet<Digest>>,
     path: Option<PathBuf>,
-    /// Another process writes the file, so that it is read whenever somebody asks.
+    /// True if another process writes the file, which is then read for every request.
     is_others: bool,
 }
 
 impl Holds {
-    /// Those of an earlier process, and from now on of this one.
+    /// Reads the holds of an earlier process and keeps this process's holds in the same file.
     pub(super) fn keep(path: &Path) -> Self {
         Self { tasks: read(path), path: Some(path.to_owned()), is_others: false }
     }
 
-    /// Those that the process which holds the store has written down.
+    /// Opens the holds of the process that has the store open, for reading.
     pub(super) fn of_others(path: &Path) -> Self {
         Self { path: Some(path.to_owned()), is_others: true, ..Self::default() }
     }
@@ -43,6 +43,11 @@ impl Holds {
         }
     }
 
+    /// Returns true if the task has stored the blob and is still held.
+    pub(super) fn has(&self, task: &TaskId, digest: Digest) -> bool {
+        self.tasks.get(task).is_some_and(|digests| digests.contains(&digest))
+    }
+
     pub(super) fn all(&self) -> BTreeSet<Digest> {
         match &self.path {
             Some(path) if self.is_others => read(path).into_values().flatten().collect(),
@@ -50,7 +55,7 @@ impl Holds {
         }
     }
 
-    /// Forgets the tasks that are not held any more.
+    /// Forgets the tasks that are no longer held.
     pub(super) fn let_go(&mut self, is_held: impl Fn(&TaskId) -> bool) {
         let before = self.tasks.len();
         self.tasks.retain(|task, _| is_held(task));
@@ -71,7 +76,7 @@ impl Holds {
         let Some(path) = &self.path else { return };
         if let Err(error) = write(path) {
             tracing::warn!(
-                "`{}` is not kept, so that a restart will not know what tasks have stored: {error}",
+                "cannot write `{}`; a restart will not know the blobs of held tasks: {error}",
                 path.display()
             );
         }
@@ -83,7 +88,7 @@ fn read(path: &Path) -> BTreeMap<TaskId, BTreeSet<Digest>> {
         Ok(text) => text,
         Err(error) => {
             if error.kind() != ErrorKind::NotFound {
-                tracing::warn!("`{}` does not read: {error}", path.display());
+                tracing::warn!("cannot read `{}`: {error}", path.display());
             }
             return BTreeMap::new();
         }

@@ -1,9 +1,9 @@
-//! Which blobs were hashed and found whole, and which damaged, by the stamp that they had then.
+//! Results of hashing blobs, whole or damaged, by the blob's stamp at that time.
 //!
-//! A stamp changes with every write to a blob, so what was found holds until then; it spares a run the hashing of gigabytes at
-//! each start. The file `verified` is a cache: each line is a digest and a stamp, a line that does not read is skipped, and
-//! the file may be deleted. Bytes that rot without a write keep their stamp; they are noticed by their next reader, for
-//! every read hashes.
+//! A stamp changes with every write to a blob, so a result is valid until then. This spares a run hashing gigabytes at
+//! each start. The file `verified` is a cache with one digest and stamp a line; unreadable lines are skipped, and the
+//! file may be deleted. Bytes that rot without a write keep their stamp; the next reader notices, because every read
+//! hashes.
 
 use std::collections::HashMap;
 use std::fs::{self, File, OpenOptions};
@@ -16,18 +16,18 @@ use protocol::Digest;
 use super::backend::Stat;
 use super::disk::regular;
 
-/// How many lines more than blobs the file may have before it is written anew.
+/// Surplus of lines over blobs at which the file is rewritten.
 const SPARE_LINES: usize = 10_000;
 
-/// What was found.
+/// Result of hashing a blob.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Finding {
     Whole,
-    /// Its bytes have this digest instead.
+    /// The bytes have this digest instead.
     Damaged(Digest),
 }
 
-/// All that was found.
+/// All results, with the file that keeps them.
 #[derive(Debug, Default)]
 pub(super) struct Known {
     found: HashMap<Digest, (String, Finding)>,
@@ -37,7 +37,7 @@ pub(super) struct Known {
 }
 
 impl Known {
-    /// What an earlier process found whole.
+    /// Reads the whole blobs that an earlier process recorded.
     pub(super) fn read(path: &Path) -> Self {
         let mut known = Self { path: Some(path.to_owned()), ..Self::default() };
         let text = regular(OpenOptions::new().read(true), path).and_then(std::io::read_to_string).unwrap_or_default();
@@ -50,12 +50,12 @@ impl Known {
         known
     }
 
-    /// What was found about a blob with this stamp.
+    /// Returns the result for a blob with this stamp.
     pub(super) fn finding(&self, digest: Digest, stamp: &str) -> Option<Finding> {
         self.found.get(&digest).filter(|(then, _)| then == stamp).map(|(_, finding)| *finding)
     }
 
-    /// Whether the blob was found damaged the last time that it was read.
+    /// Returns true if the last read found the blob damaged.
     pub(super) fn is_damaged(&self, digest: Digest) -> bool {
         matches!(self.found.get(&digest), Some((_, Finding::Damaged(_))))
     }
@@ -85,8 +85,8 @@ impl Known {
             self.file.as_mut().map_or(Ok(()), |file| file.write_all(line.as_bytes()))
         };
         if let Err(error) = written {
-            // Blobs are hashed once more, that is all.
-            tracing::debug!("`{}` is not kept: {error}", path.display());
+            // The only cost is that blobs are hashed once more.
+            tracing::debug!("cannot write `{}`: {error}", path.display());
             self.path = None;
         }
     }
@@ -94,7 +94,7 @@ impl Known {
 
 fn rewrite(path: &Path, found: &HashMap<Digest, (String, Finding)>) -> std::io::Result<File> {
     let fresh = path.with_extension("new");
-    // Whatever has that name: an older process's, or somebody's pipe.
+    // Removes any file of that name, such as one of an older process or a foreign pipe.
     match fs::remove_file(&fresh) {
         Err(e) if e.kind() != std::io::ErrorKind::NotFound => return Err(e),
         _ => {}
@@ -107,7 +107,7 @@ fn rewrite(path: &Path, found: &HashMap<Digest, (String, Finding)>) -> std::io::
     Ok(file)
 }
 
-/// What was found, for all who read: a store and its readers share it.
+/// Results shared by a store and its readers.
 #[derive(Debug)]
 pub(super) struct Findings(Mutex<Known>);
 
@@ -120,7 +120,7 @@ impl Findings {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Takes note of what reading a blob has shown.
+    /// Records the result of reading a blob.
     pub(super) fn note(&self, digest: Digest, stat: &Stat, finding: Finding) {
         if let Finding::Damaged(found) = finding {
             tracing::error!("blob {digest} is damaged: its bytes hash to {found}");

@@ -1,89 +1,126 @@
-//! Manifests as they lie in a store: read, complete, whole.
+//! Manifests in a store, with checks that their files are complete and whole.
 
 use checkpoint::BlobError;
-use protocol::{Digest, Manifest};
+use protocol::{Digest, FileEntry, Manifest};
 
 use super::BlobStore;
 
-/// The largest manifest that is read; ours are at most a few megabytes.
+/// Size limit of a manifest that is read; ours have at most a few megabytes.
 pub const MANIFEST_BYTES: u64 = 64 << 20;
 
-/// Why an artifact cannot be taken for whole.
+/// Error of an artifact that is not whole.
 #[derive(Debug, thiserror::Error)]
 pub enum ManifestError {
-    /// The manifest itself, or a blob of it, could not be read.
+    /// The manifest or one of its blobs could not be read.
     #[error(transparent)]
     Blob(BlobError),
-    /// Another blob than a manifest.
+    /// The blob is not a manifest.
     #[error("blob {digest} is not a manifest: {cause}")]
     NotAManifest {
-        /// The blob.
         digest: Digest,
-        /// What the reader said.
+        /// Error of the JSON reader.
         cause: String,
     },
-    /// Written by a newer build.
+    /// A newer build wrote the manifest.
     #[error("manifest {digest} has format {found}, this build reads {expected}; use a newer build", expected = Manifest::FORMAT)]
     Format {
         /// The manifest.
         digest: Digest,
-        /// Its version.
+        /// Format number of the manifest.
         found: u32,
     },
-    /// A file is missing or cut.
+    /// A file is missing or has another length.
     #[error("manifest {digest} lists `{file}` as blob {blob} of {expected} bytes, which is {found}")]
     Incomplete {
         /// The manifest.
         digest: Digest,
-        /// The file's name in it.
+        /// The file's name in the manifest.
         file: String,
         blob: Digest,
-        /// Bytes by the manifest.
+        /// Length in the manifest.
         expected: u64,
-        /// What is there.
+        /// Description of the stored blob.
         found: String,
     },
 }
 
+impl ManifestError {
+    /// Returns the blob that is missing or damaged, if that is the error.
+    pub(crate) fn blob(&self) -> Option<Digest> {
+        match self {
+            Self::Blob(BlobError::NotFound(digest) | BlobError::Corrupt { expected: digest, .. }) => Some(*digest),
+            Self::Incomplete { blob, .. } => Some(*blob),
+            Self::Blob(_) | Self::NotAManifest { .. } | Self::Format { .. } => None,
+        }
+    }
+}
+
+/// Checks that the blob of a listed file exists with the listed length.
+fn as_listed(digest: Digest, name: &str, file: &FileEntry, found: Option<u64>) -> Result<(), ManifestError> {
+    if found == Some(file.bytes) {
+        return Ok(());
+    }
+    Err(ManifestError::Incomplete {
+        digest,
+        file: name.to_owned(),
+        blob: file.digest,
+        expected: file.bytes,
+        found: found.map_or_else(|| "not in the store".into(), |bytes| format!("{bytes} bytes long")),
+    })
+}
+
+/// Parses the bytes of the manifest `digest`.
+fn parse(digest: Digest, bytes: &[u8]) -> Result<Manifest, ManifestError> {
+    let manifest: Manifest =
+        serde_json::from_slice(bytes).map_err(|e| ManifestError::NotAManifest { digest, cause: e.to_string() })?;
+    if manifest.format != Manifest::FORMAT {
+        return Err(ManifestError::Format { digest, found: manifest.format });
+    }
+    Ok(manifest)
+}
+
 impl BlobStore {
-    /// The manifest named `digest`.
-    pub fn manifest(&self, digest: Digest) -> Result<Manifest, ManifestError> {
-        let stat = self.must_stat(digest).map_err(ManifestError::Blob)?;
-        if stat.bytes > MANIFEST_BYTES {
-            let cause = format!("it has {} bytes, and a manifest at most {MANIFEST_BYTES}", stat.bytes);
-            return Err(ManifestError::NotAManifest { digest, cause });
+    /// Returns the manifest named `digest` and its length. A manifest that this process has just stored is not
+    /// requested again.
+    pub(crate) fn stored_manifest(&self, digest: Digest) -> Result<(Manifest, u64), ManifestError> {
+        if let Some(content) = self.seen().content(digest) {
+            return Ok((parse(digest, &content)?, content.len() as u64));
         }
-        let bytes = self.get(digest).map_err(ManifestError::Blob)?;
-        let manifest: Manifest =
-            serde_json::from_slice(&bytes).map_err(|e| ManifestError::NotAManifest { digest, cause: e.to_string() })?;
-        if manifest.format != Manifest::FORMAT {
-            return Err(ManifestError::Format { digest, found: manifest.format });
-        }
-        Ok(manifest)
+        let bytes = self.manifest_bytes(digest)?;
+        Ok((parse(digest, &bytes)?, bytes.len() as u64))
     }
 
-    /// The manifest named `digest`, once every blob that it lists is known to be there with the right length.
+    /// Returns the manifest named `digest`.
+    pub fn manifest(&self, digest: Digest) -> Result<Manifest, ManifestError> {
+        parse(digest, &self.manifest_bytes(digest)?)
+    }
+
+    fn manifest_bytes(&self, digest: Digest) -> Result<Vec<u8>, ManifestError> {
+        let stat = self.must_stat(digest).map_err(ManifestError::Blob)?;
+        if stat.bytes > MANIFEST_BYTES {
+            let cause = format!("it has {} bytes; expected at most {MANIFEST_BYTES}", stat.bytes);
+            return Err(ManifestError::NotAManifest { digest, cause });
+        }
+        self.get(digest).map_err(ManifestError::Blob)
+    }
+
+    /// Returns the manifest named `digest` after checking that every listed blob exists with the right length.
     pub fn complete_manifest(&self, digest: Digest) -> Result<Manifest, ManifestError> {
         let manifest = self.manifest(digest)?;
         for (name, file) in &manifest.files {
-            match self.size(file.digest).map_err(ManifestError::Blob)? {
-                Some(bytes) if bytes == file.bytes => {}
-                found => {
-                    return Err(ManifestError::Incomplete {
-                        digest,
-                        file: name.clone(),
-                        blob: file.digest,
-                        expected: file.bytes,
-                        found: found.map_or_else(|| "not in the store".into(), |bytes| format!("{bytes} bytes long")),
-                    });
-                }
-            }
+            let found = self.size(file.digest).map_err(ManifestError::Blob)?;
+            as_listed(digest, name, file, found)?;
         }
         Ok(manifest)
     }
 
-    /// The manifest named `digest`, once every blob that it lists is known to be whole. Takes as long as hashing what was
-    /// not hashed since it was last written to.
+    /// Checks that a file listed by the manifest `digest` exists with the right length.
+    pub(crate) fn check_listed(&self, digest: Digest, name: &str, file: &FileEntry) -> Result<(), ManifestError> {
+        as_listed(digest, name, file, self.size(file.digest).map_err(ManifestError::Blob)?)
+    }
+
+    /// Returns the manifest named `digest` after verifying every listed blob. Hashes the blobs that were written since
+    /// they were last hashed.
     pub fn whole_manifest(&self, digest: Digest) -> Result<Manifest, ManifestError> {
         let manifest = self.complete_manifest(digest)?;
         for file in manifest.files.values() {
@@ -92,12 +129,16 @@ impl BlobStore {
         Ok(manifest)
     }
 
-    /// What is wrong with an artifact, if anything is: a part of it is missing or damaged. An error says nothing about it.
+    /// Returns the missing or damaged part of an artifact, if there is one. An error gives no information about the
+    /// artifact.
     pub fn flaw(&self, artifact: Digest) -> Result<Option<ManifestError>, BlobError> {
         match self.whole_manifest(artifact) {
             Ok(_) => Ok(None),
             Err(ManifestError::Blob(
-                e @ (BlobError::Unavailable(_) | BlobError::Storage(_) | BlobError::Refused(_)),
+                e @ (BlobError::Unreachable(_)
+                | BlobError::Unavailable(_)
+                | BlobError::Storage(_)
+                | BlobError::Refused(_)),
             )) => Err(e),
             Err(flaw) => Ok(Some(flaw)),
         }

@@ -1,4 +1,4 @@
-//! Blobs in memory: for tests, and the yardstick for every other backend.
+//! Blobs in memory, for tests and as the reference for other backends.
 
 use std::collections::HashMap;
 use std::io::{Cursor, Read};
@@ -10,7 +10,7 @@ use protocol::Digest;
 use super::{Backend, Entry, Staged, Stat};
 use crate::clock;
 
-/// Blobs in memory.
+/// Backend that stores blobs in memory.
 #[derive(Debug, Default)]
 pub struct Memory(Arc<Mutex<Contents>>);
 
@@ -19,7 +19,7 @@ struct Contents {
     blobs: HashMap<Digest, Blob>,
     aside: Vec<String>,
     marker: Option<String>,
-    /// Makes every write's stamp another.
+    /// Number of writes so far; makes every write's stamp different.
     writes: u64,
 }
 
@@ -41,7 +41,7 @@ impl Memory {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Changes bytes behind the store's back, as a failing disk does.
+    /// Changes bytes without the store's knowledge, as a failing disk does.
     pub fn damage(&self, digest: Digest, bytes: &[u8]) {
         let mut held = self.lock();
         held.writes += 1;

@@ -1,11 +1,12 @@
-//! Content-addressed bytes: what a blob is called is what it hashes to.
+//! Content-addressed bytes: the name of a blob is its hash.
 //!
-//! [`BlobStore`] verifies what is read and what is used again, stores equal bytes once, mends what was damaged, and keeps
-//! collection away from blobs that are being put. Bytes come and go in parts; nothing here holds a whole blob unless it was
-//! asked to. Where bytes lie is a [`Backend`]'s matter: a folder ([`fs::Folder`]), an object store ([`objects::Objects`]) or
-//! memory ([`memory::Memory`]); all pass the same functions in `registry/tests/conformance.rs`.
+//! [`BlobStore`] verifies what is read and reused, stores equal bytes once, repairs damaged blobs, and keeps garbage
+//! collection away from blobs that are being put. Bytes are passed in parts; no function holds a whole blob unless
+//! asked to. A [`Backend`] decides where bytes are stored: a folder ([`fs::Folder`]), an object store
+//! ([`objects::Objects`]) or memory ([`memory::Memory`]). All backends pass the same functions in
+//! `registry/tests/conformance.rs`.
 //!
-//! Not its job: which blobs are needed ([`crate::retention`]), and who may write.
+//! Other modules decide which blobs are needed ([`crate::retention`]) and which writers are allowed.
 
 mod backend;
 mod begun;
@@ -19,11 +20,12 @@ pub mod memory;
 pub mod objects;
 pub mod place;
 mod reader;
+mod seen;
 mod staging;
 mod store;
 mod uploads;
 
-pub use self::backend::{Backend, Entry, Staged, Stat};
+pub use self::backend::{Backend, Entry, Problem, Staged, Stat};
 pub use self::begun::Upload;
 pub use self::manifest::{MANIFEST_BYTES, ManifestError};
 pub use self::reader::{PART_BYTES, Reader};

@@ -1,8 +1,8 @@
-//! Where a store's blobs lie: in its folder, in another one, or in an object store.
+//! Location of a store's blobs: its own folder, another folder, or an object store.
 //!
-//! The place is chosen when the store is made and remembered in the file `blobs/PLACE` of its folder; without the file they
-//! lie in that folder. Whose they are is said by the marker beside the blobs themselves (`crate::identity`), so a file that is
-//! lost or changed leads to a refusal and not to another store.
+//! The location is chosen when the store is created and recorded in the file `blobs/PLACE` of its folder; without the
+//! file the blobs are in that folder. The marker beside the blobs names the store they belong to (`crate::identity`). A
+//! lost or changed file therefore leads to an error and never to another store's blobs.
 
 use std::fmt;
 use std::fs::OpenOptions;
@@ -18,12 +18,12 @@ use super::fs::Folder;
 use super::objects::{Objects, Remote, check_url};
 use super::{Backend, BlobStore};
 
-/// A place for blobs, as a user names it.
+/// A location of blobs, as a user writes it.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Place {
-    /// A folder of this machine, by its absolute path.
+    /// A folder of this machine, as an absolute path.
     Folder(PathBuf),
-    /// A bucket and a prefix in it.
+    /// A bucket and a prefix in it, as a URL.
     Objects(String),
 }
 
@@ -43,13 +43,13 @@ impl FromStr for Place {
         let path = match text.split_once("://") {
             None => text,
             Some(("file", path)) if path.starts_with('/') => path,
-            Some(("file", _)) => return Err(format!("`{text}` is no place for blobs: expected file:///FOLDER")),
+            Some(("file", _)) => return Err(format!("`{text}` is not a place for blobs: expected file:///FOLDER")),
             Some(_) => {
-                check_url(text).map_err(|e| format!("`{text}` is no place for blobs: {e}, or a folder"))?;
+                check_url(text).map_err(|e| format!("`{text}` is not a place for blobs: {e}, or a folder"))?;
                 return Ok(Self::Objects(text.trim_end_matches('/').to_owned()));
             }
         };
-        let path = std::path::absolute(path).map_err(|e| format!("`{text}` is no place for blobs: {e}"))?;
+        let path = std::path::absolute(path).map_err(|e| format!("`{text}` is not a place for blobs: {e}"))?;
         Ok(Self::Folder(path.components().collect()))
     }
 }
@@ -59,7 +59,7 @@ fn file(dir: &Path) -> PathBuf {
 }
 
 impl Place {
-    /// Where the blobs of the store in `dir` lie by its own word; `None` if that is its folder.
+    /// Returns the recorded location of the blobs of the store in `dir`; `None` means its folder.
     pub fn remembered(dir: &Path) -> io::Result<Option<Self>> {
         let invalid = |e: String| io::Error::new(ErrorKind::InvalidData, e);
         match regular(OpenOptions::new().read(true), &file(dir)).and_then(io::read_to_string) {
@@ -69,45 +69,56 @@ impl Place {
         }
     }
 
-    /// Makes [`Self::remembered`] give this place.
+    /// Records this location for [`Self::remembered`].
     pub(crate) fn remember(&self, dir: &Path) -> io::Result<()> {
         std::fs::create_dir_all(dir.join("blobs"))?;
         write_whole(&file(dir), format!("{self}\n").as_bytes())
     }
 
-    /// Looks at the place for the store in `dir`, changing nothing.
-    pub(crate) fn look(&self, dir: &Path) -> Result<Looked, BlobError> {
+    /// Connects to the location for the store in `dir` and changes nothing.
+    pub(crate) fn locate(&self, dir: &Path) -> Result<Location, BlobError> {
         Ok(match self {
-            Self::Folder(root) => Looked::Folder(root.clone()),
-            Self::Objects(url) => Looked::Objects(Arc::new(Remote::connect(url)?), dir.to_owned()),
+            Self::Folder(root) => Location::Folder(root.clone()),
+            Self::Objects(url) => Location::Objects(Arc::new(Remote::connect(url)?), dir.to_owned()),
         })
     }
 }
 
-/// A place that was looked at.
+/// A location that is not opened yet.
 #[derive(Debug)]
-pub(crate) enum Looked {
+pub(crate) enum Location {
     Folder(PathBuf),
     Objects(Arc<Remote>, PathBuf),
+    /// A backend of the caller's that has no URL.
+    Given(Arc<dyn Backend>, PathBuf),
 }
 
-impl Looked {
-    /// For reading only.
+impl Location {
+    /// Opens the blobs read-only.
     pub(crate) fn to_read(&self) -> io::Result<Arc<dyn Backend>> {
         Ok(match self {
             Self::Folder(root) => Arc::new(Folder::to_read(root)),
             Self::Objects(remote, dir) => Arc::new(Objects::to_read(Arc::clone(remote), dir)?),
+            Self::Given(blobs, _) => Arc::clone(blobs),
         })
     }
 
-    /// The file that remembers which blobs were found whole.
-    pub(crate) fn verified(&self) -> PathBuf {
+    /// Returns true if other store folders may use the same location, so that this folder's lock does not protect it.
+    pub(crate) fn is_shared(&self, dir: &Path) -> bool {
         match self {
-            Self::Folder(dir) | Self::Objects(_, dir) => dir.join("blobs/verified"),
+            Self::Folder(root) => root != dir,
+            Self::Objects(..) | Self::Given(..) => true,
         }
     }
 
-    /// Only for the holder of the store's lock.
+    /// Returns the file that records verified blobs.
+    pub(crate) fn verified(&self) -> PathBuf {
+        match self {
+            Self::Folder(dir) | Self::Objects(_, dir) | Self::Given(_, dir) => dir.join("blobs/verified"),
+        }
+    }
+
+    /// Opens the blobs for writing. Only for the holder of the store's lock.
     pub(crate) fn open(&self) -> io::Result<BlobStore> {
         match self {
             Self::Folder(root) => BlobStore::open_folder(root),
@@ -115,6 +126,7 @@ impl Looked {
                 let objects = Objects::open(Arc::clone(remote), dir)?;
                 Ok(BlobStore::remembering(Arc::new(objects), &self.verified()))
             }
+            Self::Given(blobs, _) => Ok(BlobStore::remembering(Arc::clone(blobs), &self.verified())),
         }
     }
 }

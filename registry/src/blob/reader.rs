@@ -1,7 +1,7 @@
-//! A blob read part by part, verified by the time its last part is handed out.
+//! Reads a blob part by part, verified before its last part is returned.
 
 use std::fmt;
-use std::io::Read;
+use std::io::{self, Read};
 use std::sync::Arc;
 
 use checkpoint::BlobError;
@@ -11,11 +11,11 @@ use protocol::digest::Hasher;
 use super::backend::{Backend, Stat};
 use super::known::{Finding, Findings};
 
-/// How much is read at once.
+/// Size of one read.
 pub const PART_BYTES: usize = 1 << 20;
 
-/// A blob that is being read. Every part is held back until the next one was read, and the last one until all bytes were
-/// hashed: a damaged blob is never handed out whole.
+/// A blob being read. Each part is held back until the next one was read, and the last one until all bytes were hashed.
+/// A damaged blob is therefore never returned whole.
 pub struct Reader {
     findings: Arc<Findings>,
     digest: Digest,
@@ -26,9 +26,9 @@ pub struct Reader {
 }
 
 enum State {
-    /// Bytes are hashed as they pass.
+    /// The bytes are hashed as they are read.
     Hashing(Hasher),
-    /// The blob was found whole before.
+    /// The blob was verified before.
     Verified,
     Ended,
 }
@@ -50,7 +50,7 @@ impl Reader {
         Ok(Self { findings, digest, stat, source, state: State::Hashing(Hasher::default()), held_back: None })
     }
 
-    /// Of a blob that was found whole, from byte `from` on.
+    /// Reads a verified blob from byte `from` on.
     pub(super) fn verified(
         backend: &dyn Backend,
         findings: &Arc<Findings>,
@@ -62,12 +62,13 @@ impl Reader {
         Ok(Self { findings, digest, stat, source, state: State::Verified, held_back: None })
     }
 
-    /// The blob's length.
+    /// Returns the blob's length.
     pub fn bytes(&self) -> u64 {
         self.stat.bytes
     }
 
-    /// The next bytes; `None` after the last ones. [`BlobError::Corrupt`] takes the place of the last part of a damaged blob.
+    /// Returns the next bytes, or `None` after the last ones. Returns [`BlobError::Corrupt`] instead of a damaged
+    /// blob's last part.
     pub fn next_part(&mut self) -> Result<Option<Vec<u8>>, BlobError> {
         loop {
             let hasher = match &mut self.state {
@@ -96,12 +97,17 @@ impl Reader {
     }
 }
 
-/// Up to [`PART_BYTES`]; fewer only at the end.
+/// Reads up to [`PART_BYTES`]; fewer only at the end.
 fn read_part(source: &mut (dyn Read + Send), digest: Digest) -> Result<Vec<u8>, BlobError> {
     let mut part = Vec::with_capacity(PART_BYTES);
-    source
-        .take(PART_BYTES as u64)
-        .read_to_end(&mut part)
-        .map_err(|e| BlobError::Unavailable(format!("failed to read blob {digest}: {e}")))?;
+    source.take(PART_BYTES as u64).read_to_end(&mut part).map_err(|e| read_error(digest, &e))?;
     Ok(part)
+}
+
+pub(super) fn read_error(digest: Digest, e: &io::Error) -> BlobError {
+    let message = format!("failed to read blob {digest}: {e}");
+    match e.kind() {
+        io::ErrorKind::HostUnreachable => BlobError::Unreachable(message),
+        _ => BlobError::Unavailable(message),
+    }
 }

@@ -1,5 +1,5 @@
-//! Where blobs lie while they arrive: files that have no meaning yet. Numbered ones are this process's; those with a name of 64
-//! hexadecimal digits are uploads that another process may go on with.
+//! Staging files of arriving blobs. Numbered files belong to this process. Files with a name of 64 hexadecimal digits
+//! are uploads that another process may continue.
 
 use std::collections::BTreeSet;
 use std::fs::{self, OpenOptions};
@@ -14,10 +14,10 @@ use fail::fail_point;
 use super::disk::{Disk, DiskFile, free_bytes, regular};
 use super::disk_error::error;
 
-/// Free space that a blob must leave, so that the database can still be written to.
+/// Free space that a blob must leave for the database.
 const RESERVE_BYTES: u64 = 16 << 20;
 
-/// Ends the names of our files; anything else in the folder is somebody else's.
+/// Suffix of our files; other files in the folder are foreign.
 const SUFFIX: &str = ".part";
 
 /// A folder of arriving blobs.
@@ -29,7 +29,7 @@ pub(super) struct Staging {
 }
 
 impl Staging {
-    /// Opens the folder and removes what a killed process left there. Only for the holder of the store's lock.
+    /// Opens the folder and removes the files of a killed process. Only for the holder of the store's lock.
     pub(super) fn open(dir: PathBuf, disk: Arc<dyn Disk>) -> io::Result<Self> {
         fs::create_dir_all(&dir)?;
         for entry in fs::read_dir(&dir)? {
@@ -37,18 +37,18 @@ impl Staging {
             if is_numbered(&entry) {
                 disk.remove(&entry.path())?;
             } else if uploads_name(&entry).is_none() {
-                tracing::warn!("`{}` is not the store's and is left alone", entry.path().display());
+                tracing::warn!("`{}` does not belong to the store and is left alone", entry.path().display());
             }
         }
         Ok(Self { dir, disk, next: AtomicU64::new(0) })
     }
 
-    /// For listing only.
+    /// Opens the folder for listing only.
     pub(super) fn to_read(dir: PathBuf, disk: Arc<dyn Disk>) -> Self {
         Self { dir, disk, next: AtomicU64::new(0) }
     }
 
-    /// A file for a blob of `bytes` bytes.
+    /// Creates a file for a blob of `bytes` bytes.
     pub(super) fn create(&self, bytes: u64) -> Result<Part, BlobError> {
         self.check_space(bytes)?;
         fail_point!("blob::before_write");
@@ -56,14 +56,14 @@ impl Staging {
             let path = self.path(&self.next.fetch_add(1, Ordering::Relaxed).to_string());
             match self.disk.create(&path) {
                 Ok(file) => return Ok(self.part(path, file, false)),
-                // Somebody else's folder of that name.
+                // A foreign folder has this name.
                 Err(e) if e.kind() == io::ErrorKind::AlreadyExists => {}
                 Err(e) => return Err(error("write", &path, &e)),
             }
         }
     }
 
-    /// The file of an upload, in place of what has arrived of it before.
+    /// Creates the file of an upload and replaces an earlier one.
     pub(super) fn create_as(&self, name: &str, bytes: u64) -> Result<Part, BlobError> {
         self.check_space(bytes)?;
         fail_point!("blob::before_write");
@@ -73,7 +73,7 @@ impl Staging {
         Ok(self.part(path, file, true))
     }
 
-    /// The file of an upload that was begun before, once what has arrived of it was given to `read`.
+    /// Opens the file of an earlier upload after passing its bytes to `read`.
     pub(super) fn open_as(&self, name: &str, read: &mut dyn FnMut(&[u8])) -> Result<Option<Part>, BlobError> {
         let path = self.path(name);
         let failed = |e: io::Error| error("read", &path, &e);
@@ -92,7 +92,7 @@ impl Staging {
         Ok(Some(self.part(path, file, true)))
     }
 
-    /// Removes the file of an upload; there need be none.
+    /// Removes the file of an upload if it exists.
     pub(super) fn remove(&self, name: &str) -> Result<(), BlobError> {
         let path = self.path(name);
         match self.disk.remove(&path) {
@@ -101,7 +101,7 @@ impl Staging {
         }
     }
 
-    /// Removes the files of all uploads but these.
+    /// Removes the files of all uploads except those of `names`.
     pub(super) fn remove_but(&self, names: &BTreeSet<String>) -> Result<(), BlobError> {
         let failed = |e: io::Error| error("list", &self.dir, &e);
         for entry in fs::read_dir(&self.dir).map_err(failed)? {
@@ -121,14 +121,14 @@ impl Staging {
     }
 
     fn check_space(&self, bytes: u64) -> Result<(), BlobError> {
-        let free = free_bytes(&self.dir).map_err(|e| error("ask for free space on", &self.dir, &e))?;
+        let free = free_bytes(&self.dir).map_err(|e| error("read the free space of", &self.dir, &e))?;
         if free < bytes.saturating_add(RESERVE_BYTES) {
             return Err(BlobError::Storage(full(&self.dir, bytes, free)));
         }
         Ok(())
     }
 
-    /// What lies here and is not ours.
+    /// Lists the foreign files in this folder.
     pub(super) fn strays(&self) -> io::Result<Vec<PathBuf>> {
         let entries = match fs::read_dir(&self.dir) {
             Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
@@ -139,7 +139,7 @@ impl Staging {
     }
 }
 
-/// What stands before the suffix of a file here.
+/// Returns the name of a file here without its suffix.
 fn stem(entry: &fs::DirEntry) -> Option<String> {
     let name = entry.file_name();
     let stem = name.to_str()?.strip_suffix(SUFFIX)?;
@@ -150,7 +150,7 @@ fn is_numbered(entry: &fs::DirEntry) -> bool {
     stem(entry).is_some_and(|stem| stem.parse::<u64>().is_ok())
 }
 
-/// The name of the upload whose file it is.
+/// Returns the upload's name if the file belongs to one.
 fn uploads_name(entry: &fs::DirEntry) -> Option<String> {
     stem(entry).filter(|stem| is_uploads(stem))
 }
@@ -159,7 +159,7 @@ fn is_uploads(stem: &str) -> bool {
     stem.len() == 64 && stem.bytes().all(|b| b.is_ascii_hexdigit())
 }
 
-/// A blob on its way; its file goes with it unless it was moved to its name, or somebody may go on with it.
+/// A blob being written. Dropping it deletes the file, unless the file was renamed or belongs to a resumable upload.
 #[derive(Debug)]
 pub(super) struct Part {
     pub(super) path: PathBuf,
@@ -183,7 +183,7 @@ impl Part {
 impl Drop for Part {
     fn drop(&mut self) {
         if !self.stays {
-            // The next open clears what is left.
+            // The next process that opens the store removes the file if this fails.
             let _ = self.disk.remove(&self.path);
         }
     }
@@ -191,8 +191,8 @@ impl Drop for Part {
 
 fn full(path: &Path, needed: u64, free: u64) -> String {
     format!(
-        "no space for {needed} bytes where `{}` lies: {free} bytes are free and {RESERVE_BYTES} are kept for the database; \
-         `registry gc` removes what nothing needs, on a full disk too; then run the same command again",
+        "no space for {needed} bytes in `{}`: {free} bytes are free and {RESERVE_BYTES} are reserved for the database; \
+         `registry gc` removes unneeded blobs, even on a full disk; then run the same command again",
         path.display()
     )
 }

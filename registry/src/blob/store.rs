@@ -1,22 +1,24 @@
-//! The store of blobs: verifies what is read and what is used again, stores equal bytes once, and mends what was damaged.
+//! The blob store: verifies what is read and reused, stores equal bytes once, and repairs damaged blobs.
 
 use std::collections::BTreeMap;
+use std::fmt;
 use std::path::Path;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock};
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError, RwLock};
 
 use checkpoint::{Blob, BlobError, Blobs};
 use protocol::Digest;
 use protocol::digest::Hasher;
 
-use super::backend::{Backend, Entry, Stat};
+use super::backend::{Backend, Entry, Problem, Stat};
 use super::begun::{Upload, Uploads};
 use super::fs::Folder;
 use super::holds::Holds;
 use super::known::{Finding, Findings, Known};
 use super::memory::Memory;
-use super::reader::Reader;
+use super::reader::{Reader, read_error};
+use super::seen::Seen;
 
-/// The file that remembers what held tasks have stored.
+/// File that records the blobs of held tasks.
 const HELD: &str = "held";
 
 /// Content-addressed bytes over a [`Backend`]. Clones share it.
@@ -26,33 +28,44 @@ pub struct BlobStore(Arc<Shared>);
 #[derive(Debug)]
 struct Shared {
     backend: Arc<dyn Backend>,
-    /// Held shared while a blob is touched, exclusively while one is removed: so that nobody is told that a blob is stored
-    /// which is going away.
-    removal: RwLock<()>,
-    /// Held while a damaged blob is looked at once more and put aside.
+    /// Read-locked while a blob is touched, write-locked while one is removed, so that a blob is not reported as stored
+    /// while it is being removed. One lock for all digests with the same first byte.
+    removals: [RwLock<()>; 256],
+    /// Held while a damaged blob is verified again and put aside.
     mending: Mutex<()>,
     known: Arc<Findings>,
+    seen: Seen,
     uploads: Uploads,
+    permit: OnceLock<Permit>,
+}
+
+/// Check whether a blob may be removed now.
+struct Permit(Box<dyn Fn() -> Result<(), BlobError> + Send + Sync>);
+
+impl fmt::Debug for Permit {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("Permit")
+    }
 }
 
 impl BlobStore {
-    /// Over `backend`.
+    /// Makes a store over `backend`.
     pub fn new(backend: impl Backend + 'static) -> Self {
         Self::over(Arc::new(backend))
     }
 
-    /// Over a backend that is chosen at run time.
+    /// Makes a store over a backend that is chosen at run time.
     pub fn over(backend: Arc<dyn Backend>) -> Self {
         Self::with(backend, Known::default(), Holds::default())
     }
 
-    /// Over a backend; `verified` is the file that remembers what was hashed, and beside it lies another, `held`, that remembers what
-    /// held tasks have stored. Only for the holder of the store's lock.
+    /// Makes a store over a backend with two files: `verified` records verified blobs, and `held` beside it the blobs
+    /// of held tasks. Only for the holder of the store's lock.
     pub fn remembering(backend: Arc<dyn Backend>, verified: &Path) -> Self {
         Self::with(backend, Known::read(verified), Holds::keep(&verified.with_file_name(HELD)))
     }
 
-    /// Over a backend, beside the holder of the store's lock, who remembers at `verified`.
+    /// Makes a store for reading beside the holder of the store's lock, whose files are at `verified`.
     pub fn beside(backend: Arc<dyn Backend>, verified: &Path) -> Self {
         Self::with(backend, Known::default(), Holds::of_others(&verified.with_file_name(HELD)))
     }
@@ -60,25 +73,27 @@ impl BlobStore {
     fn with(backend: Arc<dyn Backend>, known: Known, held: Holds) -> Self {
         Self(Arc::new(Shared {
             backend,
-            removal: RwLock::default(),
+            removals: std::array::from_fn(|_| RwLock::default()),
             mending: Mutex::default(),
             known: Arc::new(Findings::new(known)),
+            seen: Seen::default(),
+            permit: OnceLock::new(),
             uploads: Uploads::new(held),
         }))
     }
 
-    /// The blobs of the store in a folder. Only for the holder of the store's lock.
+    /// Opens the blobs of the store in a folder. Only for the holder of the store's lock.
     pub fn open_folder(dir: &Path) -> std::io::Result<Self> {
         let folder = Folder::open(dir)?;
         Ok(Self::remembering(Arc::new(folder), &dir.join("blobs/verified")))
     }
 
-    /// The blobs of the store in a folder, for reading only; another process may hold its lock.
+    /// Opens the blobs of the store in a folder for reading only; another process may hold its lock.
     pub fn folder_to_read(dir: &Path) -> Self {
         Self::beside(Arc::new(Folder::to_read(dir)), &dir.join("blobs/verified"))
     }
 
-    /// In memory, for tests.
+    /// Makes a store in memory for tests.
     pub fn in_memory() -> Self {
         Self::new(Memory::default())
     }
@@ -87,7 +102,7 @@ impl BlobStore {
         &*self.0.backend
     }
 
-    /// Where the bytes lie.
+    /// Returns the backend.
     pub(crate) fn place(&self) -> Arc<dyn Backend> {
         Arc::clone(&self.0.backend)
     }
@@ -96,24 +111,55 @@ impl BlobStore {
         &self.0.uploads
     }
 
+    /// Sets a check that must pass before each removal of a blob.
+    pub(crate) fn permit_removals_by(&self, permit: impl Fn() -> Result<(), BlobError> + Send + Sync + 'static) {
+        // Set once, when the store is opened.
+        let _ = self.0.permit.set(Permit(Box::new(permit)));
+    }
+
+    fn may_remove(&self) -> Result<(), BlobError> {
+        self.0.permit.get().map_or(Ok(()), |permit| (permit.0)())
+    }
+
+    pub(super) fn seen(&self) -> &Seen {
+        &self.0.seen
+    }
+
     fn known(&self) -> MutexGuard<'_, Known> {
         self.0.known.lock()
     }
 
-    pub(super) fn must_stat(&self, digest: Digest) -> Result<Stat, BlobError> {
-        self.backend().stat(digest)?.ok_or(BlobError::NotFound(digest))
+    fn removal(&self, digest: Digest) -> &RwLock<()> {
+        let byte = u8::from_str_radix(&digest.hex()[..2], 16).unwrap_or_default();
+        &self.0.removals[usize::from(byte)]
     }
 
-    /// Refuses a blob that was found damaged and was not written to since.
+    /// Returns the current problem of the backend, as seen in the last calls.
+    pub fn problem(&self) -> Option<Problem> {
+        self.backend().problem()
+    }
+
+    pub(super) fn must_stat(&self, digest: Digest) -> Result<Stat, BlobError> {
+        let stat = self.backend().stat(digest)?;
+        if stat.is_none() {
+            self.seen().forget(digest);
+        }
+        stat.ok_or(BlobError::NotFound(digest))
+    }
+
+    /// Refuses a blob that was found damaged and not written since.
     fn not_damaged(&self, digest: Digest) -> Result<Stat, BlobError> {
         let stat = self.must_stat(digest)?;
         match self.known().finding(digest, &stat.stamp) {
-            Some(Finding::Damaged(found)) => Err(BlobError::Corrupt { expected: digest, found }),
+            Some(Finding::Damaged(found)) => {
+                self.seen().forget(digest);
+                Err(BlobError::Corrupt { expected: digest, found })
+            }
             Some(Finding::Whole) | None => Ok(stat),
         }
     }
 
-    /// The bytes named `digest`, verified, in memory.
+    /// Returns the verified bytes of a blob in memory.
     pub fn get(&self, digest: Digest) -> Result<Vec<u8>, BlobError> {
         let mut reader = self.read(digest)?;
         let mut bytes = Vec::with_capacity(usize::try_from(reader.bytes()).unwrap_or_default());
@@ -123,13 +169,13 @@ impl BlobStore {
         Ok(bytes)
     }
 
-    /// The bytes named `digest` part by part, verified by the time the last part is there.
+    /// Opens a blob for reading in parts; it is verified before its last part is returned.
     pub fn read(&self, digest: Digest) -> Result<Reader, BlobError> {
         let stat = self.not_damaged(digest)?;
         Reader::new(self.backend(), &self.0.known, digest, stat)
     }
 
-    /// The bytes named `digest` from byte `from` on, once all of it is known to be whole.
+    /// Verifies a blob and opens it for reading from byte `from` on.
     pub fn read_from(&self, digest: Digest, from: u64) -> Result<Reader, BlobError> {
         let stat = self.verify(digest)?;
         if from > stat.bytes {
@@ -138,7 +184,7 @@ impl BlobStore {
         Reader::verified(self.backend(), &self.0.known, digest, stat, from)
     }
 
-    /// Makes sure that a blob is there and whole. Hashes it, unless that was done since it was last written to.
+    /// Checks that a blob exists and is whole. Hashes it unless that was done since its last write.
     pub fn verify(&self, digest: Digest) -> Result<Stat, BlobError> {
         let stat = self.not_damaged(digest)?;
         if self.known().finding(digest, &stat.stamp) != Some(Finding::Whole) {
@@ -148,19 +194,19 @@ impl BlobStore {
         Ok(stat)
     }
 
-    /// Hashes a blob whatever is known of it: a disk may lose bytes without a write.
+    /// Hashes a blob even if it was verified before: a disk may lose bytes without a write.
     pub fn check(&self, digest: Digest) -> Result<(), BlobError> {
         let mut reader = Reader::new(self.backend(), &self.0.known, digest, self.must_stat(digest)?)?;
         while reader.next_part()?.is_some() {}
         Ok(())
     }
 
-    /// Stores bytes and returns their name, once they would survive a loss of power.
+    /// Stores bytes and returns their digest when they are durable.
     pub fn put(&self, bytes: &[u8]) -> Result<Digest, BlobError> {
         self.put_pieces(&[bytes])
     }
 
-    /// Stores the bytes that `pieces` are one after the other.
+    /// Stores the concatenation of `pieces`.
     pub fn put_pieces(&self, pieces: &[&[u8]]) -> Result<Digest, BlobError> {
         let mut hasher = Hasher::default();
         pieces.iter().for_each(|piece| hasher.update(piece));
@@ -175,42 +221,47 @@ impl BlobStore {
         Ok(digest)
     }
 
-    /// Stores bytes that somebody else named, and refuses them if they are named wrongly.
+    /// Stores bytes under a given digest and refuses them if they do not hash to it.
     pub fn put_named(&self, digest: Digest, bytes: &[u8]) -> Result<(), BlobError> {
         let mut upload = self.begin(bytes.len() as u64)?;
         upload.write(bytes)?;
         self.commit(upload, digest)
     }
 
-    /// Begins to store a blob of `bytes` bytes.
+    /// Starts to store a blob of `bytes` bytes.
     pub fn begin(&self, bytes: u64) -> Result<Upload, BlobError> {
-        Ok(Upload { staged: self.backend().stage(bytes)?, hasher: Hasher::default(), written: 0, bytes })
+        Ok(Upload::new(self.backend().stage(bytes)?, bytes))
     }
 
-    /// Gives an upload the name `digest`, and refuses it if that is not what its bytes hash to. Returns once it would survive a
-    /// loss of power.
+    /// Names an upload `digest` and returns when it is durable. Refuses it if its bytes do not hash to `digest`.
     pub fn commit(&self, upload: Upload, digest: Digest) -> Result<(), BlobError> {
         let found = upload.hasher.finish();
         if found != digest {
             return Err(BlobError::Corrupt { expected: digest, found });
         }
+        let (bytes, content) = (upload.written, upload.content);
         if self.reuse(digest)? {
+            self.seen().complete(digest, content);
             return Ok(());
         }
-        // A collection that runs now removes only what was old when it began.
+        // A running collection removes only blobs that were old when it started.
         if upload.staged.commit(digest)? {
+            let _no_removal = self.removal(digest).read().unwrap_or_else(PoisonError::into_inner);
             let stat = self.must_stat(digest)?;
             self.known().set(digest, stat.stamp, Finding::Whole);
+            self.seen().note(digest, bytes);
+            self.seen().complete(digest, content);
             return Ok(());
         }
-        // Another thread was faster with the same bytes.
+        // Another thread has stored the same bytes first.
         if self.reuse(digest)? {
             return Ok(());
         }
-        Err(BlobError::Unavailable(format!("blob {digest} went away while it was stored; store it again")))
+        Err(BlobError::Unavailable(format!("blob {digest} was removed while it was being stored; store it again")))
     }
 
-    /// Uses a blob again that is there and whole, as if it had been put just now. What is damaged is put aside, to be put anew.
+    /// Reuses a blob that exists and is whole, as if it had been put now. Puts a damaged one aside, so that it can be
+    /// stored again.
     pub fn reuse(&self, digest: Digest) -> Result<bool, BlobError> {
         loop {
             let stat = match self.verify(digest) {
@@ -218,65 +269,73 @@ impl BlobStore {
                 Err(BlobError::NotFound(_)) => return Ok(false),
                 Err(BlobError::Corrupt { .. }) => {
                     let _mending = self.0.mending.lock().unwrap_or_else(PoisonError::into_inner);
-                    // Somebody else may have mended it.
+                    // Another thread may have repaired it.
                     if let Err(BlobError::Corrupt { .. }) = self.verify(digest) {
+                        self.may_remove()?;
                         self.backend().put_aside(digest)?;
                         self.known().forget(digest);
+                        self.seen().forget(digest);
                     }
                     continue;
                 }
                 Err(e) => return Err(e),
             };
-            // Not held while gigabytes are hashed: a collection would wait, and everybody who waits for it.
-            let _no_removal = self.0.removal.read().unwrap_or_else(PoisonError::into_inner);
+            // Not held while gigabytes are hashed, because a collection and its waiters would block.
+            let _no_removal = self.removal(digest).read().unwrap_or_else(PoisonError::into_inner);
             if self.backend().stat(digest)?.is_some_and(|now| now.stamp == stat.stamp) {
                 let touched = self.backend().touch(digest)?;
                 self.known().set(digest, touched.stamp, Finding::Whole);
+                self.seen().note(digest, touched.bytes);
                 return Ok(true);
             }
         }
     }
 
-    /// The length, if it is there. Does not read it.
+    /// Returns the length of a blob, or `None` if it does not exist. Does not read the blob.
     pub fn size(&self, digest: Digest) -> Result<Option<u64>, BlobError> {
         Ok(self.backend().stat(digest)?.map(|stat| stat.bytes))
     }
 
-    /// Whether it is there. Does not read it.
+    /// Returns true if the blob exists. Does not read the blob.
     pub fn exists(&self, digest: Digest) -> Result<bool, BlobError> {
         Ok(self.size(digest)?.is_some())
     }
 
-    /// A blob as a listing shows it, if it is there.
-    pub(crate) fn entry(&self, digest: Digest) -> Result<Option<Entry>, BlobError> {
-        let stat = self.backend().stat(digest)?;
-        Ok(stat.map(|stat| Entry { digest, bytes: stat.bytes, put_ms: stat.put_ms }))
+    /// Returns the length of a blob that this process has just stored or reused. Sends no request to the backend.
+    pub(crate) fn just_stored(&self, digest: Digest) -> Option<u64> {
+        self.seen().bytes(digest)
     }
 
-    /// All blobs by name.
+    /// Lists all blobs by digest.
     pub fn list(&self) -> Result<BTreeMap<Digest, Entry>, BlobError> {
         Ok(self.backend().list()?.into_iter().map(|entry| (entry.digest, entry)).collect())
     }
 
-    /// What lies among the blobs and is not the store's. It is left alone.
+    /// Lists the files among the blobs that are not the store's. They are never touched.
     pub fn strays(&self) -> Result<Vec<String>, BlobError> {
         self.backend().strays()
     }
 
-    /// Damaged blobs that were put aside.
+    /// Lists the damaged blobs that were put aside.
     pub fn aside(&self) -> Result<Vec<String>, BlobError> {
         self.backend().aside()
     }
 
-    /// Removes a blob unless it was put after `before_ms` or a held task has put it; says whether it did. One that is known
-    /// to be damaged is put aside instead.
-    pub(crate) fn remove_older(&self, digest: Digest, before_ms: i64) -> Result<bool, BlobError> {
-        let _alone = self.0.removal.write().unwrap_or_else(PoisonError::into_inner);
+    /// Removes a blob and returns it, unless its put time is `is_young` or a held task has stored it. Puts a damaged
+    /// one aside instead of deleting it.
+    pub(crate) fn remove_unless(
+        &self,
+        digest: Digest,
+        is_young: impl FnOnce(i64) -> bool,
+    ) -> Result<Option<Entry>, BlobError> {
+        let _alone = self.removal(digest).write().unwrap_or_else(PoisonError::into_inner);
         if self.held().contains(&digest) {
-            return Ok(false);
+            return Ok(None);
         }
+        self.seen().forget(digest);
         match self.backend().stat(digest)? {
-            Some(stat) if stat.put_ms < before_ms => {
+            Some(stat) if !is_young(stat.put_ms) => {
+                self.may_remove()?;
                 let damaged = self.known().is_damaged(digest);
                 if damaged {
                     self.backend().put_aside(digest)?
@@ -284,9 +343,9 @@ impl BlobStore {
                     self.backend().remove(digest)?
                 }
                 self.known().forget(digest);
-                Ok(true)
+                Ok(Some(Entry { digest, bytes: stat.bytes, put_ms: stat.put_ms }))
             }
-            _ => Ok(false),
+            _ => Ok(None),
         }
     }
 }
@@ -310,7 +369,7 @@ impl Blobs for BlobStore {
     }
 }
 
-/// A blob that was found whole.
+/// A verified blob.
 #[derive(Debug)]
 struct Opened {
     store: BlobStore,
@@ -327,7 +386,6 @@ impl Blob for Opened {
         if offset.checked_add(out.len() as u64).is_none_or(|end| end > self.bytes) {
             return Err(checkpoint::past_the_end(offset, out.len(), self.bytes));
         }
-        let failed = |e| BlobError::Unavailable(format!("failed to read blob {}: {e}", self.digest));
-        self.store.backend().read(self.digest, offset)?.read_exact(out).map_err(failed)
+        self.store.backend().read(self.digest, offset)?.read_exact(out).map_err(|e| read_error(self.digest, &e))
     }
 }

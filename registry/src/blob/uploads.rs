@@ -1,9 +1,9 @@
-//! Uploads that arrive in several requests, and what tasks that are still held have uploaded.
+//! Uploads that arrive in several requests, and the blobs that held tasks have uploaded.
 //!
-//! A cut upload keeps what has arrived: its holder asks how much that is and goes on from there, of another process that opens
-//! the store as well. What has arrived belongs to one worker's hold on one task, is in nobody else's way, and goes when the hold
-//! ends or when nothing came for [`IDLE`]. A stored blob is noted for its task until the task is let go, so that collection leaves it
-//! alone however long the row that will name it takes ([`Holds`]).
+//! An interrupted upload keeps its bytes. Its owner asks for their number and continues from there, even after another
+//! process has opened the store. The bytes belong to one worker's hold on one task and block no other upload. They are
+//! deleted when the hold ends, or after [`IDLE`] without a request. A stored blob is recorded for its task until the
+//! task is released. Collection therefore keeps it however late a row names it ([`Holds`]).
 
 use std::collections::{BTreeSet, HashMap};
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -17,34 +17,34 @@ use protocol::{Digest, TaskId};
 use super::BlobStore;
 use super::begun::{Begun, Holder, Upload};
 
-/// How long an upload may rest.
+/// Time without a request after which an upload is deleted.
 pub const IDLE: Duration = Duration::from_secs(600);
-/// How many uploads one holder may have begun.
+/// Limit of unfinished uploads of one owner.
 const PER_HOLDER: usize = 8;
 
-/// Why an upload does not go on.
+/// Reason why an upload cannot continue.
 #[derive(Debug, thiserror::Error)]
 pub enum ResumeError {
-    /// It goes on at another byte.
-    #[error("{staged} bytes of this blob have arrived; go on from there, not from {offset}")]
+    /// The upload continues at another byte.
+    #[error("{staged} bytes of this blob have arrived; continue at byte {staged}, not at {offset}")]
     Offset {
-        /// Bytes that have arrived.
+        /// Number of bytes that have arrived.
         staged: u64,
-        /// Where the request begins.
+        /// Offset of the request.
         offset: u64,
     },
-    /// Another request writes to it.
+    /// Another request writes to the upload.
     #[error("another request is uploading this blob")]
     Busy,
-    /// The holder has begun too many.
-    #[error("{0} uploads have been begun and not ended by this worker")]
+    /// The owner has too many unfinished uploads.
+    #[error("this worker has {0} unfinished uploads; finish one first")]
     TooMany(usize),
-    /// The store does not take it.
+    /// The blob store refused the bytes.
     #[error(transparent)]
     Blob(#[from] BlobError),
 }
 
-/// What an upload is called where blobs arrive: the same in every process, and nobody else's.
+/// Returns the unique name of an upload's staging file, equal in every process.
 fn name((holder, digest): &(Holder, Digest)) -> String {
     let (task, worker, incarnation) = holder;
     Digest::of(format!("{task}\n{worker}\n{incarnation}\n{digest}").as_bytes()).hex()
@@ -59,7 +59,7 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 }
 
 impl BlobStore {
-    /// How many bytes of a blob have arrived in the name of a grant.
+    /// Returns the number of bytes of a blob that have arrived for a grant.
     pub fn staged(&self, grant: &Grant, digest: Digest) -> Result<u64, BlobError> {
         let place = (holder(grant), digest);
         self.recall(&place)?;
@@ -68,8 +68,8 @@ impl BlobStore {
         Ok(upload.map_or(0, Upload::written))
     }
 
-    /// Takes up an upload of `bytes` bytes at byte `offset`; at 0 it begins, anew if need be. What has arrived when it is
-    /// dropped waits for the holder's next request.
+    /// Continues an upload of `bytes` bytes at byte `offset`; offset 0 starts it again. Dropping the returned value
+    /// keeps the bytes for the owner's next request.
     pub fn take_up(&self, grant: &Grant, digest: Digest, offset: u64, bytes: u64) -> Result<Arriving, ResumeError> {
         let arriving = |upload| Arriving {
             store: self.clone(),
@@ -108,7 +108,7 @@ impl BlobStore {
         match self.backend().stage_as(&name(&place), bytes) {
             Ok(staged) => {
                 all.insert(place, Begun { upload: None, waits: false, bytes: Some(bytes), touched: Instant::now() });
-                Ok(arriving(Upload { staged, hasher: Hasher::default(), written: 0, bytes }))
+                Ok(arriving(Upload::new(staged, bytes)))
             }
             Err(error) => {
                 self.discard(&mut all, &place);
@@ -117,12 +117,12 @@ impl BlobStore {
         }
     }
 
-    /// Takes up what has arrived of an upload and waits, or what has arrived for an earlier process if this one knows nothing of it.
+    /// Opens the staged bytes of an upload that waits, or that an earlier process began.
     fn recall(&self, place: &(Holder, Digest)) -> Result<(), BlobError> {
         if lock(&self.uploads().begun).get(place).is_some_and(|begun| !begun.waits) {
             return Ok(());
         }
-        // Hashed without the lock, which every other upload takes.
+        // Hashed without the lock that every other upload needs.
         let (mut hasher, mut written) = (Hasher::default(), 0);
         let mut read = |part: &[u8]| {
             hasher.update(part);
@@ -130,49 +130,56 @@ impl BlobStore {
         };
         let staged = self.backend().staged_as(&name(place), &mut read)?;
         let mut all = lock(&self.uploads().begun);
-        // Another request may have been as fast, and be writing to it.
+        // Another request may already be writing to it.
         if all.get(place).is_none_or(|begun| begun.waits) {
             all.remove(place);
             if let Some(staged) = staged {
-                let upload = Some(Upload { staged, hasher, written, bytes: written });
+                let upload = Some(Upload { staged, hasher, written, bytes: written, content: None });
                 all.insert(place.clone(), Begun { upload, waits: false, bytes: None, touched: Instant::now() });
             }
         }
         Ok(())
     }
 
-    /// Forgets an upload, and what has arrived of it.
+    /// Deletes an upload and its bytes.
     fn discard(&self, all: &mut HashMap<(Holder, Digest), Begun>, place: &(Holder, Digest)) {
         all.remove(place);
         if let Err(error) = self.backend().unstage(&name(place)) {
-            tracing::warn!(%error, "a part of a blob stays where blobs arrive");
+            tracing::warn!(%error, "cannot delete the staged bytes of an upload");
         }
     }
 
-    /// Notes that a held task has stored a blob, which is kept until [`Self::let_go`].
+    /// Records that a held task has stored a blob. The blob is kept until [`Self::let_go`].
     pub fn hold(&self, task: &TaskId, digest: Digest) {
         lock(&self.uploads().held).hold(task, digest);
     }
 
-    /// Keeps a blob, which need not be there yet, for as long as what is returned lives: until the row that names it is stored.
-    #[must_use = "the blob is kept only as long as this lives"]
+    /// Returns true if a held task has stored the blob.
+    pub fn has_stored(&self, task: &TaskId, digest: Digest) -> bool {
+        lock(&self.uploads().held).has(task, digest)
+    }
+
+    /// Protects a blob, which need not exist yet, until the returned value is dropped. Used until the row that names it
+    /// is stored.
+    #[must_use = "the blob is protected only while this value lives"]
     pub fn protect(&self, digest: Digest) -> Protected {
         *lock(&self.uploads().protected).entry(digest).or_default() += 1;
         Protected { store: self.clone(), digest }
     }
 
-    /// What held tasks have stored, and what is protected: roots of a collection.
+    /// Returns the blobs of held tasks and the protected ones: roots of a collection.
     pub fn held(&self) -> BTreeSet<Digest> {
         let mut held = lock(&self.uploads().held).all();
         held.extend(lock(&self.uploads().protected).keys());
         held
     }
 
-    /// Forgets what belongs to tasks that are not held any more, and uploads at which nothing came for `idle`, usually [`IDLE`].
+    /// Releases the blobs of tasks that are no longer held. Deletes uploads without a request for `idle`, usually
+    /// [`IDLE`].
     pub fn let_go(&self, idle: Duration, is_held: impl Fn(&TaskId) -> bool) {
         lock(&self.uploads().held).let_go(&is_held);
         let mut all = lock(&self.uploads().begun);
-        // One that a request writes to right now ends with that request.
+        // An upload that a request is writing to ends with that request.
         let rests = |begun: &Begun| begun.upload.is_some() || begun.waits;
         let over = |begun: &Begun, task| rests(begun) && (begun.touched.elapsed() >= idle || !is_held(task));
         let gone = all.iter().filter(|(((task, _, _), _), begun)| over(begun, task)).map(|(place, _)| place.clone());
@@ -182,15 +189,15 @@ impl BlobStore {
         if self.uploads().since.elapsed() < idle {
             return;
         }
-        // Nobody has asked for what else an earlier process has left.
+        // No request has asked for the other uploads of an earlier process.
         let known: BTreeSet<String> = all.keys().map(name).collect();
         if let Err(error) = self.backend().unstage_but(&known) {
-            tracing::warn!(%error, "parts of blobs stay where blobs arrive");
+            tracing::warn!(%error, "cannot delete the staged bytes of old uploads");
         }
     }
 }
 
-/// Keeps a blob from collection.
+/// Protects a blob from collection while it lives.
 #[derive(Debug)]
 pub struct Protected {
     store: BlobStore,
@@ -215,9 +222,9 @@ pub struct Arriving {
     store: BlobStore,
     holder: Holder,
     digest: Digest,
-    /// `None` once it has ended.
+    /// `None` after the end.
     upload: Option<Upload>,
-    /// It has ended, and its bytes are where they arrived.
+    /// True if the upload has ended but its bytes stay in the staging area.
     waits: bool,
 }
 
@@ -232,19 +239,21 @@ impl Arriving {
         written
     }
 
-    /// Bytes that have arrived.
+    /// Returns the number of bytes that have arrived.
     pub fn written(&self) -> u64 {
         self.upload.as_ref().map_or(0, Upload::written)
     }
 
-    /// Stores the blob if all of it has arrived, and notes it for its task; says whether it did. If it cannot be stored now, what has
-    /// arrived waits for the holder's next request.
+    /// Stores the blob and records it for its task; returns `false` if bytes are missing. If it cannot be stored now,
+    /// the bytes wait for the owner's next request.
     pub fn finish(mut self) -> Result<bool, BlobError> {
         let Some(upload) = self.upload.take_if(|upload| upload.is_complete()) else { return Ok(false) };
-        // Before it is there: a collection in between must not take it.
+        // Recorded before the blob exists, so that a collection in between keeps it.
         self.store.hold(&self.holder.0, self.digest);
         let stored = self.store.commit(upload, self.digest);
-        self.waits = matches!(stored, Err(BlobError::Unavailable(_) | BlobError::Storage(_)));
+        let may_be_later =
+            |e: &BlobError| matches!(e, BlobError::Unreachable(_) | BlobError::Unavailable(_) | BlobError::Storage(_));
+        self.waits = stored.as_ref().is_err_and(may_be_later);
         stored.map(|()| true)
     }
 }

@@ -1,4 +1,4 @@
-//! The model card: what a version is, in Markdown, for people who get the file and nothing else.
+//! The model card: describes a version in Markdown for readers who have only the file.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -11,7 +11,7 @@ use serde_json::Value;
 use crate::leaderboard;
 use crate::versions::Version;
 
-/// Facts of a part's meta that say what it is, by key.
+/// Keys of a part's meta that the card shows.
 const FACTS: [&str; 12] = [
     "encoder",
     "family",
@@ -27,11 +27,11 @@ const FACTS: [&str; 12] = [
     "network",
 ];
 
-/// The card of a version, whose parts' manifests are `parts`.
+/// Writes the card of a version; `parts` are the manifests of its parts.
 pub fn card(version: &Version, manifest: &Manifest, model: &Model, parts: &BTreeMap<Role, Manifest>) -> String {
     let (name, number) = (&version.model, version.version);
     let mut text = format!(
-        "# {name}, version {number}\n\nA text-to-motion model: `{}`, which draws motions of {}.\n\n\
+        "# {name}, version {number}\n\nA text-to-motion model: `{}`, which generates motions of {}.\n\n\
          | | |\n|---|---|\n| artifact | `{}` |\n| generator | `{}` |\n| data format | {} |\n",
         model.generator,
         model.format.skeleton(),
@@ -40,7 +40,7 @@ pub fn card(version: &Version, manifest: &Manifest, model: &Model, parts: &BTree
         model.format.name(),
     );
     let mut line = |arguments: std::fmt::Arguments<'_>| {
-        // Writing to a text cannot fail.
+        // Writing to a `String` cannot fail.
         let _ = text.write_fmt(arguments);
         text.push('\n');
     };
@@ -49,7 +49,7 @@ pub fn card(version: &Version, manifest: &Manifest, model: &Model, parts: &BTree
             line(format_args!("| {key} | {} |", cell(value)));
         }
     }
-    line(format_args!("\n## Parts\n\n| role | kind | bytes | what its manifest says |\n|---|---|---:|---|"));
+    line(format_args!("\n## Parts\n\n| role | kind | bytes | meta |\n|---|---|---:|---|"));
     for (role, part) in parts {
         let bytes: u64 = part.files.values().map(|file| file.bytes).sum();
         line(format_args!("| `{role}` | {} | {bytes} | {} |", part.kind.noun(), cell(&facts(&part.meta))));
@@ -66,8 +66,8 @@ pub fn card(version: &Version, manifest: &Manifest, model: &Model, parts: &BTree
     }
     line(format_args!("\n## Sampler\n"));
     match &model.sampler {
-        Some(sampler) => line(format_args!("Drawn as it was measured: {sampler}.")),
-        None => line(format_args!("Nobody has measured it; it is drawn as its papers draw.")),
+        Some(sampler) => line(format_args!("Default settings, as evaluated: {sampler}.")),
+        None => line(format_args!("Not evaluated; sampling uses the papers' settings.")),
     }
     line(format_args!("\n## Metrics\n"));
     let measured = leaderboard::measured(version);
@@ -83,23 +83,23 @@ pub fn card(version: &Version, manifest: &Manifest, model: &Model, parts: &BTree
         }
     }
     line(format_args!(
-        "\n## How to draw from it\n\n```sh\nregistry import {name}-{number}.tar.zst\n\
+        "\n## How to generate motions\n\n```sh\nregistry import {name}-{number}.tar.zst\n\
          trainer generate \"a person walks in a circle\" --model {name}@latest -o walk.bvh\n```\n\n\
-         The folder's files have the names of the manifest; weights are safetensors. {} files, {} bytes. Nothing here says under which terms \
-         the model may be used: that follows from the data that it was trained on.",
+         Exported files have the names in the manifest; weights are safetensors. {} files, {} bytes. This file grants no \
+         licence: the terms of use follow from the training data.",
         manifest.files.len(),
         manifest.files.values().map(|file| file.bytes).sum::<u64>(),
     ));
     text
 }
 
-/// What a part's meta says of it, in a line.
+/// Formats the shown keys of a part's meta in a line.
 fn facts(meta: &Value) -> String {
     let fact = |key: &&'static str| Some(format!("{key} {}", short(meta.get(*key)?)));
     FACTS.iter().filter_map(fact).collect::<Vec<_>>().join("; ")
 }
 
-/// A value without the signs of JSON.
+/// Formats a value without the syntax of JSON.
 fn short(value: &Value) -> String {
     match value {
         Value::String(text) => text.clone(),
@@ -111,7 +111,7 @@ fn short(value: &Value) -> String {
     }
 }
 
-/// A text in a cell of a table.
+/// Escapes a text for a cell of a Markdown table.
 fn cell(text: &str) -> String {
     printable(text).replace('|', "\\|").replace('\n', " ")
 }

@@ -1,20 +1,21 @@
-//! A bundle: one version of a model in one file, `*.tar.zst`, to be drawn from on another machine.
+//! A bundle: one version of a model in one file, `*.tar.zst`, for use on another machine.
 //!
 //! ```text
-//! bundle.json      first: what it is (`Head`), as JSON
+//! bundle.json      first: description (`Head`), as JSON
 //! manifest.json    second: the model's manifest, whose digest is the version's artifact
-//! card.md          for people: what it is, how it was measured, how to draw from it
-//! ROLE/...         every file of the manifest under the name that it has there, a part's manifest among them
+//! card.md          for readers: description, measurements, usage
+//! ROLE/...         every file of the manifest under its name there, the parts' manifests included
 //! ```
 //!
-//! The archive is a plain POSIX one (`ustar`): regular files only, no extensions, so that a name is at most 255 bytes and nothing but names
-//! stands between files; `tar --zstd -xf` unpacks it. Owners and times are zero, so one version always gives the same bytes. Compression is
-//! zstd with a window of at most 2^[`WINDOW_LOG`] bytes. Statistics of the data, the text encoder and how the model is drawn from are in the
-//! manifests already.
+//! The archive is plain POSIX (`ustar`) and has only regular files and no extensions, so a name has at most 255 bytes.
+//! `tar --zstd -xf` unpacks it. Owners and times are zero, so one version always gives the same bytes. Compression is
+//! zstd with a window of at most 2^[`WINDOW_LOG`] bytes. Statistics of the data, the text encoder and the sampler's
+//! settings are part of the manifests.
 //!
-//! Who reads a bundle trusts nothing in it. The manifest must have the digest that the head says, every file the length and digest that the
-//! manifest says, and parts must make the model; whatever else is there is refused, and no more is unpacked than was announced. `format`
-//! grows when an older build would misread a newer bundle; keys that only say more join without.
+//! The reader trusts nothing in a bundle. The manifest must have the digest in the head, every file the length and
+//! digest in the manifest, and the parts must form the model. Any other content is refused, and no more bytes are
+//! unpacked than announced. `format` grows when an older build would misread a newer bundle; additional keys do not
+//! raise it.
 
 mod card;
 mod import;
@@ -34,75 +35,75 @@ pub(crate) use import::origin;
 pub use read::{Sink, read};
 pub use write::{WriteError, Writer};
 
-/// The version of the format that this build writes and reads.
+/// Version of the format that this build writes and reads.
 pub const FORMAT: u32 = 1;
-/// What a bundle's file is called at its end.
+/// Suffix of a bundle's file name.
 pub const SUFFIX: &str = ".tar.zst";
-/// The largest window of the compression, as a power of two: 32 MiB, as `zstd -22` has at most by a quarter.
+/// Largest window of the compression, as a power of two: 32 MiB. `zstd -22` uses up to four times that.
 pub const WINDOW_LOG: u32 = 25;
-/// Bytes of `bundle.json`, and of `card.md`.
+/// Size limit of `bundle.json` and of `card.md`.
 pub const TEXT_BYTES: u64 = 1 << 20;
-/// Bytes of all manifests together; ours have some kilobytes.
+/// Size limit of all manifests together; ours have some kilobytes.
 pub const MANIFESTS_BYTES: u64 = 32 << 20;
-/// Files of a model.
+/// Limit of the number of files.
 pub const FILES: usize = 10_000;
 
 const HEAD: &str = "bundle.json";
 const MANIFEST: &str = "manifest.json";
 const CARD: &str = "card.md";
 
-/// What a bundle says of itself.
+/// Description of a bundle.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Head {
     /// [`FORMAT`] of the build that wrote it.
     pub format: u32,
-    /// What the model was called there.
+    /// The model's name in the exporting store.
     pub model: ModelName,
-    /// Its number there.
+    /// Version number in the exporting store.
     pub version: u64,
-    /// The model's manifest.
+    /// Digest of the model's manifest.
     pub artifact: Digest,
-    /// Metrics by name; what was no number is null.
+    /// Metrics by name; null for values that are not numbers.
     pub metrics: BTreeMap<String, Option<f64>>,
-    /// Where the version came from: run, stage, stage key, and which metric decides which version is best.
+    /// Origin of the version: run, stage, stage key, and the metric that ranks the model's versions.
     pub source: Value,
 }
 
-/// A bundle that was read and is whole.
+/// A bundle that was read and verified.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Bundle {
-    /// What it says of itself.
+    /// Its description.
     pub head: Head,
-    /// The model.
+    /// The model's manifest.
     pub manifest: Manifest,
     /// The card, if there is one.
     pub card: Option<String>,
 }
 
-/// Why a bundle is not taken.
+/// Reason why a bundle is refused.
 #[derive(Debug, thiserror::Error)]
 pub enum BundleError {
-    /// Something else.
-    #[error("it is no bundle: {0}")]
+    /// The file is not a bundle.
+    #[error("it is not a bundle: {0}")]
     NotABundle(String),
-    /// Of a later build.
-    #[error("it is a bundle of format {found}, and this build reads {FORMAT}; use a newer build")]
+    /// A later build wrote the bundle.
+    #[error("it is a bundle of format {found}, but this build reads {FORMAT}; use a newer build")]
     Newer {
-        /// Its format.
+        /// Format number of the bundle.
         found: u64,
     },
-    /// Cut, changed, or made to harm.
+    /// An entry is cut, changed or malicious.
     #[error("entry `{entry}`: {why}")]
     Entry {
         /// The entry's name in the archive, or its number.
         entry: String,
-        /// What is wrong with it.
+        /// Description of the error.
         why: String,
     },
-    /// The archive itself, or what it holds together.
+    /// The archive is damaged, or its files do not fit together.
     #[error("{0}")]
     Damaged(String),
-    /// The store does not take it.
+    /// The store refused a file.
     #[error(transparent)]
     Blob(#[from] BlobError),
 }

@@ -1,8 +1,8 @@
-//! Reads a bundle as it comes, and believes nothing of it.
+//! Reads a bundle as a stream without trusting it.
 //!
-//! Memory is bounded by the decompressor's window and by the manifests, which are bounded themselves; files go on to a [`Sink`] piece by
-//! piece. What is unpacked is bounded by what the manifest announces, of which each file is read once: a small archive that unpacks without
-//! end is left at the first byte too many.
+//! Memory is bounded by the decompressor's window and by the limit of the manifests; a [`Sink`] gets the files piece by
+//! piece. The manifest announces the unpacked size, and each of its files is read once. Reading a small archive that
+//! unpacks to endless data stops at the first byte too many.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::Read;
@@ -20,22 +20,22 @@ use zstd::stream::read::Decoder;
 
 use super::{Bundle, BundleError, CARD, FILES, FORMAT, HEAD, Head, MANIFEST, MANIFESTS_BYTES, TEXT_BYTES, WINDOW_LOG};
 
-/// Bytes that are read at a time.
+/// Bytes of one read.
 const PIECE: usize = 1 << 16;
-/// Zeros that may stand behind the archive: tar pads to records of 10 KiB.
+/// Limit of zeros after the archive; tar pads to records of 10 KiB.
 const PADDING: u64 = 1 << 16;
-/// How every zstd frame begins.
+/// First bytes of every zstd frame.
 const MAGIC: [u8; 4] = [0x28, 0xb5, 0x2f, 0xfd];
 
 type Result<T> = std::result::Result<T, BundleError>;
 
-/// Takes the files of a bundle, one after the other. `()` only has them verified.
+/// Receives the files of a bundle, one after the other. `()` only verifies them.
 pub trait Sink {
-    /// A file of `bytes` bytes begins that is said to be `digest`.
+    /// Starts a file of `bytes` bytes whose announced digest is `digest`.
     fn begin(&mut self, digest: Digest, bytes: u64) -> std::result::Result<(), BlobError>;
-    /// Its next bytes.
+    /// Appends bytes to the file.
     fn write(&mut self, piece: &[u8]) -> std::result::Result<(), BlobError>;
-    /// It is whole, and is `digest`.
+    /// Ends a file that was verified as `digest`.
     fn end(&mut self, digest: Digest) -> std::result::Result<(), BlobError>;
 }
 
@@ -53,11 +53,11 @@ impl Sink for () {
     }
 }
 
-/// Reads a whole bundle and gives its files, the manifest first, to `sink`. When it returns, every file of the manifest has been given, with
-/// the length and the digest that it has there, and the parts make the model.
+/// Reads a whole bundle and passes its files to `sink`, the manifest first. Success means that every file of the
+/// manifest was passed with the listed length and digest, and that the parts form the model.
 ///
 /// # Errors
-/// The first thing that is wrong. What the sink was given before is of no use then.
+/// Returns the first error. Files passed to the sink before it must be discarded.
 pub fn read(reader: impl Read, sink: &mut impl Sink) -> Result<Bundle> {
     let mut reader = reader;
     let mut magic = [0; 4];
@@ -71,7 +71,7 @@ pub fn read(reader: impl Read, sink: &mut impl Sink) -> Result<Bundle> {
     decoder.window_log_max(WINDOW_LOG).map_err(|e| unreadable(&e))?;
     let mut archive = Archive::new(decoder);
     let mut reading = Reading::default();
-    // Raw: extensions, which hold names of any length, come as entries of their own and are refused as such.
+    // Raw: extensions, which hold names of any length, appear as separate entries and are refused.
     for (number, entry) in archive.entries().map_err(|e| unreadable(&e))?.raw(true).enumerate() {
         let mut entry = entry.map_err(|e| reading.cut(&e))?;
         let name = name(number, &entry)?;
@@ -83,7 +83,7 @@ pub fn read(reader: impl Read, sink: &mut impl Sink) -> Result<Bundle> {
     reading.finish()
 }
 
-/// The name of an entry, which must be a regular file.
+/// Returns the name of an entry, which must be a regular file.
 fn name<R: Read>(number: usize, entry: &tar::Entry<'_, R>) -> Result<String> {
     let bytes = entry.path_bytes();
     let shown = printable(&String::from_utf8_lossy(&bytes)).into_owned();
@@ -99,35 +99,35 @@ fn name<R: Read>(number: usize, entry: &tar::Entry<'_, R>) -> Result<String> {
         }
         _ => return refuse("it is neither file nor folder; expected files only"),
     }
-    let Ok(name) = std::str::from_utf8(&bytes) else { return refuse("its name is no UTF-8 text") };
+    let Ok(name) = std::str::from_utf8(&bytes) else { return refuse("its name is not UTF-8") };
     if let Err(why) = check_name(name) {
         return refuse(why);
     }
     if number == 0 && name != HEAD {
-        return Err(BundleError::NotABundle(format!("it begins with `{shown}`; expected `{HEAD}`")));
+        return Err(BundleError::NotABundle(format!("it starts with `{shown}`; expected `{HEAD}`")));
     }
     Ok(name.to_owned())
 }
 
-/// Whether a name stays in its folder wherever it is unpacked.
+/// Checks that a name stays inside the folder on every platform.
 fn check_name(name: &str) -> std::result::Result<(), &'static str> {
     if name.is_empty() {
         return Err("it has no name");
     }
     if name.starts_with('/') || name.starts_with('\\') || name.contains(':') {
-        return Err("its name is absolute; expected one within the bundle");
+        return Err("its name is absolute; expected a path inside the bundle");
     }
     if name.split('/').any(|part| part == "..") {
         return Err("its name has `..`, which leads out of the bundle");
     }
     let normal = Path::new(name).components().all(|part| matches!(part, Component::Normal(_)));
     if !normal || name.contains('\\') || name.contains("//") || name.chars().any(char::is_control) {
-        return Err("its name is not one of a file within the bundle");
+        return Err("its name is not a plain path inside the bundle");
     }
     Ok(())
 }
 
-/// What has been read.
+/// State of a bundle being read.
 #[derive(Default)]
 struct Reading {
     head: Option<Head>,
@@ -135,7 +135,7 @@ struct Reading {
     card: Option<String>,
     /// Manifests of parts.
     parts: BTreeMap<Role, Manifest>,
-    /// Bytes of manifests that were read.
+    /// Bytes of the manifests so far.
     manifests: u64,
     seen: BTreeSet<String>,
 }
@@ -151,7 +151,7 @@ impl Reading {
     ) -> Result<()> {
         let refuse = |why: String| BundleError::Entry { entry: name.to_owned(), why };
         if !self.seen.insert(name.to_owned()) {
-            return Err(refuse("it stands twice in the bundle".into()));
+            return Err(refuse("it appears twice in the bundle".into()));
         }
         match (number, name) {
             (0, HEAD) => {
@@ -176,10 +176,10 @@ impl Reading {
                 self.manifest = Some((manifest, model));
                 Ok(())
             }
-            (1, _) => Err(refuse(format!("it stands second; expected `{MANIFEST}`"))),
+            (1, _) => Err(refuse(format!("it is the second entry; expected `{MANIFEST}`"))),
             (_, CARD) => {
                 let content = small(name, bytes, TEXT_BYTES, from)?;
-                let text = String::from_utf8(content).map_err(|_| refuse("it is no UTF-8 text".into()))?;
+                let text = String::from_utf8(content).map_err(|_| refuse("it is not UTF-8".into()))?;
                 self.card = Some(text);
                 Ok(())
             }
@@ -187,12 +187,12 @@ impl Reading {
         }
     }
 
-    /// A file of the manifest.
+    /// Reads a file of the manifest.
     fn file(&mut self, name: &str, bytes: u64, from: &mut impl Read, sink: &mut impl Sink) -> Result<()> {
         let refuse = |why: String| BundleError::Entry { entry: name.to_owned(), why };
         let known = self.manifest.as_ref().and_then(|(manifest, model)| Some((manifest.files.get(name)?, model)));
         let Some((FileEntry { digest, bytes: expected }, model)) = known else {
-            return Err(refuse(format!("`{MANIFEST}` knows no such file")));
+            return Err(refuse(format!("`{MANIFEST}` does not list it")));
         };
         if bytes != *expected {
             return Err(refuse(format!("it has {bytes} bytes, and `{MANIFEST}` says {expected}")));
@@ -214,7 +214,7 @@ impl Reading {
             let most = usize::try_from(left).unwrap_or(PIECE).min(PIECE);
             let count = from.read(&mut piece[..most]).map_err(|e| refuse(format!("it cannot be unpacked: {e}")))?;
             if count == 0 {
-                return Err(refuse(format!("it is cut: {left} of its {bytes} bytes are missing")));
+                return Err(refuse(format!("it is truncated: {left} of its {bytes} bytes are missing")));
             }
             left -= count as u64;
             hasher.update(&piece[..count]);
@@ -238,7 +238,7 @@ impl Reading {
         Ok(())
     }
 
-    /// What an archive that does not go on means.
+    /// Translates an error of the archive's next entry.
     fn cut(&self, error: &std::io::Error) -> BundleError {
         if self.seen.is_empty() {
             unreadable(error)
@@ -248,15 +248,16 @@ impl Reading {
     }
 
     fn finish(self) -> Result<Bundle> {
-        let missing = |name: &str| BundleError::Damaged(format!("the bundle has no `{name}`: it is cut, or no bundle"));
+        let missing =
+            |name: &str| BundleError::Damaged(format!("the bundle has no `{name}`: it is truncated or not a bundle"));
         let head = self.head.ok_or_else(|| missing(HEAD))?;
         let (manifest, model) = self.manifest.ok_or_else(|| missing(MANIFEST))?;
         if let Some(name) = manifest.files.keys().find(|name| !self.seen.contains(*name)) {
             return Err(missing(name));
         }
-        // Put together anew, of the parts as they say that they are.
+        // The model is assembled again from the parts' own manifests and compared.
         let whole = model::assemble(&model.generator, model.format, &self.parts);
-        let whole = whole.map_err(|e| BundleError::Damaged(format!("its parts make no model: {e}")))?;
+        let whole = whole.map_err(|e| BundleError::Damaged(format!("its parts form no model: {e}")))?;
         let made = Model::read(&whole).map_err(|e| BundleError::Damaged(e.to_string()))?;
         if whole.files != manifest.files || made.parts != model.parts {
             let why = format!("the files of `{MANIFEST}` are not those that the manifests of its parts list");
@@ -266,7 +267,7 @@ impl Reading {
     }
 }
 
-/// An entry that is read into memory.
+/// Reads a small entry into memory.
 fn small(name: &str, bytes: u64, most: u64, from: &mut impl Read) -> Result<Vec<u8>> {
     let refuse = |why: String| BundleError::Entry { entry: name.to_owned(), why };
     if bytes > most {
@@ -275,7 +276,10 @@ fn small(name: &str, bytes: u64, most: u64, from: &mut impl Read) -> Result<Vec<
     let mut content = Vec::new();
     from.take(bytes).read_to_end(&mut content).map_err(|e| refuse(format!("it cannot be unpacked: {e}")))?;
     if content.len() as u64 != bytes {
-        return Err(refuse(format!("it is cut: {} of its {bytes} bytes are missing", bytes - content.len() as u64)));
+        return Err(refuse(format!(
+            "it is truncated: {} of its {bytes} bytes are missing",
+            bytes - content.len() as u64
+        )));
     }
     Ok(content)
 }
@@ -286,14 +290,14 @@ fn head(content: &[u8]) -> Result<Head> {
         format: u64,
     }
     let malformed =
-        |e: serde_json::Error| BundleError::Entry { entry: HEAD.into(), why: format!("it does not read: {e}") };
+        |e: serde_json::Error| BundleError::Entry { entry: HEAD.into(), why: format!("it cannot be parsed: {e}") };
     let Format { format } = serde_json::from_slice(content).map_err(malformed)?;
     if format != u64::from(FORMAT) {
         return Err(BundleError::Newer { found: format });
     }
     let head: Head = serde_json::from_slice(content).map_err(malformed)?;
     if !is_name(head.model.as_str()) {
-        let why = format!("`model` is {:?}, no name of a model", printable(head.model.as_str()));
+        let why = format!("`model` is {:?}, which is not a model name", printable(head.model.as_str()));
         return Err(BundleError::Entry { entry: HEAD.into(), why });
     }
     Ok(head)
@@ -302,19 +306,19 @@ fn head(content: &[u8]) -> Result<Head> {
 fn manifest(name: &str, content: &[u8]) -> Result<Manifest> {
     let refuse = |why: String| BundleError::Entry { entry: name.to_owned(), why };
     let manifest: Manifest = serde_json::from_slice(content)
-        .map_err(|e| refuse(format!("it is not a manifest that this build reads: {e}")))?;
+        .map_err(|e| refuse(format!("this build cannot parse it as a manifest: {e}")))?;
     if manifest.format != Manifest::FORMAT {
         let (found, known) = (manifest.format, Manifest::FORMAT);
         return Err(refuse(format!("it has format {found}, and this build reads {known}; use a newer build")));
     }
-    // A blob's name is the digest of its bytes, and a part's manifest is named by that of what was read.
+    // A part's manifest is named by the digest of its canonical bytes, so other bytes are refused.
     if manifest.to_bytes() != content {
-        return Err(refuse("it is not written as manifests are, in canonical JSON".into()));
+        return Err(refuse("it is not canonical JSON".into()));
     }
     Ok(manifest)
 }
 
-/// What the model's manifest announces, before any of it is read.
+/// Checks the files that the model's manifest lists before any of them is read.
 fn check_files(manifest: &Manifest, model: &Model) -> std::result::Result<(), String> {
     if manifest.files.len() > FILES {
         return Err(format!("it lists {} files; expected at most {FILES}", manifest.files.len()));
@@ -323,7 +327,7 @@ fn check_files(manifest: &Manifest, model: &Model) -> std::result::Result<(), St
     for (name, entry) in &manifest.files {
         check_name(name).map_err(|why| format!("it lists `{}`: {why}", printable(name)))?;
         if [HEAD, MANIFEST, CARD].contains(&name.as_str()) {
-            return Err(format!("it lists `{name}`, which is a name of the bundle itself"));
+            return Err(format!("it lists `{name}`, which is reserved for the bundle"));
         }
         if entry.bytes > limits::BLOB_BYTES as u64 {
             let most = limits::BLOB_BYTES;
@@ -337,20 +341,20 @@ fn check_files(manifest: &Manifest, model: &Model) -> std::result::Result<(), St
     for (role, digest) in &model.parts {
         let name = format!("{role}/manifest.json");
         if manifest.files.get(&name).map(|entry| entry.digest) != Some(*digest) {
-            return Err(format!("its part `{role}` is {}, and it lists no `{name}` of this digest", digest.short()));
+            return Err(format!("its part `{role}` is {}, but it lists no `{name}` with this digest", digest.short()));
         }
     }
-    if manifest.kind == ArtifactKind::Model { Ok(()) } else { Err("it is of no model".into()) }
+    if manifest.kind == ArtifactKind::Model { Ok(()) } else { Err("it is not a model's manifest".into()) }
 }
 
-/// Behind the archive stand zeros, and not many.
+/// Checks that only zeros follow the archive, and not too many.
 fn check_padding(rest: impl Read) -> Result<()> {
     let mut padding = Vec::new();
     rest.take(PADDING + 1)
         .read_to_end(&mut padding)
         .map_err(|e| BundleError::Damaged(format!("its end is damaged: {e}")))?;
     if padding.len() as u64 > PADDING || padding.iter().any(|byte| *byte != 0) {
-        return Err(BundleError::Damaged("something stands behind the end of the archive".into()));
+        return Err(BundleError::Damaged("data follows the end of the archive".into()));
     }
     Ok(())
 }

@@ -1,4 +1,4 @@
-//! Writes a bundle, file after file, without knowing where they come from.
+//! Writes a bundle file by file from any source.
 
 use std::fmt;
 use std::io::{self, Write};
@@ -9,27 +9,27 @@ use zstd::stream::write::Encoder;
 
 use super::{CARD, HEAD, Head, MANIFEST};
 
-/// Compression that costs little: weights hardly shrink.
+/// A fast level: weights hardly compress.
 const LEVEL: i32 = 3;
-/// What entries of a tar archive are padded to.
+/// Alignment of entries in a tar archive.
 const BLOCK: u64 = 512;
 
-/// Why a bundle is not written.
+/// Reason why a bundle cannot be written.
 #[derive(Debug, thiserror::Error)]
 pub enum WriteError {
-    /// Where it is written to.
+    /// Writing failed.
     #[error(transparent)]
     Io(#[from] io::Error),
-    /// What is written.
+    /// The content is invalid.
     #[error("{0}")]
     Content(String),
 }
 
-/// A bundle in the making: [`begin`](Self::begin), then for each file of the manifest, in its order, [`file`](Self::file) and its bytes by
-/// [`write`](Self::write), then [`finish`](Self::finish).
+/// Writer of a bundle: [`begin`](Self::begin), then [`file`](Self::file) and [`write`](Self::write) for each file of
+/// the manifest in order, then [`finish`](Self::finish).
 pub struct Writer<W: Write> {
     encoder: Encoder<'static, W>,
-    /// The open entry's name, and its bytes that are missing.
+    /// The open entry's name, and the number of bytes that it still lacks.
     open: (String, u64),
     padding: u64,
 }
@@ -41,7 +41,7 @@ impl<W: Write> fmt::Debug for Writer<W> {
 }
 
 impl<W: Write> Writer<W> {
-    /// Begins a bundle with head, manifest and card.
+    /// Starts a bundle with head, manifest and card.
     pub fn begin(into: W, head: &Head, manifest: &Manifest, card: &str) -> Result<Self, WriteError> {
         let mut encoder = Encoder::new(into, LEVEL)?;
         encoder.include_checksum(true)?;
@@ -55,7 +55,7 @@ impl<W: Write> Writer<W> {
         Ok(writer)
     }
 
-    /// Begins a file of `bytes` bytes.
+    /// Starts a file of `bytes` bytes.
     pub fn file(&mut self, name: &str, bytes: u64) -> Result<(), WriteError> {
         self.close()?;
         let mut header = Header::new_ustar();
@@ -73,7 +73,7 @@ impl<W: Write> Writer<W> {
         Ok(())
     }
 
-    /// The next bytes of the file that was begun.
+    /// Appends bytes to the open file.
     pub fn write(&mut self, bytes: &[u8]) -> Result<(), WriteError> {
         let (name, left) = &mut self.open;
         *left = left
@@ -82,7 +82,7 @@ impl<W: Write> Writer<W> {
         Ok(self.encoder.write_all(bytes)?)
     }
 
-    /// Ends the bundle, and gives back where it was written to.
+    /// Ends the bundle and returns the inner writer.
     pub fn finish(mut self) -> Result<W, WriteError> {
         self.close()?;
         self.encoder.write_all(&[0; 2 * BLOCK as usize])?;
@@ -92,7 +92,7 @@ impl<W: Write> Writer<W> {
     fn close(&mut self) -> Result<(), WriteError> {
         let (name, left) = &self.open;
         if *left > 0 {
-            return Err(WriteError::Content(format!("file `{name}` has {left} bytes less than its manifest says")));
+            return Err(WriteError::Content(format!("file `{name}` lacks {left} of the bytes in its manifest")));
         }
         let zeros = [0; BLOCK as usize];
         let padding = usize::try_from(std::mem::take(&mut self.padding)).unwrap_or_default();

@@ -1,19 +1,22 @@
-//! What the catalog of a store is: all that is kept besides the blobs, behind two traits.
+//! The catalog of a store: all data except the blobs, behind two traits.
 //!
-//! [`Records`] answers questions from what is committed; [`Catalog`] commits. SQLite implements them (`sqlite`), and whatever
-//! else does passes the same suite, `registry/tests/catalog_conformance.rs`. What an implementation owes:
+//! [`Records`] answers queries from committed data; [`Catalog`] commits. SQLite implements them (`sqlite`). Every
+//! implementation passes the suite `registry/tests/catalog_conformance.rs` and guarantees:
 //!
-//! - **One order is all or nothing.** [`Catalog::commit`] returns once the order would survive a loss of power, or has changed
-//!   nothing. Orders that are committed together do not see each other's failures.
-//! - **Fences are checked where the write is stored**, in the same transaction (those of a [`Write`] that carries a grant).
+//! - **One order is all or nothing.** [`Catalog::commit`] returns when the order is durable, or has changed nothing.
+//!   Orders that are committed together do not see each other's failures.
+//! - **Fences are checked where the write is stored**, in the same transaction (those of a [`Write`] that carries a
+//!   grant).
 //! - **One epoch writes.** Opening for writing raises the epoch; a commit under an older one is refused with
-//!   [`WriteError::Superseded`], whichever process or machine it comes from. So exclusivity needs no lock that both can see.
-//! - **Committed transactions are counted** ([`Stored::commits`]), so that a catalog that has gone back is told from the newest.
-//! - **A row names only what is whole**: manifests are checked, and noted for a collection under way, before the row is stored.
-//! - **An answer is of one moment**, and of every commit that was acknowledged before the question.
+//!   [`WriteError::Superseded`], from any process or machine. Exclusivity therefore needs no shared lock.
+//! - **Committed transactions are counted** ([`Stored::commits`]), so that an older copy of a catalog is recognised.
+//! - **A row names only proven artifacts**: one without a [`Proof`](crate::Proof) is refused with
+//!   [`WriteError::Unproven`]. A commit sends no request to the blobs' backend. Blobs of named artifacts are recorded
+//!   for a running collection and as [present](Records::present).
+//! - **An answer is consistent**: it shows one moment, including every commit that was acknowledged before the query.
 //!
-//! Rules that no database has a say in are functions beside the types ([`crate::versions`], and `curve`): which version is
-//! the best, whether a gate holds, where a rollback goes, which attempt's values count.
+//! Rules independent of the database are functions beside the types ([`crate::versions`], and `curve`). They cover the
+//! best version, gates, the target of a rollback, and the attempt whose values count.
 
 mod rows;
 
@@ -23,12 +26,16 @@ use std::path::Path;
 use std::sync::Arc;
 
 use async_trait::async_trait;
+use protocol::message::Times;
 use protocol::stage::Keep;
-use protocol::{Alias, Digest, ModelName, RunId, StageName, TaskId};
+use protocol::{Alias, Digest, Group, ModelName, RunId, StageName, TaskId};
 
-pub use rows::{CheckpointRow, EndedRow, LineageNode, LogRow, Needs, Recovery, Root, RunRow, StageResultRow};
+pub use rows::{
+    CheckpointRow, EndedRow, HistoryQuery, HistoryRow, LineageNode, LogRow, Needs, Recovery, Root, RunRow,
+    StageResultRow, Usage,
+};
 
-use crate::curve::Curve;
+use crate::curve::{Buckets, Curve, Page, Window};
 use crate::forget::Forgotten;
 use crate::store_id::Stored;
 use crate::versions::{self, Expect, Model, ModelRef, Pick, Promotion, Version};
@@ -36,88 +43,125 @@ use crate::{QueryError, Write, WriteError};
 
 type Result<T> = std::result::Result<T, QueryError>;
 
-/// What can be asked, from what is committed.
+/// Queries on committed data.
 #[async_trait]
 pub trait Records: Debug + Send + Sync {
-    /// What the catalog says of itself; `None` if it is not one of a store.
+    /// Returns the catalog's identity and counters; `None` if it belongs to no store.
     async fn stored(&self) -> Result<Option<Stored>>;
 
-    /// What a coordinator recovers from.
+    /// Returns the data from which a coordinator recovers.
     async fn recovery(&self) -> Result<Recovery>;
 
-    /// What is kept of a run that ended; `None` while it has never ended.
+    /// Returns the stored data of an ended run; `None` if it has never ended.
     async fn ended(&self, run: &RunId) -> Result<Option<EndedRow>>;
 
-    /// The views of runs that ended, as JSON, with their runs; oldest first. Of more than `limit` the newest.
-    async fn ended_views(&self, limit: u32) -> Result<Vec<(RunId, String)>>;
+    /// Returns the views of ended runs as JSON, oldest first: the newest `limit`, or the newest `limit` submitted before a run.
+    async fn ended_views(&self, before: Option<&RunId>, limit: u32) -> Result<Vec<(RunId, String)>>;
 
-    /// Runs that ended before a time, in milliseconds since 1970; oldest first.
+    /// Returns the views of ended runs as [`Self::ended_views`] does, for one group.
+    async fn ended_views_of(&self, group: &Group, before: Option<&RunId>, limit: u32) -> Result<Vec<(RunId, String)>>;
+
+    /// Returns the groups that own the runs. Runs of the store's own user, or without an owner, are missing.
+    async fn run_owners(&self, runs: &[RunId]) -> Result<BTreeMap<RunId, Group>>;
+
+    /// Returns the groups that own all models, or one model. Models that were imported by hand are missing.
+    async fn model_owners(&self, model: Option<&ModelName>) -> Result<BTreeMap<ModelName, Group>>;
+
+    /// Returns the runs that ended before a time in milliseconds since 1970, oldest first.
     async fn ended_before(&self, before_ms: i64) -> Result<Vec<RunId>>;
 
-    /// The run and the stage under whose names a stage key's logs and metrics are stored: those that made its value, or began to.
+    /// Returns the run and stage that computed, or began to compute, each key's value. Its logs and metrics are stored
+    /// under them.
     async fn sources(&self, keys: &[Digest]) -> Result<BTreeMap<Digest, (RunId, StageName)>>;
 
-    /// What a coordinator left of a stage's value when nobody waited for it any more, as JSON.
+    /// Returns the JSON of an unfinished execution that a coordinator archived when no run needed it.
     async fn archived_execution(&self, key: Digest) -> Result<Option<String>>;
 
-    /// The values whose keys are among `keys`.
+    /// Returns the stored values for `keys`.
     async fn stage_results(&self, keys: &[Digest]) -> Result<BTreeMap<Digest, StageResultRow>>;
 
-    /// The value stored under a stage key.
+    /// Returns the value stored under a stage key.
     async fn stage_result(&self, key: Digest) -> Result<Option<StageResultRow>> {
         Ok(self.stage_results(&[key]).await?.remove(&key))
     }
 
-    /// All runs, newest first.
+    /// Returns all runs, newest first.
     async fn runs(&self) -> Result<Vec<RunRow>>;
 
-    /// One run.
+    /// Returns one run.
     async fn run(&self, run: &RunId) -> Result<Option<RunRow>>;
 
-    /// The run that was submitted with an idempotency key.
+    /// Returns the run that was submitted with an idempotency key.
     async fn run_by_key(&self, key: &str) -> Result<Option<RunRow>>;
 
-    /// A task's committed checkpoints, newest first.
+    /// Returns a task's committed checkpoints, newest first.
     async fn checkpoints(&self, task: &TaskId) -> Result<Vec<CheckpointRow>>;
 
-    /// A task's newest committed checkpoint: where the next attempt goes on.
+    /// Returns a task's newest committed checkpoint, from which the next attempt continues.
     async fn latest_checkpoint(&self, task: &TaskId) -> Result<Option<CheckpointRow>> {
         Ok(self.checkpoints(task).await?.into_iter().next())
     }
 
-    /// The shards of a run's map stages that are stored, by task.
+    /// Returns the stored shards of a run's map stages, by task.
     async fn shards(&self, run: &RunId) -> Result<BTreeMap<TaskId, Digest>>;
 
-    /// Log lines of a run, or of one stage of it, that were stored after line `after`; at most `limit`.
+    /// Returns at most `limit` log lines of a run, or of one of its stages, stored after line `after`.
     async fn logs(&self, run: &RunId, stage: Option<&StageName>, after: i64, limit: u32) -> Result<Vec<LogRow>>;
 
-    /// The current values of a stage by key; of all keys, or of `keys`; at most about `points` of each, 0 for all.
-    async fn metrics(
+    /// The newest `limit` log lines of a run, or of one stage of it, in their order.
+    async fn last_logs(&self, run: &RunId, stage: Option<&StageName>, limit: u32) -> Result<Vec<LogRow>>;
+
+    /// Returns the amounts that count against a run's limits.
+    async fn usage(&self, run: &RunId) -> Result<Usage>;
+
+    /// The points of a stage's curves by key; of all keys, or of `keys`.
+    async fn points(
         &self,
         run: &RunId,
         stage: &StageName,
         keys: Option<&[String]>,
-        points: usize,
+        page: Page,
     ) -> Result<BTreeMap<String, Curve>>;
+
+    /// The same curves in buckets.
+    async fn buckets(
+        &self,
+        run: &RunId,
+        stage: &StageName,
+        keys: Option<&[String]>,
+        window: &Window,
+    ) -> Result<BTreeMap<String, Buckets>>;
+
+    /// Returns the events, oldest first.
+    async fn timeline(&self, asked: &HistoryQuery) -> Result<Vec<HistoryRow>>;
+
+    /// The same; what happened to runs of other groups is left out.
+    async fn timeline_of(&self, group: &Group, asked: &HistoryQuery) -> Result<Vec<HistoryRow>>;
+
+    /// Returns the times of runs. Their views do not have them.
+    async fn run_times(&self, runs: &[RunId]) -> Result<BTreeMap<RunId, Times>>;
+
+    /// Returns the times of the stages that a run began.
+    async fn stage_times(&self, run: &RunId) -> Result<BTreeMap<StageName, Times>>;
 
     /// All models by name.
     async fn models(&self) -> Result<Vec<Model>>;
 
-    /// One model.
+    /// Returns one model.
     async fn model(&self, model: &ModelName) -> Result<Option<Model>>;
 
-    /// A model's versions, oldest first.
+    /// Returns a model's versions, oldest first.
     async fn versions(&self, model: &ModelName) -> Result<Vec<Version>>;
 
-    /// The version that an artifact was registered as.
+    /// Returns the model's version with this artifact.
     async fn version_of(&self, model: &ModelName, artifact: Digest) -> Result<Option<Version>> {
         Ok(self.versions(model).await?.into_iter().find(|version| version.artifact == artifact))
     }
 
-    /// The moves of a model's aliases, or of one of them, oldest first.
+    /// Returns the moves of a model's aliases, or of one alias, oldest first.
     async fn history(&self, model: &ModelName, alias: Option<&Alias>) -> Result<Vec<Promotion>>;
 
-    /// The version behind `quickstart@staging`, `quickstart@best` or `quickstart:3`.
+    /// Returns the version named by a reference such as `quickstart@staging`, `quickstart@best` or `quickstart:3`.
     async fn resolve(&self, reference: &str) -> Result<Version> {
         let reference: ModelRef = reference.parse().map_err(QueryError::Invalid)?;
         match self.model(&reference.model).await? {
@@ -126,123 +170,137 @@ pub trait Records: Debug + Send + Sync {
         }
     }
 
-    /// An artifact and all that it was made of, nearest first.
+    /// Returns an artifact and everything it was made from, nearest first.
     async fn lineage(&self, digest: Digest) -> Result<Vec<LineageNode>>;
 
-    /// What the rows need of the blobs.
+    /// Returns those of `blobs` that are known to be stored, with their lengths.
+    async fn present(&self, blobs: &[Digest]) -> Result<BTreeMap<Digest, u64>>;
+
+    /// Returns the blobs that rows need.
     async fn needs(&self) -> Result<Needs>;
 
-    /// What the database finds wrong with itself, in words. Takes as long as reading all of it.
+    /// Describes the inconsistencies that the database finds in itself. Reads all of it.
     async fn problems(&self) -> Result<Vec<String>>;
 
-    /// Writes a copy of all of it, as of one moment, to a new file; returns what that copy needs of the blobs. Writes go on
-    /// meanwhile.
+    /// Copies the database, as of one moment, to a new file and returns the blobs that the copy needs. Does not block
+    /// writes.
     async fn copy_to(&self, path: &Path) -> Result<Needs>;
 
-    /// Ends its connections.
+    /// Closes the connections.
     async fn close(&self);
 }
 
-/// What commits.
+/// Commits of orders.
 #[async_trait]
 pub trait Catalog: Debug + Send + Sync {
-    /// What can be asked of it.
+    /// Returns the queries on the catalog.
     fn records(&self) -> Arc<dyn Records>;
 
-    /// Commits an order; returns once it would survive a loss of power, or has changed nothing.
+    /// Commits an order and returns when it is durable, or has changed nothing.
     async fn commit(&self, order: Order) -> std::result::Result<Done, WriteError>;
 }
 
-/// One thing to commit.
+/// A request to commit.
 #[derive(Debug, Clone)]
 pub enum Order {
-    /// All of them or none.
+    /// All of the writes or none.
     Write(Vec<Write>),
-    /// Moves an alias forward: compares, judges the gates, moves, logs.
+    /// Moves an alias forward: compares, checks the gates, moves, logs.
     Promote(PromoteOrder),
-    /// Moves an alias back. This is a log entry itself.
+    /// Moves an alias back. This adds a log entry.
     Rollback(RollbackOrder),
-    /// Forgets a task's checkpoints but those that the policy names.
+    /// Deletes a task's checkpoints that the policy does not keep.
     PruneCheckpoints {
-        /// Whose.
+        /// The task.
         task: TaskId,
-        /// Which stay.
+        /// The policy.
         keep: Keep,
+        /// The stage's value is stored.
+        at_end: bool,
     },
-    /// Keeps an artifact whatever else points at it.
+    /// Keeps an artifact even if no row names it.
     Pin {
         /// The artifact.
         digest: Digest,
-        /// Why; `None` ends the pin.
+        /// Reason of the pin; `None` removes the pin.
         reason: Option<String>,
     },
-    /// Forgets a run that has ended.
+    /// Deletes an ended run.
     Forget(RunId),
-    /// Forgets what a run that ended before a time has left behind and nobody needs.
+    /// Deletes unreferenced data of a run that ended before a time.
     ForgetLeftovers {
-        /// The run, which stays itself.
+        /// The run; its own row stays.
         run: RunId,
-        /// In milliseconds since 1970.
+        /// The time, in milliseconds since 1970.
         before_ms: i64,
     },
-    /// Forgets the rows that a collection takes. From here on what rows come to name is noted.
+    /// Removes history from before a time, in milliseconds since 1970.
+    PruneHistory { before_ms: i64 },
+    /// Starts a collection: deletes its rows, then records the blobs that new rows name.
     BeginCollection,
+    /// Removes the record that blobs are present, except of blobs that rows have named since the collection began. From
+    /// then on no writer relies on the others.
+    Condemn(Vec<Digest>),
 }
 
-/// A promotion to be made.
+/// A promotion to commit.
 #[derive(Debug, Clone)]
 pub struct PromoteOrder {
     pub model: ModelName,
-    /// The alias that moves.
+    /// The alias to move.
     pub alias: Alias,
-    /// Where to.
+    /// The version to move it to.
     pub to: Which,
-    /// Where the alias must be now, if the caller minds.
+    /// Expected current version of the alias, if the caller gives one.
     pub expect: Option<Expect>,
     /// Gates as written.
     pub require: Vec<String>,
-    /// Why.
+    /// Reason for the log.
     pub reason: String,
-    /// Who.
+    /// Name of the caller.
     pub actor: String,
 }
 
-/// A rollback to be made.
+/// A rollback to commit.
 #[derive(Debug, Clone)]
 pub struct RollbackOrder {
     pub model: ModelName,
-    /// The alias that moves.
+    /// The alias to move.
     pub alias: Alias,
-    /// Where to; `None` is the version before its last promotion.
+    /// The target version; `None` means the version before the last promotion.
     pub to: Option<u64>,
-    /// Where the alias must be now, if the caller minds.
+    /// Expected current version of the alias, if the caller gives one.
     pub expect: Option<Expect>,
-    /// Why.
+    /// Reason for the log.
     pub reason: String,
-    /// Who.
+    /// Name of the caller.
     pub actor: String,
 }
 
-/// Which version is to be promoted.
+/// Choice of the version to promote.
 #[derive(Debug, Clone)]
 pub enum Which {
-    /// The one that an artifact was registered as.
+    /// The version with this artifact.
     Artifact(Digest),
-    /// By its name.
+    /// A version by number or alias.
     Pick(Pick),
 }
 
-/// What an order gives.
+/// Result of a committed order.
 #[derive(Debug)]
 pub enum Done {
-    /// It is stored.
+    /// The order is stored.
     Nothing,
-    /// Of a promotion or a rollback: the log entry.
+    /// The log entry of a promotion or rollback.
     Promoted(Box<Promotion>),
-    /// Of pruning: the manifests that were forgotten.
+    /// The manifests of pruned checkpoints.
     Pruned(Vec<Digest>),
-    /// Of a collection's beginning: the tasks whose shards were forgotten.
+    /// Of pruning history: the number of rows that went.
+    PrunedHistory(u64),
+    /// The tasks whose shards the start of a collection deleted.
     Begun(Vec<TaskId>),
-    /// Of forgetting: what went.
+    /// The condemned blobs, without the ones named by a row.
+    Condemned(Vec<Digest>),
+    /// The rows that forgetting a run deleted.
     Forgotten(Forgotten),
 }

@@ -1,4 +1,4 @@
-//! What a catalog answers with.
+//! Rows that a catalog returns.
 
 use std::collections::{BTreeMap, HashMap};
 
@@ -6,10 +6,11 @@ use protocol::{Attempt, Digest, RunId, StageName, TaskId, WorkerId};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
-/// A run as stored.
+use crate::history::HistoryEntry;
+
+/// A stored run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct RunRow {
-    /// Which.
     pub run: RunId,
     /// The validated pipeline.
     pub pipeline: Value,
@@ -17,51 +18,77 @@ pub struct RunRow {
     pub source: String,
     /// `running`, `paused`, `finished`, `failed`, `cancelled`.
     pub state: String,
-    /// Unique when given.
+    /// Unique if given.
     pub idempotency_key: Option<String>,
-    /// When it was submitted, in milliseconds since 1970.
+    /// Time of submission, in milliseconds since 1970.
     pub created_ms: i64,
-    /// When it last changed, in milliseconds since 1970.
+    /// Time of the last change, in milliseconds since 1970.
     pub updated_ms: i64,
 }
 
-/// What a coordinator recovers from, each with the number of its decision.
+/// Data from which a coordinator recovers, with decision numbers.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Recovery {
-    /// The newest snapshot.
+    /// The newest snapshot, with its number.
     pub snapshot: Option<(u64, String)>,
-    /// Facts, oldest first; those after the snapshot count.
+    /// Parts of the snapshot by name.
+    pub parts: BTreeMap<String, String>,
+    /// Facts with their numbers, oldest first; only those after the snapshot apply.
     pub facts: Vec<(u64, String)>,
 }
 
-/// What is kept of a run that ended. What each says is the coordinator's business; see [`Write::RunEnded`](crate::Write::RunEnded).
+/// A part of the history.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct HistoryQuery {
+    /// Only what happened to this run, and to this worker.
+    pub run: Option<RunId>,
+    pub worker: Option<WorkerId>,
+    /// The row after which it begins.
+    pub after: i64,
+    /// The time from which on, in milliseconds since 1970.
+    pub since_ms: Option<i64>,
+    pub limit: u32,
+}
+
+/// An event as stored.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct HistoryRow {
+    /// Grows from row to row.
+    pub id: i64,
+    /// In milliseconds since 1970.
+    pub at_ms: i64,
+    #[serde(flatten)]
+    pub entry: HistoryEntry,
+}
+
+/// Stored data of an ended run. Only the coordinator interprets it; see [`Write::RunEnded`](crate::Write::RunEnded).
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct EndedRow {
     /// The run as clients see it.
     pub view: String,
-    /// The run as the coordinator takes it up again.
+    /// The run as the coordinator resumes it.
     pub archive: String,
 }
 
-/// A stage's value.
+/// The value of a stage.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct StageResultRow {
     /// The stage's key.
     pub key: Digest,
-    /// Which run made it.
+    /// The run that computed it.
     pub run: RunId,
-    /// Which stage.
+    /// The stage that computed it.
     pub stage: StageName,
     pub kind: String,
     /// Outputs by name.
     pub outputs: BTreeMap<String, Digest>,
-    /// Final values.
+    /// Final metrics by name.
     pub metrics: BTreeMap<String, f64>,
-    /// What it was made of.
+    /// Digests of the inputs by name.
     pub inputs: BTreeMap<String, Digest>,
-    /// Seconds of work.
+    /// Working time in seconds.
     pub wall_s: f64,
-    /// When, in milliseconds since 1970.
+    /// Time of the commit, in milliseconds since 1970.
     pub at_ms: i64,
 }
 
@@ -69,76 +96,82 @@ pub struct StageResultRow {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct CheckpointRow {
     pub task: TaskId,
-    /// Which attempt saved it.
+    /// The attempt that saved it.
     pub attempt: Attempt,
-    /// Steps applied.
+    /// Number of applied steps.
     pub step: u64,
     pub manifest: Digest,
-    /// Values that retention may rank by.
+    /// Values by which retention may rank checkpoints.
     pub metrics: BTreeMap<String, f64>,
-    /// When, in milliseconds since 1970.
+    /// Time of the commit, in milliseconds since 1970.
     pub at_ms: i64,
 }
 
-/// A log line.
+/// The amounts that a run has ever stored, including those that were deleted since.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Usage {
+    /// Bytes of log lines.
+    pub log_bytes: u64,
+    /// Number of values by step.
+    pub values: u64,
+}
+
+/// A stored log line.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct LogRow {
-    /// Grows; ask for what comes after the last one seen.
+    /// Increasing number; a reader continues after the last one it has seen.
     pub id: i64,
     pub task: TaskId,
-    /// The try.
     pub attempt: Attempt,
-    /// Who wrote it.
+    /// The worker that wrote it.
     pub worker: WorkerId,
-    /// Its number within attempt and worker.
+    /// Line number within attempt and worker.
     pub line: u64,
-    /// When it was stored, in milliseconds since 1970.
+    /// Time of storing, in milliseconds since 1970.
     pub at_ms: i64,
-    /// The line.
     pub text: String,
 }
 
-/// An artifact and what it was made of.
+/// An artifact with the artifacts it was made from.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct LineageNode {
-    /// The artifact.
     pub digest: Digest,
-    /// Its kind, if a stage made it.
+    /// Kind of the artifact, if a stage made it.
     pub kind: Option<String>,
     /// The run that made it.
     pub run: Option<String>,
     /// The stage that made it.
     pub stage: Option<String>,
-    /// Its stage's key.
+    /// Key of that stage.
     pub key: Option<String>,
-    /// Bytes of its files.
+    /// Total bytes of its files.
     pub bytes: Option<u64>,
-    /// What it was made of, by the field that named it.
+    /// Artifacts it was made from, by the field that named them.
     pub inputs: BTreeMap<String, Digest>,
-    /// How many steps from the artifact asked for.
+    /// Distance from the requested artifact.
     pub depth: u32,
 }
 
-/// A digest that a row names, so that it must be whole.
+/// A digest that a row names and whose blobs must be whole.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Root {
-    /// The manifest.
+    /// Digest of the manifest.
     pub digest: Digest,
-    /// The row in words.
+    /// Description of the row.
     pub what: String,
     /// The task, if the row is a shard.
     pub shard: Option<TaskId>,
 }
 
-/// What the rows need of the blobs, as of one moment.
+/// Blobs that the rows need, as of one moment.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Needs {
-    /// What rows name.
+    /// Artifacts that rows name.
     pub roots: Vec<Root>,
-    /// What each artifact was made of.
+    /// Artifacts that each artifact was made from.
     pub parents: HashMap<Digest, Vec<Digest>>,
-    /// Shards that a collection forgets, by task: the artifact of their finished stage stands for them.
+    /// Tasks whose shards a collection deletes, because the artifact of their finished stage replaces them.
     pub done_shards: Vec<TaskId>,
-    /// Whether a run is under way.
+    /// True while a run is under way.
     pub live: bool,
 }

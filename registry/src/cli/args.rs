@@ -1,4 +1,4 @@
-//! The command line: what users type, turned into a [`Command`].
+//! The command line, parsed into a [`Command`].
 
 use std::path::PathBuf;
 use std::str::FromStr;
@@ -13,28 +13,28 @@ use crate::bundle::SUFFIX;
 use crate::leaderboard::Style;
 use crate::versions::Expect;
 
-/// How answers are printed.
+/// Output format of answers.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, ValueEnum)]
 pub enum Output {
-    /// For people.
+    /// Tables for people
     #[default]
     Table,
-    /// For programs: one object on stdout; errors as one object on stderr.
+    /// One JSON object on stdout; errors as one object on stderr
     Json,
 }
 
-/// In whose files weights are written.
+/// File layout of exported weights.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum LayoutName {
-    /// A file of MLD's and MotionLCM's: VAE, denoiser, control parts under `state_dict`
+    /// One file of MLD and MotionLCM: VAE, denoiser, control parts under `state_dict`
     Motionlcm,
     /// Three files: tokenizer, masked and residual transformer
     Momask,
     /// Two files: tokenizer and transformer
     T2mgpt,
-    /// A file: the network
+    /// One file: the network
     Mdm,
-    /// One safetensors file of any model, each part's names behind its role
+    /// One safetensors file of any model, with the role before each name
     Safetensors,
 }
 
@@ -50,15 +50,15 @@ impl From<LayoutName> for Layout {
     }
 }
 
-/// What stands behind `-o`: how the answer is printed, or where `export` writes a bundle.
+/// Value of `-o`: an output format, or for `export` a bundle's file.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub enum OutputArg {
-    /// As [`Output::Table`].
+    /// Same as [`Output::Table`].
     #[default]
     Table,
-    /// As [`Output::Json`].
+    /// Same as [`Output::Json`].
     Json,
-    /// A bundle's file.
+    /// The path of a bundle.
     Bundle(PathBuf),
 }
 
@@ -76,7 +76,7 @@ impl FromStr for OutputArg {
 }
 
 impl OutputArg {
-    /// How the answer is printed, and the bundle's file.
+    /// Returns the output format and the bundle's file.
     pub(super) fn split(self) -> (Output, Option<PathBuf>) {
         match self {
             Self::Table => (Output::Table, None),
@@ -96,7 +96,7 @@ pub enum Verb {
         /// MODEL, MODEL@ALIAS, MODEL@best or MODEL:VERSION
         model: String,
     },
-    /// Shows who moved an alias, when, why, from where and to where
+    /// Shows the moves of a model's aliases: who, when, why, from and to which version
     History {
         /// The model
         model: String,
@@ -117,7 +117,7 @@ pub enum Verb {
         /// A gate such as 'latent_fid<=0.2' or 'latent_fid <= staging - 0.01'; may be repeated
         #[arg(long, value_name = "GATE")]
         require: Vec<String>,
-        /// Why, for the log
+        /// Reason for the log
         #[arg(long)]
         reason: String,
     },
@@ -128,150 +128,157 @@ pub enum Verb {
         /// The alias to move
         #[arg(long)]
         alias: String,
-        /// To this version instead
+        /// Move to this version instead
         #[arg(long, value_name = "VERSION")]
         to: Option<u64>,
         /// Refuse unless the alias points at this version now
         #[arg(long, value_name = "VERSION")]
         expect: Option<Expect>,
-        /// Why, for the log
+        /// Reason for the log
         #[arg(long, default_value = "rollback")]
         reason: String,
     },
-    /// Compares two versions metric by metric, and says which differences are beyond noise
+    /// Compares two versions metric by metric and marks differences beyond noise
     Compare {
         /// MODEL (its best version), MODEL@ALIAS or MODEL:VERSION
         left: String,
-        /// Likewise
+        /// The other version, in the same form
         right: String,
-        /// How the table is written
+        /// Format of the table
         #[arg(long, value_enum, default_value_t)]
         style: Style,
     },
-    /// Shows every version's metrics in the papers' order, beside the papers' own
+    /// Shows the metrics of every version in the papers' order, with the papers' rows
     Leaderboard {
         /// A model, or `humanml3d` or `kit` for all models of that data format
         of: String,
-        /// Leave the papers' rows out
+        /// Leave out the papers' rows
         #[arg(long)]
         no_published: bool,
-        /// How the table is written: `markdown` and `latex` give rows to paste
+        /// Format of the table: `markdown` and `latex` give rows to paste
         #[arg(long, value_enum, default_value_t)]
         style: Style,
     },
-    /// Shows what a version or an artifact was made of
+    /// Shows the artifacts that a version or an artifact was made from
     Lineage {
         /// A model version or a digest
         artifact: String,
     },
-    /// Hashes every blob again and follows every reference
+    /// Shows the audit log of a server: who called what, from where, with what result; needs the scope `admin`
+    Audit {
+        /// Number of newest lines to show
+        #[arg(long, value_name = "LINES", default_value_t = 100)]
+        limit: usize,
+    },
+    /// Hashes every blob again and checks every reference
     Fsck,
-    /// Removes blobs that nothing needs
+    /// Removes blobs that are no longer needed
     Gc {
-        /// Only show what would be removed
+        /// Only show the blobs that would be removed
         #[arg(long)]
         dry_run: bool,
-        /// Keep blobs that were stored in the last so many minutes
+        /// Keep blobs that were stored in the last MINUTES minutes
         #[arg(long, value_name = "MINUTES", default_value_t = 60)]
         grace: u32,
     },
-    /// Goes on with what is left of a store whose blobs are missing or were moved, or whose database has gone back
+    /// Repairs a store whose blobs are missing or were moved, or whose database is older than its blobs
     Adopt {
-        /// Where the blobs are now: a folder, s3://BUCKET/PREFIX, gs://BUCKET/PREFIX or az://CONTAINER/PREFIX
+        /// New location of the blobs: a folder, s3://BUCKET/PREFIX, gs://BUCKET/PREFIX or az://CONTAINER/PREFIX
         #[arg(long, value_name = "PLACE")]
         blobs: Option<Place>,
     },
-    /// Forgets runs that have ended, but not what models are made of or other runs need; `gc` then frees the space
+    /// Deletes ended runs, except data that models or other runs need; `gc` then frees the space
     Forget {
         /// The run
         #[arg(required_unless_present_any = ["ended_before", "leftovers_before"])]
         run: Option<String>,
-        /// All runs that ended longer ago than this, such as `30d`, `12h` or `90m`
+        /// All runs that ended longer ago than AGE, such as `30d`, `12h` or `90m`
         #[arg(long, value_name = "AGE", value_parser = age, conflicts_with = "run")]
         ended_before: Option<i64>,
-        /// Of all runs that ended longer ago than this only what nobody needs to look at them: trials of sweeps that are not the
-        /// best, and checkpoints of stages that were never finished. To resume such a run is to compute that anew
+        /// Only leftovers of runs that ended longer ago than AGE: sweep trials other than the best, and checkpoints of
+        /// unfinished stages. Resuming such a run computes them again
         #[arg(long, value_name = "AGE", value_parser = age, conflicts_with_all = ["run", "ended_before"])]
         leftovers_before: Option<i64>,
     },
-    /// Makes or renews a backup of the store in a folder of this machine, while runs go on
+    /// Makes or renews a backup of the store in a folder of this machine; runs continue meanwhile
     Backup {
         /// The folder: empty, missing, or an older backup of this store
         dir: PathBuf,
     },
-    /// Makes a store of a backup, once all of it was verified
+    /// Restores a store from a backup after verifying all of it
     Restore {
         /// The backup's folder
         backup: PathBuf,
         /// The store's folder; it must be empty or missing
         #[arg(long, value_name = "DIR")]
         to: PathBuf,
-        /// Where its blobs are to lie, instead of in that folder: another one, s3://BUCKET/PREFIX, gs://BUCKET/PREFIX or
-        /// az://CONTAINER/PREFIX. They may be there already
+        /// Location of the blobs, instead of that folder: another folder, s3://BUCKET/PREFIX, gs://BUCKET/PREFIX or
+        /// az://CONTAINER/PREFIX. Blobs that are already there are kept
         #[arg(long, value_name = "PLACE")]
         blobs: Option<Place>,
     },
-    /// Copies a version's files to a folder, or to one file that `import` reads on another machine
+    /// Copies a version's files to a folder, or to one file for `import` on another machine
     Export {
         /// MODEL@ALIAS, MODEL@best or MODEL:VERSION
         model: String,
-        /// The folder, which must be empty or missing; or with `-o`, a bundle's file, FILE.tar.zst
+        /// The folder, which must be empty or missing; or with `-o` a bundle's file, FILE.tar.zst
         dir: Option<PathBuf>,
-        /// The weights alone, in the files and under the names of the code that published such models; of a layout of one file, `DIR` is the file, which must be missing
+        /// Export only the weights, in the files and names of the code that published such models. For a layout with
+        /// one file, DIR is that file and must not exist
         #[arg(long, value_enum)]
         layout: Option<LayoutName>,
     },
     /// Registers the version in a bundle's file that `export -o FILE.tar.zst` wrote
     Import {
-        /// The bundle
+        /// The bundle's file
         file: PathBuf,
-        /// Register it as a version of this model instead of what it was called there
+        /// Register it as a version of this model instead of its original name
         #[arg(long, value_name = "NAME")]
         model: Option<String>,
     },
 }
 
-/// What a verb comes to.
+/// Operation that a verb requests.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) enum Asked {
+pub(super) enum Operation {
     /// A command for the holder of the store.
     Command(Command),
-    /// Something that ends in this machine's files.
+    /// Writes files on this machine.
     Export { model: String, dir: PathBuf, layout: Option<Layout> },
-    /// Likewise, in one file.
+    /// Writes one file on this machine.
     Bundle { model: String, file: PathBuf },
-    /// A file of this machine, into a store that need not be there yet.
+    /// Imports a file of this machine into a store, which is created if missing.
     Import { file: PathBuf, model: Option<String> },
-    /// Likewise, and only of a store whose folder this machine has.
+    /// Needs the store's folder on this machine.
     Backup { dir: PathBuf },
-    /// Likewise, of no store yet.
+    /// Creates a store from a backup on this machine.
     Restore { backup: PathBuf, to: PathBuf, blobs: Option<Place> },
-    /// Only of a store that no process holds.
+    /// Needs a store that no process holds.
     Adopt { blobs: Option<Place> },
 }
 
 impl Verb {
-    /// What is asked, and whether it is of the store's holder alone.
+    /// Returns the requested operation; `file` is the bundle's file of `-o`.
     ///
     /// # Errors
-    /// What `file` behind `-o` has to do with it, if that is nothing.
-    pub(super) fn asks(self, file: Option<PathBuf>) -> Result<Asked, String> {
+    /// Describes the conflict if the verb cannot use `file`.
+    pub(super) fn operation(self, file: Option<PathBuf>) -> Result<Operation, String> {
         let is_bundle = |path: &PathBuf| path.to_string_lossy().ends_with(SUFFIX);
         match (&self, file) {
             (Self::Export { layout: Some(_), .. }, Some(_)) => {
-                return Err("a bundle holds the whole version; name a layout, or a bundle's file".into());
+                return Err("a bundle holds the whole version; use a layout or a bundle's file, not both".into());
             }
             (Self::Export { model, dir: None, .. }, Some(file)) => {
-                return Ok(Asked::Bundle { model: model.clone(), file });
+                return Ok(Operation::Bundle { model: model.clone(), file });
             }
             (Self::Export { dir: Some(_), .. }, Some(_)) => {
-                return Err("a folder and a bundle's file are named; name one of them".into());
+                return Err("both a folder and a bundle's file are given; use one of them".into());
             }
             (Self::Export { dir: None, .. }, None) => {
                 return Err(format!("`export` writes to a folder, or with `-o FILE{SUFFIX}` to one file; name one"));
             }
             (Self::Export { model, dir: Some(file), layout: None }, None) if is_bundle(file) => {
-                return Ok(Asked::Bundle { model: model.clone(), file: file.clone() });
+                return Ok(Operation::Bundle { model: model.clone(), file: file.clone() });
             }
             (_, Some(file)) => {
                 return Err(format!("`-o {}` is for `export`; expected `table` or `json`", file.display()));
@@ -281,9 +288,9 @@ impl Verb {
         Ok(self.other())
     }
 
-    /// What is asked by a verb that writes no bundle.
-    fn other(self) -> Asked {
-        Asked::Command(match self {
+    /// Returns the operation of a verb that writes no bundle.
+    fn other(self) -> Operation {
+        Operation::Command(match self {
             Self::List => Command::List,
             Self::Show { model } => Command::Show { reference: model },
             Self::History { model, alias } => Command::History { model, alias },
@@ -298,6 +305,7 @@ impl Verb {
                 Command::Leaderboard { of, published: !no_published, style }
             }
             Self::Lineage { artifact } => Command::Lineage { reference: artifact },
+            Self::Audit { limit } => Command::Audit { limit },
             Self::Fsck => Command::Fsck,
             Self::Gc { dry_run, grace } => Command::Gc { dry_run, grace_minutes: Some(grace) },
             Self::Forget { run: Some(run), .. } => Command::Forget { run },
@@ -308,22 +316,24 @@ impl Verb {
                 let age_ms = ended_before.unwrap_or(i64::MAX);
                 Command::ForgetEnded { before_ms: crate::clock::now_ms().saturating_sub(age_ms) }
             }
-            Self::Backup { dir } => return Asked::Backup { dir },
-            Self::Restore { backup, to, blobs } => return Asked::Restore { backup, to, blobs },
-            Self::Adopt { blobs } => return Asked::Adopt { blobs },
+            Self::Backup { dir } => return Operation::Backup { dir },
+            Self::Restore { backup, to, blobs } => return Operation::Restore { backup, to, blobs },
+            Self::Adopt { blobs } => return Operation::Adopt { blobs },
             Self::Export { model, dir, layout } => {
                 let (dir, layout) = (dir.unwrap_or_default(), layout.map(Layout::from));
-                return Asked::Export { model, dir, layout };
+                return Operation::Export { model, dir, layout };
             }
-            Self::Import { file, model } => return Asked::Import { file, model },
+            Self::Import { file, model } => return Operation::Import { file, model },
         })
     }
 }
 
-/// A time as people write it, in milliseconds.
+/// Parses an age such as `30d` into milliseconds.
 fn age(text: &str) -> Result<i64, String> {
     let wrong = || {
-        format!("`{text}` is no age: expected a whole number of days, hours or minutes, such as `30d`, `12h` or `90m`")
+        format!(
+            "`{text}` is not an age: expected a whole number of days, hours or minutes, such as `30d`, `12h` or `90m`"
+        )
     };
     let unit = match text.chars().last() {
         Some('d') => 24 * 60 * 60 * 1000,

@@ -1,4 +1,4 @@
-//! `registry export -o FILE.tar.zst` and `registry import`: a version on its way out of a store in one file, and into another one.
+//! `registry export -o FILE.tar.zst` and `registry import`: a version as one file out of a store and into another.
 
 use std::collections::BTreeMap;
 use std::fs::{self, File};
@@ -8,24 +8,24 @@ use std::path::{Path, PathBuf};
 use checkpoint::model::Model;
 use protocol::artifact::Role;
 use protocol::message::ApiError;
-use protocol::{Manifest, ModelName};
+use protocol::{Manifest, ModelName, Owner};
 
 use super::export::{Source, whole};
 use super::{Answer, Data, error};
 use crate::bundle::{self, BundleError, Head, ImportError, Writer};
 use crate::{Store, Version};
 
-/// Writes a version to `file`, which must not exist; returns the names of the model's files. A file that is not whole is never there
-/// under its name.
+/// Writes a version to `file`, which must not exist, and returns the names of the model's files. The file appears under
+/// its name only when it is complete.
 pub(super) async fn export(source: &impl Source, version: &Version, file: &Path) -> Result<Vec<String>, ApiError> {
     let refuse = |why: &str| {
-        let hint = "name a file that does not exist, in a folder that does";
+        let hint = "name a new file in an existing folder";
         error("invalid", format!("`{}` {why}", file.display()), Some(hint))
     };
     if fs::symlink_metadata(file).is_ok() {
         return Err(refuse("exists already"));
     }
-    let Some(name) = file.file_name() else { return Err(refuse("is no name of a file")) };
+    let Some(name) = file.file_name() else { return Err(refuse("is not a file name")) };
     let part = file.with_file_name(format!(".{}.{}.part", name.to_string_lossy(), std::process::id()));
     let unwritten = |e: &io::Error| error("storage", format!("failed to write `{}`: {e}", part.display()), None);
     let part = Part(part.clone());
@@ -35,12 +35,12 @@ pub(super) async fn export(source: &impl Source, version: &Version, file: &Path)
     Ok(names)
 }
 
-/// A file in the making, which goes with this unless it got its name before.
+/// An unfinished file. Dropping it deletes the file unless it was renamed before.
 struct Part(PathBuf);
 
 impl Drop for Part {
     fn drop(&mut self) {
-        // It has its name, or there is nobody to tell.
+        // Fails if the file was renamed; no caller can use the error.
         let _ = fs::remove_file(&self.0);
     }
 }
@@ -81,7 +81,7 @@ async fn write(source: &impl Source, version: &Version, file: File) -> Result<Ve
     Ok(manifest.files.into_keys().collect())
 }
 
-/// A manifest, whose bytes are those that its digest names.
+/// Reads a manifest and verifies its digest.
 async fn read(source: &impl Source, digest: protocol::Digest) -> Result<Manifest, ApiError> {
     let mut bytes = Vec::new();
     let mut keep = |piece: &[u8]| {
@@ -95,14 +95,14 @@ async fn read(source: &impl Source, digest: protocol::Digest) -> Result<Manifest
     serde_json::from_slice(&bytes).map_err(|e| error("damaged", e, Some("`registry fsck` checks the store")))
 }
 
-/// Registers what a bundle's file holds in a store that this process holds, as `model` or as it was called there. Messages call the file
-/// `shown`.
-pub async fn import(store: &Store, file: &Path, shown: &str, model: Option<&str>) -> Answer {
+/// Registers the version in a bundle's file for `owner`, under `model` or its original name. This process holds the
+/// store. Messages call the file `shown`.
+pub async fn import(store: &Store, file: &Path, shown: &str, model: Option<&str>, owner: Owner) -> Answer {
     let model = match model.map(str::parse::<ModelName>).transpose() {
         Ok(model) => model,
         Err(e) => return Answer::refused(error("invalid", e, Some("`--model NAME` gives it another name"))),
     };
-    match store.import_bundle(file, model).await {
+    match store.import_bundle_of(file, model, owner).await {
         Ok(version) => Answer::done(Data::Imported { version, file: shown.to_owned() }),
         Err(ImportError::Write(e)) => Answer::from(e),
         Err(ImportError::Query(e)) => Answer::from(e),

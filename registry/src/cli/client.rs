@@ -1,5 +1,5 @@
-//! Runs a command where it can be run: at the server that is named, here if it only reads or nobody holds the store, else at
-//! the holder.
+//! Chooses where a command runs. A given server runs it. Otherwise this process does if the command only reads or the
+//! store is free; else the store's holder does.
 
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -7,52 +7,52 @@ use std::time::{Duration, Instant};
 use access::{ConnectError, Server, ServerOptions, explain};
 use checkpoint::published::Layout;
 use protocol::message::ApiError;
-use protocol::{Digest, ModelName};
+use protocol::{Digest, ModelName, Owner};
 use reqwest::header::CONTENT_LENGTH;
 use reqwest::{Body, Method, Response};
 use tokio::io::AsyncReadExt as _;
 
-use super::args::Asked;
+use super::args::Operation;
 use super::export::{self, Source};
 use super::{Answer, Command, Data, OutputArg, Verb, bundles, error, print, read, run};
 use crate::{Holder, OpenError, ReadStore, Store};
 
-/// How long to wait for a holder without an address, such as another `registry` command, to end or to get one.
+/// Time to wait for a holder without an address, such as another `registry` command.
 const PATIENCE: Duration = Duration::from_secs(5);
 const BETWEEN: Duration = Duration::from_millis(50);
 
-/// Runs a verb on the store in `dir`, or at the server of `options`, and prints the answer; returns the exit code.
+/// Runs a verb on the store in `dir`, or at the server of `options`, prints the answer and returns the exit code.
 pub async fn execute(verb: Verb, dir: &Path, options: &ServerOptions, output: OutputArg) -> u8 {
     let (output, file) = output.split();
-    let answer = match verb.asks(file) {
-        Err(why) => Answer::refused(error("invalid", why, Some("`registry help` shows how commands are written"))),
-        Ok(asked) => answer(asked, dir, options).await,
+    let answer = match verb.operation(file) {
+        Err(why) => Answer::refused(error("invalid", why, Some("`registry help` shows the syntax"))),
+        Ok(operation) => answer(operation, dir, options).await,
     };
-    // A closed pipe (`| head`) is no failure of the command.
+    // A closed pipe (`| head`) is not an error.
     let _ = print::show(&answer, output);
     answer.exit
 }
 
-async fn answer(asked: Asked, dir: &Path, options: &ServerOptions) -> Answer {
-    match asked {
-        Asked::Command(command) => ask(command, dir, options).await,
-        Asked::Export { model, dir: into, layout } => {
+async fn answer(operation: Operation, dir: &Path, options: &ServerOptions) -> Answer {
+    match operation {
+        Operation::Command(command) => ask(command, dir, options).await,
+        Operation::Export { model, dir: into, layout } => {
             let to = layout.map_or(Destination::Folder(&into), |layout| Destination::Weights(&into, layout));
             with(dir, options, Need::Read, async |place| export_to(place, &model, to).await).await
         }
-        Asked::Bundle { model, file } => {
+        Operation::Bundle { model, file } => {
             with(dir, options, Need::Read, async |place| export_to(place, &model, Destination::Bundle(&file)).await)
                 .await
         }
-        Asked::Import { file, model } => {
+        Operation::Import { file, model } => {
             with(dir, options, Need::Make, async |place| import(place, &file, model.as_deref()).await).await
         }
-        Asked::Backup { dir: into } => match local(options, "a backup is made on the machine of the store") {
+        Operation::Backup { dir: into } => match local(options, "a backup is made on the machine of the store") {
             Ok(()) => backup(dir, &into).await,
             Err(refused) => *refused,
         },
-        Asked::Adopt { blobs } => adopt(dir, blobs.as_ref(), options).await,
-        Asked::Restore { backup, to, blobs } => match crate::backup::restore(&backup, &to, blobs.as_ref()).await {
+        Operation::Adopt { blobs } => adopt(dir, blobs.as_ref(), options).await,
+        Operation::Restore { backup, to, blobs } => match crate::backup::restore(&backup, &to, blobs.as_ref()).await {
             Ok(summary) => Answer::done(Data::Restored { summary, dir: to }),
             Err(e) => Answer::from(e),
         },
@@ -64,13 +64,13 @@ pub async fn ask(command: Command, dir: &Path, options: &ServerOptions) -> Answe
     with(dir, options, command.need(), async |place| place.ask(&command).await).await
 }
 
-/// What a place must be good for.
+/// Access that a command needs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Need {
     Read,
     Collect,
     Write,
-    /// A store that is made if there is none.
+    /// A store that is created if missing.
     Make,
 }
 
@@ -84,7 +84,7 @@ impl Command {
     }
 }
 
-/// Refuses what can only be done where the store's folder is, if a server is named.
+/// Refuses a command that needs the store's folder if a server is given.
 fn local(options: &ServerOptions, why: &str) -> Result<(), Box<Answer>> {
     match options.connect() {
         Ok(None) => Ok(()),
@@ -96,7 +96,7 @@ fn local(options: &ServerOptions, why: &str) -> Result<(), Box<Answer>> {
     }
 }
 
-/// Only here: a store that is not whole has no server.
+/// Runs only on this machine: a store that needs repair has no server.
 async fn adopt(dir: &Path, blobs: Option<&crate::Place>, options: &ServerOptions) -> Answer {
     if let Err(refused) = local(options, "a store is adopted on its machine") {
         return *refused;
@@ -118,30 +118,30 @@ async fn backup(dir: &Path, into: &Path) -> Answer {
     }
 }
 
-/// Where commands are run.
+/// The place where a command runs.
 enum Place {
     Here(Box<Store>),
     Reading(ReadStore),
     At(Server),
 }
 
-/// Why a holder did not do what it was asked.
-enum Missed {
-    /// It was not reached at all, so nothing was done.
-    NotThere(String),
-    /// It may or may not have been done.
-    Broken(String),
+/// Reason why a holder did not answer.
+enum CallError {
+    /// The connection failed, so nothing was done.
+    Unreachable(String),
+    /// The command may have been done.
+    Incomplete(String),
 }
 
 impl Place {
-    async fn ask(&self, command: &Command) -> Result<Answer, Missed> {
+    async fn ask(&self, command: &Command) -> Result<Answer, CallError> {
         match self {
             Self::Here(store) => Ok(run(command.clone(), store, &user()).await),
             Self::Reading(store) => Ok(read(command.clone(), store).await),
             Self::At(server) => {
                 let sent = server.request(Method::POST, "/v1/registry").json(command).send().await;
                 match check(sent).await? {
-                    Ok(response) => response.json().await.map_err(|e| Missed::Broken(explain(&e))),
+                    Ok(response) => response.json().await.map_err(|e| CallError::Incomplete(explain(&e))),
                     Err(refused) => Ok(Answer::refused(refused)),
                 }
             }
@@ -149,10 +149,11 @@ impl Place {
     }
 }
 
-/// The answer, or what was refused.
-async fn check(sent: Result<Response, reqwest::Error>) -> Result<Result<Response, ApiError>, Missed> {
-    let response =
-        sent.map_err(|e| if e.is_connect() { Missed::NotThere(explain(&e)) } else { Missed::Broken(explain(&e)) })?;
+/// Returns the response, or the server's error.
+async fn check(sent: Result<Response, reqwest::Error>) -> Result<Result<Response, ApiError>, CallError> {
+    let response = sent.map_err(|e| {
+        if e.is_connect() { CallError::Unreachable(explain(&e)) } else { CallError::Incomplete(explain(&e)) }
+    })?;
     let status = response.status();
     if status.is_success() {
         return Ok(Ok(response));
@@ -163,20 +164,21 @@ async fn check(sent: Result<Response, reqwest::Error>) -> Result<Result<Response
     })))
 }
 
-/// Finds the place for `work`, and waits where it is about to be free. Work that only reads needs nobody to be free.
+/// Opens the store or connects to its holder for `work`, and waits briefly if the store is about to be free. Read-only
+/// work needs no free store.
 async fn with(
     dir: &Path,
     options: &ServerOptions,
     need: Need,
-    work: impl AsyncFn(&Place) -> Result<Answer, Missed>,
+    work: impl AsyncFn(&Place) -> Result<Answer, CallError>,
 ) -> Answer {
     let internal = |_| Answer::refused(error("internal", "the store did not answer", None));
     match options.connect() {
         Ok(None) => {}
         Ok(Some(server)) => {
             let url = server.url().to_owned();
-            return work(&Place::At(server)).await.unwrap_or_else(|missed| {
-                let (Missed::NotThere(why) | Missed::Broken(why)) = missed;
+            return work(&Place::At(server)).await.unwrap_or_else(|failed| {
+                let (CallError::Unreachable(why) | CallError::Incomplete(why)) = failed;
                 unreachable_(&format!("cannot reach `{url}`: {why}"))
             });
         }
@@ -211,9 +213,9 @@ async fn with(
                 };
                 match work(&Place::At(server)).await {
                     Ok(answer) => return answer,
-                    // It may be ending, and the store be free in a moment.
-                    Err(Missed::NotThere(why)) => format!("{busy}, which does not answer: {why}"),
-                    Err(Missed::Broken(why)) => {
+                    // The holder may be ending, and the store may be free soon.
+                    Err(CallError::Unreachable(why)) => format!("{busy}, which does not answer: {why}"),
+                    Err(CallError::Incomplete(why)) => {
                         return unreachable_(&format!("{busy}, whose answer could not be read: {why}"));
                     }
                 }
@@ -238,25 +240,25 @@ fn unreachable_(message: &str) -> Answer {
     Answer::refused(error(
         "unreachable",
         message,
-        Some("wait for it to end, or see whether it hangs; then run the same command again"),
+        Some("wait for it to end, or check if it hangs; then run the same command again"),
     ))
 }
 
-/// Where a version's files go.
+/// Target of an export.
 #[derive(Clone, Copy)]
 enum Destination<'a> {
     Folder(&'a Path),
-    /// The weights alone, as others write them.
+    /// The weights alone, in a layout of published code.
     Weights(&'a Path, Layout),
     Bundle(&'a Path),
 }
 
-async fn export_to(place: &Place, model: &str, to: Destination<'_>) -> Result<Answer, Missed> {
+async fn export_to(place: &Place, model: &str, to: Destination<'_>) -> Result<Answer, CallError> {
     let shown = place.ask(&Command::Show { reference: model.to_owned() }).await?;
     let Some(data) = shown.data else { return Ok(shown) };
     let Data::Version { version, .. } = data else {
-        let hint = "say MODEL@best or MODEL:VERSION";
-        return Ok(Answer::refused(error("invalid", format!("`{model}` is no one version"), Some(hint))));
+        let hint = "use MODEL@best or MODEL:VERSION";
+        return Ok(Answer::refused(error("invalid", format!("`{model}` does not name a single version"), Some(hint))));
     };
     let (written, to) = match to {
         Destination::Folder(dir) => (export::export(place, &version, dir).await.map(|files| (files, Vec::new())), dir),
@@ -271,11 +273,14 @@ async fn export_to(place: &Place, model: &str, to: Destination<'_>) -> Result<An
     })
 }
 
-/// Has a bundle of this machine registered where the store is.
-async fn import(place: &Place, file: &Path, model: Option<&str>) -> Result<Answer, Missed> {
+/// Imports a bundle of this machine into the store.
+async fn import(place: &Place, file: &Path, model: Option<&str>) -> Result<Answer, CallError> {
     let shown = file.display().to_string();
     match place {
-        Place::Here(store) => Ok(bundles::import(store, file, &shown, model).await),
+        Place::Here(store) => {
+            let owner = Owner { admin: true, ..Owner::default() };
+            Ok(bundles::import(store, file, &shown, model, owner).await)
+        }
         Place::Reading(_) => Ok(Answer::refused(error("internal", "the store was opened for reading", None))),
         Place::At(server) => {
             let opened = async {
@@ -297,7 +302,7 @@ async fn import(place: &Place, file: &Path, model: Option<&str>) -> Result<Answe
             let request = server.request(Method::POST, &path).header(CONTENT_LENGTH, bytes);
             match check(request.body(Body::wrap_stream(pieces(file))).send().await).await? {
                 Ok(response) => {
-                    let mut answer: Answer = response.json().await.map_err(|e| Missed::Broken(explain(&e)))?;
+                    let mut answer: Answer = response.json().await.map_err(|e| CallError::Incomplete(explain(&e)))?;
                     if let Some(Data::Imported { file, .. }) = &mut answer.data {
                         *file = shown;
                     }
@@ -309,7 +314,7 @@ async fn import(place: &Place, file: &Path, model: Option<&str>) -> Result<Answe
     }
 }
 
-/// A file's bytes, piece by piece.
+/// Streams a file in pieces.
 fn pieces(file: tokio::fs::File) -> impl futures::Stream<Item = std::io::Result<Vec<u8>>> {
     futures::stream::try_unfold(file, async |mut file| {
         let mut piece = vec![0; 1 << 18];
@@ -326,17 +331,17 @@ impl Source for Place {
             Self::Here(store) => pass(store.blobs().read(digest), into),
             Self::Reading(store) => pass(store.blobs().read(digest), into),
             Self::At(server) => {
-                let lost = |missed| {
-                    let (Missed::NotThere(why) | Missed::Broken(why)) = missed;
+                let lost = |failed| {
+                    let (CallError::Unreachable(why) | CallError::Incomplete(why)) = failed;
                     error(
                         "unreachable",
-                        format!("blob {digest} did not come whole from `{}`: {why}", server.url()),
+                        format!("blob {digest} was not received completely from `{}`: {why}", server.url()),
                         None,
                     )
                 };
                 let sent = server.request(Method::GET, &format!("/v1/blobs/{digest}")).send().await;
                 let mut response = check(sent).await.map_err(lost)??;
-                while let Some(part) = response.chunk().await.map_err(|e| lost(Missed::Broken(explain(&e))))? {
+                while let Some(part) = response.chunk().await.map_err(|e| lost(CallError::Incomplete(explain(&e))))? {
                     into(&part).map_err(unwritten)?;
                 }
                 Ok(())
@@ -345,7 +350,7 @@ impl Source for Place {
     }
 }
 
-/// Gives the parts of a blob of this machine to `into`.
+/// Passes the parts of a local blob to `into`.
 fn pass(
     reader: Result<crate::blob::Reader, checkpoint::BlobError>,
     into: &mut impl FnMut(&[u8]) -> std::io::Result<()>,
@@ -358,7 +363,7 @@ fn pass(
     Ok(())
 }
 
-/// Who moves an alias of a store that nobody serves; a server writes down whose token it was.
+/// Returns the user's name for the log of a store without a server; a server logs the token's name.
 fn user() -> String {
     let named =
         ["USER", "LOGNAME"].into_iter().find_map(|name| std::env::var(name).ok().filter(|user| !user.is_empty()));

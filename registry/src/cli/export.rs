@@ -1,4 +1,4 @@
-//! A model's files in a folder of this machine, under the names that its manifest gives them, from wherever the blobs are.
+//! Exports a model's files to a local folder, under the names in its manifest, from any source of blobs.
 
 use std::collections::BTreeMap;
 use std::fs::{self, File};
@@ -13,14 +13,14 @@ use sha2::{Digest as _, Sha256};
 use super::error;
 use crate::Version;
 
-/// Where blobs come from.
+/// A source of blobs.
 pub(super) trait Source {
-    /// Gives the bytes of a blob to `into`, part by part.
+    /// Passes the bytes of a blob to `into`, part by part.
     async fn fetch(&self, digest: Digest, into: &mut impl FnMut(&[u8]) -> io::Result<()>) -> Result<(), ApiError>;
 }
 
-/// Writes `manifest.json` and every file; returns their names. The folder must be empty or missing. What is there afterwards
-/// has the digests that the manifest says, wherever it came from.
+/// Writes `manifest.json` and every file, and returns their names. The folder must be empty or missing. The written
+/// files have the digests in the manifest, from any source.
 pub(super) async fn export(source: &impl Source, version: &Version, dir: &Path) -> Result<Vec<String>, ApiError> {
     empty_folder(dir)?;
     let mut bytes = Vec::new();
@@ -30,7 +30,7 @@ pub(super) async fn export(source: &impl Source, version: &Version, dir: &Path) 
     for (name, entry) in &manifest.files {
         let relative = Path::new(name);
         if !relative.components().all(|part| matches!(part, Component::Normal(_))) {
-            return Err(damaged(&format!("manifest {} names a file `{name}` outside of its folder", version.artifact)));
+            return Err(damaged(&format!("manifest {} lists a file `{name}` outside its folder", version.artifact)));
         }
         let path = dir.join(relative);
         let parent = path.parent().unwrap_or(dir);
@@ -45,8 +45,9 @@ pub(super) async fn export(source: &impl Source, version: &Version, dir: &Path) 
     Ok(names)
 }
 
-/// Writes the weights alone, in the files of a layout, and returns their names, and the parts that it has no place for. Of a layout of one file `path` is that file, which must be missing;
-/// otherwise a folder, which must be empty or missing.
+/// Writes only the weights, in the files of a layout. Returns their names and the parts that the layout cannot hold.
+/// For a layout with one file `path` is that file, which must be missing; otherwise `path` is a folder, which must be
+/// empty or missing.
 pub(super) async fn weights(
     source: &impl Source,
     version: &Version,
@@ -71,13 +72,13 @@ pub(super) async fn weights(
         }
     }
     if names.is_empty() {
-        let hint = Some("`--layout safetensors` takes every model");
+        let hint = Some("`--layout safetensors` holds every model");
         return Err(error("invalid", format!("`{}` has no weights for `{}`", version.model, layout.name()), hint));
     }
     Ok((names, left_out))
 }
 
-/// Writes one file of a layout, if the model has what is in it.
+/// Writes one file of a layout, if the model has its content.
 async fn written(source: &impl Source, manifest: &Manifest, planned: &Planned, to: &Path) -> Result<Written, ApiError> {
     let mut files = BTreeMap::new();
     for name in planned.reads() {
@@ -107,7 +108,7 @@ fn damaged(e: &dyn std::fmt::Display) -> ApiError {
     error("damaged", e, Some("`registry fsck` checks the store"))
 }
 
-/// Makes a folder, unless it is there and empty.
+/// Creates a folder, or checks that it is empty.
 fn empty_folder(dir: &Path) -> Result<(), ApiError> {
     match fs::read_dir(dir) {
         Ok(mut entries) => match entries.next() {
@@ -122,7 +123,7 @@ fn empty_folder(dir: &Path) -> Result<(), ApiError> {
     }
 }
 
-/// A blob's bytes, and that they are those.
+/// Passes a blob's bytes to `write` and verifies their digest.
 pub(super) async fn whole(
     source: &impl Source,
     digest: Digest,

@@ -1,10 +1,9 @@
-//! The registry's commands, once: the `registry` binary, `trainer registry` and the server's `POST /v1/registry` all call
+//! The registry's commands. The `registry` binary, `trainer registry` and the server's `POST /v1/registry` all call
 //! [`run`].
 //!
-//! [`Command`] is what may be asked and [`Answer`] what comes back, both plain data, so that a client can send the one and
-//! show the other. A command never names a place on the machine that runs it: what `export` writes, the client fetches and
-//! writes itself. Exit codes: 0 done, 1 other errors, 2 wrong usage or an unusable store, 3 not found, 4 conflict, 5 the token
-//! is refused, 6 the holder of the store does not answer, 9 damage found, 10 a gate does not hold.
+//! [`Command`] and [`Answer`] are plain data, so that a client can send a command and print its answer. A command never
+//! contains a path of the machine that runs it: for `export` the client downloads and writes the files itself.
+//! [`EXIT_CODES`] lists the exit codes of the process.
 
 mod args;
 mod bundles;
@@ -26,6 +25,7 @@ pub use bundles::import;
 pub use client::{ask, execute};
 pub use print::{render, show_error};
 
+use crate::audit::{self, AuditEntry};
 use crate::backup::{BackupError, Summary};
 use crate::forget::Forgotten;
 use crate::leaderboard::{self, Comparison, Leaderboard, Style};
@@ -33,98 +33,116 @@ use crate::retention::{GRACE_MS, Plan};
 use crate::versions::{BEST, Expect, Gate, LATEST, Model, ModelRef, Promotion, Version};
 use crate::{LineageNode, OpenError, QueryError, ReadStore, Store, StoreId, WriteError, fsck};
 
-/// What may be asked of a registry.
+/// The table of exit codes for `--help`. They have the same meaning in `trainer`.
+pub const EXIT_CODES: &str = "\
+Exit codes:
+    0  done
+    1  the requested operation failed
+    2  wrong usage, or a store that cannot be used; nothing was changed
+    4  a conflict with what is stored
+    5  the token is missing or lacks a scope
+    6  the process that holds the store does not answer
+    7  there is no such model, version, run or artifact
+    9  stored data is damaged
+   10  a gate does not hold; nothing was changed";
+
+/// A request to a registry.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "command", rename_all = "kebab-case")]
 pub enum Command {
-    /// All models.
+    /// Lists all models.
     List,
-    /// A model with its versions, or one version.
+    /// Shows a model with its versions, or one version.
     Show {
-        /// `MODEL`, `MODEL@ALIAS`, `MODEL:VERSION`.
+        /// A reference: `MODEL`, `MODEL@ALIAS`, `MODEL:VERSION`.
         reference: String,
     },
-    /// The moves of a model's aliases.
+    /// Shows the moves of a model's aliases.
     History {
         model: String,
-        /// Only of this alias.
+        /// Shows only this alias.
         alias: Option<String>,
     },
     /// Moves an alias to a version.
     Promote {
-        /// `MODEL@ALIAS`, `MODEL@best`, `MODEL:VERSION`.
+        /// A reference: `MODEL@ALIAS`, `MODEL@best`, `MODEL:VERSION`.
         reference: String,
-        /// The alias.
+        /// The alias to move.
         to: String,
-        /// What the alias must point at now.
+        /// Expected current version of the alias.
         expect: Option<Expect>,
         /// Gates as written.
         require: Vec<String>,
-        /// Why.
+        /// Reason for the log.
         reason: String,
     },
     /// Moves an alias back.
     Rollback {
         model: String,
         alias: String,
-        /// To this version; otherwise to the one before the last promotion.
+        /// The target version; `None` means the version before the last promotion.
         to: Option<u64>,
-        /// What the alias must point at now.
+        /// Expected current version of the alias.
         expect: Option<Expect>,
-        /// Why.
+        /// Reason for the log.
         reason: String,
     },
-    /// Two versions, metric by metric.
+    /// Compares two versions metric by metric.
     Compare {
-        /// `MODEL`, `MODEL@ALIAS`, `MODEL:VERSION`; a model alone is its best version.
+        /// A reference: `MODEL` (its best version), `MODEL@ALIAS`, `MODEL:VERSION`.
         left: String,
-        /// Likewise.
+        /// The other version, in the same form.
         right: String,
-        /// How the table is written.
+        /// Format of the table.
         style: Style,
     },
-    /// All versions of a model, or of all models of a data format, beside what the papers print.
+    /// Shows all versions of a model, or of all models of a data format, with the papers' metrics.
     Leaderboard {
         /// A model, or `humanml3d` or `kit`.
         of: String,
-        /// Whether the papers' rows are shown.
+        /// Includes the papers' rows.
         published: bool,
-        /// How the table is written.
+        /// Format of the table.
         style: Style,
     },
-    /// What an artifact was made of.
+    /// Shows the artifacts that an artifact was made from.
     Lineage {
         /// A model version or a digest.
         reference: String,
     },
-    /// Checks everything.
+    /// Checks the whole store.
     Fsck,
-    /// Removes what nothing needs.
+    /// Removes blobs that are no longer needed.
     Gc {
-        /// Only says what would go.
+        /// Only lists the blobs to remove.
         dry_run: bool,
-        /// Minutes for which a fresh blob is safe.
+        /// Minutes for which a fresh blob is kept.
         grace_minutes: Option<u32>,
     },
-    /// Forgets a run that has ended.
+    /// Deletes an ended run.
     Forget {
-        /// Which.
+        /// Name of the run.
         run: String,
     },
-    /// Forgets runs that ended before a time.
+    /// Deletes runs that ended before a time.
     ForgetEnded {
-        /// In milliseconds since 1970.
+        /// The time, in milliseconds since 1970.
         before_ms: i64,
     },
-    /// Forgets what runs that ended before a time have left behind and nobody needs; the runs stay.
+    /// Deletes unreferenced data of runs that ended before a time; the runs stay.
     ForgetLeftovers {
-        /// In milliseconds since 1970.
+        /// The time, in milliseconds since 1970.
         before_ms: i64,
+    },
+    /// Shows the newest lines of the audit log.
+    Audit {
+        /// Number of lines.
+        limit: usize,
     },
 }
 
 impl Command {
-    /// What a token must allow for it.
+    /// Returns the scope that a token needs for the command.
     pub fn scope(&self) -> Scope {
         match self {
             Self::List
@@ -135,7 +153,8 @@ impl Command {
             | Self::Lineage { .. } => Scope::Read,
             Self::Promote { .. } | Self::Rollback { .. } => Scope::Promote,
             // Reads every byte of the store.
-            Self::Fsck
+            Self::Audit { .. }
+            | Self::Fsck
             | Self::Gc { .. }
             | Self::Forget { .. }
             | Self::ForgetEnded { .. }
@@ -143,7 +162,36 @@ impl Command {
         }
     }
 
-    /// Whether it changes nothing in the store, so that it needs nobody who holds it.
+    /// Returns the model and alias that the command moves.
+    pub fn moves(&self) -> Option<(&str, &str)> {
+        match self {
+            Self::Promote { reference, to, .. } => Some((reference, to)),
+            Self::Rollback { model, alias, .. } => Some((model, alias)),
+            _ => None,
+        }
+    }
+
+    /// Formats the command and its object for a log.
+    pub fn in_short(&self) -> String {
+        match self {
+            Self::List => "list".into(),
+            Self::Show { reference } => format!("show {reference}"),
+            Self::History { model, .. } => format!("history {model}"),
+            Self::Promote { reference, to, .. } => format!("promote {reference} to {to}"),
+            Self::Rollback { model, alias, .. } => format!("rollback {model}@{alias}"),
+            Self::Compare { left, right, .. } => format!("compare {left} {right}"),
+            Self::Leaderboard { of, .. } => format!("leaderboard {of}"),
+            Self::Lineage { reference } => format!("lineage {reference}"),
+            Self::Fsck => "fsck".into(),
+            Self::Gc { dry_run, .. } => if *dry_run { "gc --dry-run" } else { "gc" }.into(),
+            Self::Forget { run } => format!("forget {run}"),
+            Self::ForgetEnded { before_ms } => format!("forget --ended-before {before_ms}"),
+            Self::ForgetLeftovers { before_ms } => format!("forget --leftovers-before {before_ms}"),
+            Self::Audit { limit } => format!("audit {limit}"),
+        }
+    }
+
+    /// Returns true if the command changes nothing in the store and therefore needs no holder.
     pub fn only_reads(&self) -> bool {
         match self {
             Self::List
@@ -152,6 +200,7 @@ impl Command {
             | Self::Compare { .. }
             | Self::Leaderboard { .. }
             | Self::Lineage { .. }
+            | Self::Audit { .. }
             | Self::Fsck => true,
             Self::Gc { dry_run, .. } => *dry_run,
             Self::Promote { .. }
@@ -163,69 +212,71 @@ impl Command {
     }
 }
 
-/// What a command gives.
+/// Result of a command.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "kebab-case")]
 #[expect(missing_docs, reason = "each field is the type it holds")]
 pub enum Data {
-    /// Of `list`.
+    /// Result of `list`.
     Models { models: Vec<Model> },
-    /// Of `show MODEL`.
+    /// Result of `show MODEL`.
     Model { model: Model, versions: Vec<Version> },
-    /// Of `show MODEL@ALIAS`.
+    /// Result of `show MODEL@ALIAS`.
     Version {
         version: Version,
         manifest: Manifest,
-        /// For each part of a model those that it was made for.
+        /// For each part of a model, the parts it was made for.
         #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
         fits: BTreeMap<Role, Parts>,
-        /// Versions of any model that a control part was made beside, as `MODEL:VERSION`; the newest [`MOST_BASES`] are looked at.
+        /// Versions that a control part was made for, as `MODEL:VERSION`, among the newest [`MOST_BASES`].
         #[serde(default, skip_serializing_if = "Vec::is_empty")]
         bases: Vec<String>,
     },
-    /// Of `history`.
+    /// Result of `history`.
     History { model: ModelName, history: Vec<Promotion> },
-    /// Of `promote` and `rollback`.
+    /// Result of `promote` and `rollback`.
     Promotion { promotion: Promotion },
-    /// Of `compare`.
+    /// Result of `compare`.
     Comparison { comparison: Comparison, style: Style },
-    /// Of `leaderboard`.
+    /// Result of `leaderboard`.
     Leaderboard { leaderboard: Leaderboard, style: Style },
-    /// Of `lineage`.
+    /// Result of `lineage`.
     Lineage { nodes: Vec<LineageNode> },
-    /// Of `fsck`.
+    /// Result of `fsck`.
     Fsck { report: fsck::Report },
-    /// Of `gc`.
+    /// Result of `gc`.
     Gc { dry_run: bool, plan: Plan },
-    /// Of `adopt`.
+    /// Result of `adopt`.
     Adopted { store: StoreId },
-    /// Of `forget`.
+    /// Result of `audit`.
+    Audit { entries: Vec<AuditEntry> },
+    /// Result of `forget`.
     Forgotten { runs: Vec<(RunId, Forgotten)> },
-    /// Of `backup`.
+    /// Result of `backup`.
     BackedUp { summary: Summary, dir: std::path::PathBuf },
-    /// Of `restore`.
+    /// Result of `restore`.
     Restored { summary: Summary, dir: std::path::PathBuf },
-    /// Of `export`.
+    /// Result of `export`.
     Exported {
         version: Version,
         dir: std::path::PathBuf,
         files: Vec<String>,
-        /// Parts that the layout has no place for.
+        /// Parts that the layout cannot hold.
         #[serde(default, skip_serializing_if = "Vec::is_empty")]
         left_out: Vec<String>,
     },
-    /// Of `import`.
+    /// Result of `import`.
     Imported { version: Version, file: String },
 }
 
-/// What came of a command.
+/// Answer to a command.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Answer {
     /// The process's exit code.
     pub exit: u8,
-    /// What was asked for.
+    /// Result of the command, if there is one.
     pub data: Option<Data>,
-    /// Why it was refused, or what was found to be wrong.
+    /// Reason of a refusal, or a problem that was found.
     pub error: Option<ApiError>,
 }
 
@@ -234,11 +285,11 @@ impl Answer {
         Self { exit: 0, data: Some(data), error: None }
     }
 
-    /// Refused, with the exit code that belongs to the error's code.
+    /// Makes an answer of an error, with the exit code of the error's code.
     pub fn refused(error: ApiError) -> Self {
         let exit = match error.code.as_str() {
             "invalid" | "store" => 2,
-            "not-found" => 3,
+            "not-found" => 7,
             "conflict" | "stale-fence" => 4,
             "unauthorized" | "forbidden" => 5,
             "unreachable" => 6,
@@ -257,7 +308,7 @@ fn error(code: &str, message: impl ToString, hint: Option<&str>) -> ApiError {
 impl From<QueryError> for Answer {
     fn from(e: QueryError) -> Self {
         Self::refused(match &e {
-            QueryError::NotFound(_) => error("not-found", e, Some("`registry list` shows what there is")),
+            QueryError::NotFound(_) => error("not-found", e, Some("`registry list` shows the models")),
             QueryError::Invalid(_) => {
                 error("invalid", e, Some("`registry list` shows models, `registry show MODEL` their versions"))
             }
@@ -273,15 +324,20 @@ impl From<WriteError> for Answer {
     fn from(e: WriteError) -> Self {
         Self::refused(match &e {
             WriteError::StaleFence { .. } => error("stale-fence", e, None),
-            WriteError::Conflict(_) => error("conflict", e, Some("`registry history MODEL` shows who moved what")),
+            WriteError::Conflict(_) => {
+                error("conflict", e, Some("`registry history MODEL` shows the moves of aliases"))
+            }
             WriteError::Gate(_) => error(
                 "gate",
                 e,
                 Some("nothing was changed; `registry show MODEL` lists every version with its metrics"),
             ),
-            WriteError::NotFound(_) => error("not-found", e, Some("`registry list` shows what there is")),
+            WriteError::NotFound(_) => error("not-found", e, Some("`registry list` shows the models")),
             WriteError::Storage(_) | WriteError::Superseded { .. } => error("storage", e, None),
-            WriteError::Internal(_) => error("internal", e, Some("`registry fsck` checks the store")),
+            WriteError::Unreachable(_) => error("unreachable", e, None),
+            WriteError::Unproven { .. } | WriteError::Internal(_) => {
+                error("internal", e, Some("`registry fsck` checks the store"))
+            }
         })
     }
 }
@@ -302,7 +358,7 @@ impl From<BackupError> for Answer {
             BackupError::Folder(_) => Self::refused(error("invalid", e, Some("name another folder"))),
             BackupError::Damaged(_) => Self::refused(error("damaged", e, Some("`registry fsck` checks a store"))),
             BackupError::Disk { .. } => {
-                Self::refused(error("storage", e, Some("see to the disk and run the same command again")))
+                Self::refused(error("storage", e, Some("check the disk and run the same command again")))
             }
             BackupError::Query(e) => Self::from(e),
         }
@@ -310,10 +366,10 @@ impl From<BackupError> for Answer {
 }
 
 fn invalid(message: impl ToString) -> Refused {
-    Refused::from(error("invalid", message, Some("`registry help` shows how commands are written")))
+    Refused::from(error("invalid", message, Some("`registry help` shows the syntax")))
 }
 
-/// A refusal on its way out of a function.
+/// An answer with an error, for use with `?`.
 struct Refused(Box<Answer>);
 
 impl<E: Into<Answer>> From<E> for Refused {
@@ -328,17 +384,17 @@ impl From<ApiError> for Answer {
     }
 }
 
-/// Runs a command on a store that this process holds, in the name of `actor`.
+/// Runs a command on a store that this process holds, on behalf of `actor`.
 pub async fn run(command: Command, store: &Store, actor: &str) -> Answer {
     answer(command, store, Some((store, actor))).await.unwrap_or_else(|refused| *refused.0)
 }
 
-/// Runs a command that only reads.
+/// Runs a read-only command.
 pub async fn read(command: Command, store: &ReadStore) -> Answer {
     answer(command, store, None).await.unwrap_or_else(|refused| *refused.0)
 }
 
-/// `holder` is `store` if this process holds it, and in whose name it is changed.
+/// Runs a command. `holder` is given if this process holds `store`, with the actor of changes.
 async fn answer(command: Command, store: &ReadStore, holder: Option<(&Store, &str)>) -> Result<Answer, Refused> {
     let writes = || holder.ok_or_else(|| invalid("the command changes the store, which was opened for reading"));
     let data = match command {
@@ -385,10 +441,16 @@ async fn answer(command: Command, store: &ReadStore, holder: Option<(&Store, &st
                 Err(_) => store.resolve(&reference).await?.artifact,
             };
             let nodes = store.lineage(digest).await?;
-            if nodes.iter().all(|node| node.kind.is_none() && node.inputs.is_empty()) && !exists(store, digest)? {
+            if nodes.iter().all(|node| node.kind.is_none() && node.inputs.is_empty()) && !exists(store, digest).await? {
                 return Err(Refused::from(QueryError::NotFound(format!("no artifact {digest}"))));
             }
             Data::Lineage { nodes }
+        }
+        Command::Audit { limit } => {
+            let dir = store.dir().to_owned();
+            let read = tokio::task::spawn_blocking(move || audit::read(&dir, limit.min(MOST_LINES))).await;
+            let failed = |e: &dyn std::fmt::Display| QueryError::Storage(format!("the audit log cannot be read: {e}"));
+            Data::Audit { entries: read.map_err(|e| failed(&e))?.map_err(|e| failed(&e))? }
         }
         Command::Fsck => {
             let report = store.fsck().await?;
@@ -414,7 +476,7 @@ async fn answer(command: Command, store: &ReadStore, holder: Option<(&Store, &st
         }
         Command::ForgetEnded { before_ms } => {
             let mut runs = Vec::new();
-            // One transaction each, so that other writes get in between.
+            // One transaction each, so that other writes can proceed in between.
             for run in store.ended_before(before_ms).await? {
                 let gone = writes()?.0.forget(&run).await?;
                 runs.push((run, gone));
@@ -435,7 +497,8 @@ async fn answer(command: Command, store: &ReadStore, holder: Option<(&Store, &st
     Ok(Answer::done(data))
 }
 
-/// The version that a reference names; a model alone stands for its best one, or its newest where no metric decides.
+/// Returns the version that a reference names. A model alone means its best version, or its newest if no metric ranks
+/// them.
 async fn one(store: &ReadStore, text: &str) -> Result<Version, Refused> {
     let reference: ModelRef = text.parse().map_err(invalid)?;
     if reference.pick.is_some() {
@@ -445,9 +508,9 @@ async fn one(store: &ReadStore, text: &str) -> Result<Version, Refused> {
     Ok(store.resolve(&format!("{text}@{pick}")).await?)
 }
 
-/// The data format of a version's motions, which is how the papers name their datasets.
-fn format_of(store: &ReadStore, version: &Version) -> Option<String> {
-    let manifest = store.blobs().manifest(version.artifact).ok()?;
+/// Returns the data format of a version's motions; the papers' datasets have the same names.
+async fn format_of(store: &ReadStore, version: &Version) -> Option<String> {
+    let manifest = manifest(store, version.artifact).await.ok()?;
     ModelMeta::read(&manifest).ok().map(|model| model.format.name().to_owned())
 }
 
@@ -455,14 +518,20 @@ async fn leaderboard(store: &ReadStore, of: &str, published: bool) -> Result<Lea
     if leaderboard::FORMATS.contains(&of) {
         let mut all = Vec::new();
         for model in store.models().await? {
-            all.extend(store.versions(&model.model).await?);
+            for version in store.versions(&model.model).await? {
+                if format_of(store, &version).await.as_deref() == Some(of) {
+                    all.push(version);
+                }
+            }
         }
-        all.retain(|version| format_of(store, version).as_deref() == Some(of));
         return Ok(leaderboard::leaderboard(of.to_owned(), &all, None, published.then_some(of)));
     }
     let model = known(store, of).await?;
     let versions = store.versions(&model.model).await?;
-    let format = versions.first().and_then(|version| format_of(store, version)).filter(|_| published);
+    let format = match versions.first().filter(|_| published) {
+        Some(version) => format_of(store, version).await,
+        None => None,
+    };
     Ok(leaderboard::leaderboard(of.to_owned(), &versions, model.metric.as_deref(), format.as_deref()))
 }
 
@@ -470,20 +539,28 @@ async fn known(store: &ReadStore, name: &str) -> Result<Model, Refused> {
     let name: ModelName = name.parse().map_err(invalid)?;
     match store.model(&name).await? {
         Some(model) => Ok(model),
-        // Says which models there are.
+        // The error of `resolve` lists the known models.
         None => Err(store
             .resolve(&format!("{name}@latest"))
             .await
-            .map_or_else(Refused::from, |_| invalid("the model was made just now"))),
+            .map_or_else(Refused::from, |_| invalid("the model was created meanwhile; run the command again"))),
     }
 }
 
-fn exists(store: &ReadStore, digest: Digest) -> Result<bool, Refused> {
-    store.blobs().exists(digest).map_err(|e| Refused::from(QueryError::Blob(e.to_string())))
+async fn exists(store: &ReadStore, digest: Digest) -> Result<bool, Refused> {
+    let blobs = store.blobs().clone();
+    store.ask_blobs(move || blobs.exists(digest)).await.map_err(|e| Refused::from(QueryError::Blob(e.to_string())))
 }
 
-/// Versions that are looked at for bases of a control part.
+async fn manifest(store: &ReadStore, digest: Digest) -> Result<Manifest, QueryError> {
+    let blobs = store.blobs().clone();
+    store.ask_blobs(move || blobs.manifest(digest)).await.map_err(|e| QueryError::Blob(e.to_string()))
+}
+
+/// Number of versions searched for bases of a control part.
 pub const MOST_BASES: usize = 1_000;
+/// Limit of shown lines of the audit log.
+const MOST_LINES: usize = 10_000;
 
 async fn show(store: &ReadStore, text: &str) -> Result<Data, Refused> {
     let reference: ModelRef = text.parse().map_err(invalid)?;
@@ -493,8 +570,8 @@ async fn show(store: &ReadStore, text: &str) -> Result<Data, Refused> {
         return Ok(Data::Model { model, versions });
     }
     let version = store.resolve(text).await?;
-    let manifest = store.blobs().manifest(version.artifact).map_err(|e| QueryError::Blob(e.to_string()))?;
-    let fits = fits(store, &manifest)?;
+    let manifest = manifest(store, version.artifact).await?;
+    let fits = fits(store, &manifest).await?;
     let bases = match fits.get(&Role::CONTROL) {
         Some(wanted) => bases(store, &version, wanted).await?,
         None => Vec::new(),
@@ -502,7 +579,7 @@ async fn show(store: &ReadStore, text: &str) -> Result<Data, Refused> {
     Ok(Data::Version { version, manifest, fits, bases })
 }
 
-/// Other versions whose parts are those that are `wanted`: the models that a control part fits.
+/// Finds other versions that contain all `wanted` parts: the models that a control part fits.
 async fn bases(store: &ReadStore, own: &Version, wanted: &Parts) -> Result<Vec<String>, Refused> {
     let mut all = Vec::new();
     for model in store.models().await? {
@@ -511,8 +588,8 @@ async fn bases(store: &ReadStore, own: &Version, wanted: &Parts) -> Result<Vec<S
     all.sort_by_key(|version| std::cmp::Reverse(version.created_ms));
     let mut bases = Vec::new();
     for version in all.iter().take(MOST_BASES).filter(|version| version.artifact != own.artifact) {
-        // What is no model, or is damaged, is no base; `fsck` says so.
-        let Ok(manifest) = store.blobs().manifest(version.artifact) else { continue };
+        // Skips artifacts that are damaged or not models; `fsck` reports them.
+        let Ok(manifest) = manifest(store, version.artifact).await else { continue };
         let Ok(model) = ModelMeta::read(&manifest) else { continue };
         if wanted.iter().all(|(role, digest)| model.parts.get(role) == Some(digest)) {
             bases.push(format!("{}:{}", version.model, version.version));
@@ -521,12 +598,12 @@ async fn bases(store: &ReadStore, own: &Version, wanted: &Parts) -> Result<Vec<S
     Ok(bases)
 }
 
-/// For each part of a model those that it was made for; nothing for what is no model.
-fn fits(store: &ReadStore, manifest: &Manifest) -> Result<BTreeMap<Role, Parts>, Refused> {
-    let Ok(model) = ModelMeta::read(manifest) else { return Ok(BTreeMap::new()) };
+/// Returns for each part of a model the parts it was made for. Empty for other artifacts.
+async fn fits(store: &ReadStore, of: &Manifest) -> Result<BTreeMap<Role, Parts>, Refused> {
+    let Ok(model) = ModelMeta::read(of) else { return Ok(BTreeMap::new()) };
     let mut all = BTreeMap::new();
     for (role, digest) in model.parts {
-        let part = store.blobs().manifest(digest).map_err(|e| QueryError::Blob(e.to_string()))?;
+        let part = manifest(store, digest).await?;
         let fits = model::fits(&role, &part).map_err(|e| QueryError::Blob(e.to_string()))?;
         if !fits.is_empty() {
             all.insert(role, fits);

@@ -1,4 +1,4 @@
-//! Answers on the terminal. Data goes to stdout, messages to stderr.
+//! Prints answers to the terminal: data to stdout, messages to stderr.
 
 use std::collections::BTreeMap;
 use std::io::{self, Write};
@@ -33,7 +33,7 @@ pub(super) fn show(answer: &Answer, output: Output) -> io::Result<()> {
     answer.error.as_ref().map_or(Ok(()), |error| show_error(error, output))
 }
 
-/// Prints an error to stderr: message, empty line, hint; or one JSON object.
+/// Prints an error to stderr: message, empty line and hint, or one JSON object.
 pub fn show_error(error: &ApiError, output: Output) -> io::Result<()> {
     let mut stderr = io::stderr().lock();
     match output {
@@ -45,7 +45,7 @@ pub fn show_error(error: &ApiError, output: Output) -> io::Result<()> {
     }
 }
 
-/// An answer's data for people.
+/// Formats an answer's data as text.
 pub fn render(data: &Data) -> String {
     match data {
         Data::Models { models } if models.is_empty() => "no models yet: a `register` stage makes one\n".into(),
@@ -125,6 +125,22 @@ pub fn render(data: &Data) -> String {
             }
             format!("{}\n", table.trim_fmt())
         }
+        Data::Audit { entries } if entries.is_empty() => "the audit log is empty\n".into(),
+        Data::Audit { entries } => {
+            let mut table = table(&["WHEN", "WHO", "FROM", "CALL", "OBJECT", "STATUS", "CALLS"]);
+            for entry in entries {
+                table.add_row([
+                    format_ms(entry.at_ms),
+                    entry.who.clone(),
+                    entry.from.clone(),
+                    entry.call.clone(),
+                    entry.object.clone(),
+                    entry.status.to_string(),
+                    entry.count.to_string(),
+                ]);
+            }
+            format!("{}\n", table.trim_fmt())
+        }
         Data::Promotion { promotion } => {
             let Promotion { model, alias, from, to, .. } = promotion;
             let from = from.map_or_else(|| "nothing".into(), |from| format!("version {from}"));
@@ -171,7 +187,8 @@ pub fn render(data: &Data) -> String {
                 text += &format!("  {digest}\n");
             }
             let verb = if *dry_run { "would remove" } else { "removed" };
-            let fresh = if plan.fresh == 0 { String::new() } else { format!(", {} too fresh to go", plan.fresh) };
+            let fresh =
+                if plan.fresh == 0 { String::new() } else { format!(", {} within their grace period", plan.fresh) };
             text + &format!(
                 "{verb} {} blobs ({}); {} are needed{fresh}\n",
                 plan.remove.len(),
@@ -180,9 +197,9 @@ pub fn render(data: &Data) -> String {
             )
         }
         Data::Adopted { store } => {
-            format!("the parts are store {store} again; `registry fsck` says what is missing\n")
+            format!("store {store} is repaired; `registry fsck` lists missing data\n")
         }
-        Data::Forgotten { runs } if runs.is_empty() => "no run that ended before that has anything to forget\n".into(),
+        Data::Forgotten { runs } if runs.is_empty() => "no run that ended before that time has data to forget\n".into(),
         Data::Forgotten { runs } => {
             let mut text = String::new();
             for (run, gone) in runs {
@@ -194,7 +211,7 @@ pub fn render(data: &Data) -> String {
                     text += &format!("  {stage} stays: a model, a pin or another run needs it\n");
                 }
             }
-            text + "`registry gc` removes what nothing needs any more\n"
+            text + "`registry gc` removes blobs that are no longer needed\n"
         }
         Data::BackedUp { summary, dir } => {
             let Summary { store, at_ms, blobs, bytes } = summary;
@@ -209,14 +226,14 @@ pub fn render(data: &Data) -> String {
         Data::Exported { version, dir, files, left_out } => {
             let without = match left_out.is_empty() {
                 true => String::new(),
-                false => format!("; the layout has no place for {}", left_out.join(", ")),
+                false => format!("; the layout cannot hold {}", left_out.join(", ")),
             };
             format!("{}:{} is in `{}`: {}{without}\n", version.model, version.version, dir.display(), files.join(", "))
         }
         Data::Imported { version, file } => {
             let (model, number) = (&version.model, version.version);
             format!(
-                "`{file}` is {model}:{number}; `trainer generate \"a person walks\" --model {model}@{number}` draws from it\n"
+                "`{file}` is {model}:{number}; `trainer generate \"a person walks\" --model {model}@{number}` uses it\n"
             )
         }
     }
@@ -244,10 +261,10 @@ fn list(items: impl Iterator<Item = String>) -> String {
     if items.is_empty() { "-".into() } else { items.join(", ") }
 }
 
-/// How a model is drawn from, and what with.
+/// Describes a model's generator, sampler and parts.
 fn drawn(manifest: &Manifest) -> Vec<(&'static str, String)> {
     let Ok(model) = Model::read(manifest) else { return Vec::new() };
-    let sampler = model.sampler.map_or_else(|| "nobody measured it".to_owned(), |sampler| sampler.to_string());
+    let sampler = model.sampler.map_or_else(|| "not evaluated".to_owned(), |sampler| sampler.to_string());
     let part = |(role, digest): (&Role, &Digest)| format!("{role}={}", digest.short());
     vec![
         ("generator", format!("{}, {}", model.generator, model.format.name())),
@@ -256,7 +273,7 @@ fn drawn(manifest: &Manifest) -> Vec<(&'static str, String)> {
     ]
 }
 
-/// Which parts each part was made for.
+/// Lists the parts that each part was made for.
 fn made_for(fits: &BTreeMap<Role, Parts>) -> Option<(&'static str, String)> {
     let one = |(role, parts): (&Role, &Parts)| {
         let each = parts.iter().map(|(role, digest)| format!("{role}={}", digest.short()));
@@ -265,7 +282,7 @@ fn made_for(fits: &BTreeMap<Role, Parts>) -> Option<(&'static str, String)> {
     (!fits.is_empty()).then(|| ("fits", list(fits.iter().map(one))))
 }
 
-/// Versions that a control part was made beside.
+/// Lists the versions that a control part was made for.
 fn beside(bases: &[String]) -> Option<(&'static str, String)> {
     (!bases.is_empty()).then(|| ("bases", list(bases.iter().cloned())))
 }

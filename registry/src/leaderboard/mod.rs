@@ -1,11 +1,12 @@
-//! Comparing models by the field's metrics: intervals, differences beyond noise, and tables in the papers' column order.
+//! Comparison of models by the field's metrics: intervals, differences beyond noise, and tables in the papers' column
+//! order.
 //!
-//! A metric `fid` may come with `fid.lower` and `fid.upper`, the 95 % interval of its mean over repeats, or with `fid_sd`, the
-//! standard deviation over repeats, which then stands for the interval as 1.96 sd (wider than the mean's). Metrics that several
-//! evaluations of one model gave are told apart by a stage's name in front (`eval_4.fid`); each such stage is a row of its own.
+//! A metric `fid` may come with `fid.lower` and `fid.upper`, the 95 % interval of its mean over repeats. Or it comes
+//! with `fid_sd`, the standard deviation over repeats; the interval is then 1.96 sd (wider than the mean's). A stage's
+//! name in front (`eval_4.fid`) separates metrics of several evaluations of one model; each such stage has its own row.
 //!
-//! Published rows are what the papers print, on the full test splits with the published evaluators. They say where a result should
-//! land, and are only comparable with numbers of that evaluator on that split.
+//! Published rows are the papers' numbers, on the full test splits with the published evaluators. They show the target
+//! of a result and are only comparable with numbers of that evaluator on that split.
 
 mod print;
 mod published;
@@ -22,25 +23,25 @@ use crate::versions::Version;
 pub use print::Style;
 pub use row::{Measure, Row};
 
-/// Which way is better.
+/// Direction in which a metric is better.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Better {
-    /// Such as a distance.
+    /// A smaller value is better, such as a distance.
     Lower,
-    /// Such as a hit rate.
+    /// A larger value is better, such as a hit rate.
     Higher,
-    /// The nearer to real motion, the better.
+    /// A value closer to that of real motion is better.
     NearReal,
-    /// Nothing is said: a property, not a merit.
+    /// The metric is a property without a better direction.
     Neither,
 }
 
-/// A metric that tables have a column for.
+/// A metric with a column in tables.
 #[derive(Debug)]
 struct Column {
     key: &'static str,
-    /// In a table's head.
+    /// Heading of the column.
     head: &'static str,
     better: Better,
 }
@@ -49,7 +50,7 @@ const fn column(key: &'static str, head: &'static str, better: Better) -> Column
     Column { key, head, better }
 }
 
-/// The text-to-motion papers' order, then what they report of reconstruction and control, then what needs no evaluator.
+/// Columns in the order of text-to-motion papers, then reconstruction and control, then metrics without an evaluator.
 const COLUMNS: [Column; 28] = [
     column("aits", "AITS (s)", Better::Lower),
     column("r_precision_top1", "R@1", Better::Higher),
@@ -81,10 +82,10 @@ const COLUMNS: [Column; 28] = [
     column("latent_r_precision_top3_test", "Latent R@3, test", Better::Higher),
 ];
 
-/// The data formats, by which the papers' datasets go.
+/// Data formats; the papers' datasets have the same names.
 pub const FORMATS: [&str; 2] = ["humanml3d", "kit"];
 
-/// Columns of the papers' text-to-motion table: the first ones.
+/// Number of columns of the papers' text-to-motion table, which come first.
 const PAPER_COLUMNS: usize = 8;
 
 fn better(key: &str) -> Better {
@@ -94,54 +95,54 @@ fn better(key: &str) -> Better {
 /// A table of rows.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Leaderboard {
-    /// Of what.
+    /// Title of the table.
     pub title: String,
-    /// Of models: ours by the deciding metric, best first; then the published ones in their papers' order.
+    /// Rows of models: ours by the deciding metric, best first, then published ones in their papers' order.
     pub rows: Vec<Row>,
 }
 
-/// Who is ahead.
+/// Result of comparing two values.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Verdict {
-    /// The left one, beyond noise.
+    /// The left value is better, beyond noise.
     Left,
-    /// The right one, beyond noise.
+    /// The right value is better, beyond noise.
     Right,
-    /// They differ beyond noise, in what has no better or worse.
+    /// The values differ beyond noise, but neither is better.
     Differ,
-    /// They do not differ beyond noise.
+    /// The values do not differ beyond noise.
     Noise,
-    /// They differ, and how noisy they are was not measured.
+    /// The values differ, but their noise was not measured.
     Unknown,
 }
 
-/// One metric of two rows.
+/// One metric of two models.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Difference {
     pub metric: String,
-    /// Of the left one.
+    /// Value of the left model.
     pub left: Option<Measure>,
-    /// Of the right one.
+    /// Value of the right model.
     pub right: Option<Measure>,
     /// Right minus left, with the interval of the difference.
     pub difference: Option<Measure>,
-    /// Who is ahead.
+    /// Result of the comparison.
     pub verdict: Option<Verdict>,
 }
 
-/// Two models, metric by metric.
+/// A comparison of two models, metric by metric.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Comparison {
-    /// `MODEL:VERSION`.
+    /// Left version, as `MODEL:VERSION`.
     pub left: String,
-    /// `MODEL:VERSION`.
+    /// Right version, as `MODEL:VERSION`.
     pub right: String,
-    /// Every metric that either has.
+    /// Every metric of either model.
     pub metrics: Vec<Difference>,
 }
 
-/// `fid`, `fid.lower`, `fid.upper` and `fid_sd` made one.
+/// Combines `fid`, `fid.lower`, `fid.upper` and `fid_sd` into one measure.
 fn measures(metrics: &BTreeMap<String, f64>) -> BTreeMap<String, Measure> {
     let is_part = |key: &str| {
         let of = |end: &str| key.strip_suffix(end).is_some_and(|base| metrics.contains_key(base));
@@ -159,8 +160,8 @@ fn measures(metrics: &BTreeMap<String, f64>) -> BTreeMap<String, Measure> {
     whole.map(|(key, &value)| (key.clone(), Measure { value, half: half(key) })).collect()
 }
 
-/// A version's evaluations: metrics under a stage's name are that stage's; what is under none is shared by all of them, and the only
-/// one's where no stage has a name.
+/// Groups a version's metrics by evaluation. Metrics with a stage's name belong to that stage; those without one belong
+/// to every stage, or to the only evaluation if no metric has a name.
 pub(crate) fn measured(version: &Version) -> Vec<(Option<String>, BTreeMap<String, Measure>)> {
     let mut by_stage: BTreeMap<String, BTreeMap<String, Measure>> = BTreeMap::new();
     let mut shared = BTreeMap::new();
@@ -173,7 +174,7 @@ pub(crate) fn measured(version: &Version) -> Vec<(Option<String>, BTreeMap<Strin
     if by_stage.is_empty() {
         return vec![(None, shared)];
     }
-    // The value without a stage's name is one of those with a name: shown where it belongs, not twice.
+    // The value without a stage's name repeats one with a name and is dropped.
     shared.retain(|key, _| !by_stage.values().any(|measures| measures.contains_key(key)));
     by_stage.values_mut().for_each(|measures| measures.extend(shared.clone()));
     by_stage.into_iter().map(|(stage, measures)| (Some(stage), measures)).collect()
@@ -188,7 +189,7 @@ fn rows(version: &Version) -> Vec<Row> {
     measured(version).into_iter().map(row).collect()
 }
 
-/// Metrics in the order of the tables; what no table has comes last, by name.
+/// Returns metrics in the order of the tables; other metrics come last, by name.
 pub(crate) fn in_order(metrics: &BTreeMap<String, Measure>) -> Vec<(&String, Measure)> {
     let place = |key: &str| COLUMNS.iter().position(|column| column.key == key).unwrap_or(COLUMNS.len());
     let mut all: Vec<_> = metrics.iter().map(|(key, measure)| (key, *measure)).collect();
@@ -196,7 +197,7 @@ pub(crate) fn in_order(metrics: &BTreeMap<String, Measure>) -> Vec<(&String, Mea
     all
 }
 
-/// The value of `deciding`, and of the first few others that tables have.
+/// Returns the value of `deciding` and of the first few other metrics with a column.
 pub(crate) fn in_brief(version: &Version, deciding: Option<&str>) -> Vec<(String, Measure)> {
     const FEW: usize = 4;
     let plain = version.metrics.iter().filter(|(key, _)| !measures_of_a_stage(&version.metrics, key));
@@ -208,13 +209,14 @@ pub(crate) fn in_brief(version: &Version, deciding: Option<&str>) -> Vec<(String
     first.into_iter().chain(others).take(FEW).collect()
 }
 
-/// Whether `key` is `STAGE.METRIC`, and not an interval's end.
+/// Returns true if `key` is `STAGE.METRIC` and not the end of an interval.
 fn measures_of_a_stage(metrics: &BTreeMap<String, f64>, key: &str) -> bool {
     let base = key.strip_suffix(".lower").or_else(|| key.strip_suffix(".upper")).filter(|b| metrics.contains_key(*b));
     base.unwrap_or(key).contains('.')
 }
 
-/// Rows of `versions`, the best by `metric` first; with the published rows of the data format `published`, if any.
+/// Builds the rows of `versions`, the best by `metric` first, and adds published rows of the data format `published`,
+/// if given.
 pub fn leaderboard(title: String, versions: &[Version], metric: Option<&str>, published: Option<&str>) -> Leaderboard {
     let mut ours: Vec<Row> = versions.iter().flat_map(rows).collect();
     let deciding = metric.or_else(|| {
@@ -236,7 +238,7 @@ pub fn leaderboard(title: String, versions: &[Version], metric: Option<&str>, pu
     Leaderboard { title, rows: ours }
 }
 
-/// A table of evaluations in the order given, each with its name and its metrics; none where no table has a column for any of them.
+/// Builds a table of named evaluations in the given order; `None` if no metric has a column.
 pub fn evaluations(title: &str, all: impl IntoIterator<Item = (String, BTreeMap<String, f64>)>) -> Option<Leaderboard> {
     let row = |(label, metrics): (String, BTreeMap<String, f64>)| Row {
         source: label.clone(),
@@ -249,7 +251,7 @@ pub fn evaluations(title: &str, all: impl IntoIterator<Item = (String, BTreeMap<
     (!rows.is_empty()).then(|| Leaderboard { title: title.to_owned(), rows })
 }
 
-/// Two versions, metric by metric, in the papers' order; what no paper has comes last.
+/// Compares two versions metric by metric, in the papers' order; other metrics come last.
 pub fn compare(left: &Version, right: &Version) -> Comparison {
     let name = |version: &Version| format!("{}:{}", version.model, version.version);
     let (a, b) = (measures(&left.metrics), measures(&right.metrics));

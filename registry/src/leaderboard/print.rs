@@ -1,4 +1,4 @@
-//! Boards as text for terminals, and as Markdown and LaTeX rows that a paper or a page can take as they are.
+//! Leaderboards as text for terminals, and as Markdown and LaTeX rows for papers and pages.
 
 use clap::ValueEnum;
 use comfy_table::{ContentArrangement, Table, presets};
@@ -6,21 +6,21 @@ use serde::{Deserialize, Serialize};
 
 use super::{Better, COLUMNS, Column, Comparison, Leaderboard, Measure, PAPER_COLUMNS, Row, Verdict};
 
-/// How a table is written.
+/// Format of a table.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, ValueEnum)]
 #[serde(rename_all = "lowercase")]
 pub enum Style {
-    /// For a terminal.
+    /// Plain text for a terminal
     #[default]
     Text,
-    /// A table of GitHub's Markdown.
+    /// A table in GitHub's Markdown
     Markdown,
-    /// Rows of a `tabular`, with a comment that names the columns.
+    /// Rows of a `tabular`, with a comment that names the columns
     Latex,
 }
 
 impl Leaderboard {
-    /// The columns that a row of ours has; the papers' all together beside a published row, whatever of them we measured.
+    /// Returns the columns with a value in our rows. Next to published rows all columns of the papers are included.
     fn columns(&self) -> Vec<&'static Column> {
         let has = |column: &Column| self.rows.iter().any(|row| !row.published && row.measures.contains_key(column.key));
         let paper = self.rows.iter().any(|row| row.published);
@@ -32,7 +32,7 @@ impl Leaderboard {
             .collect()
     }
 
-    /// The table.
+    /// Formats the table.
     pub fn render(&self, style: Style) -> String {
         let columns = self.columns();
         let heads: Vec<String> = columns.iter().map(|c| format!("{}{}", c.head, arrow(c.better))).collect();
@@ -100,7 +100,7 @@ impl Leaderboard {
 }
 
 impl Comparison {
-    /// The table.
+    /// Formats the table.
     pub(crate) fn render(&self, style: Style) -> String {
         let cell = |measure: Option<Measure>| measure.map_or_else(|| "-".into(), |m| number(m, " ± "));
         let verdict = |verdict: Option<Verdict>| match verdict {
@@ -149,12 +149,12 @@ fn arrow(better: Better) -> &'static str {
     }
 }
 
-/// A value with its interval, as tables show it.
+/// Formats a value with its interval, as in tables.
 pub(crate) fn in_words(measure: Measure) -> String {
     number(measure, " ± ")
 }
 
-/// As many decimals as the interval has to say something about, and three without one, as the papers print.
+/// Formats with enough decimals for the interval, and with three without one, as papers print.
 fn number(measure: Measure, plus_minus: &str) -> String {
     let decimals = match measure.half {
         Some(half) if half > 0.0 && half < 5e-4 => 4,

@@ -1,4 +1,4 @@
-//! The rows of the papers: `published.tsv`, with its sources.
+//! Rows of the papers, from `published.tsv`, which names their sources.
 
 use std::collections::BTreeMap;
 
@@ -6,7 +6,7 @@ use super::row::{Measure, Row};
 
 const TABLE: &str = include_str!("published.tsv");
 
-/// The published rows of a data format (`humanml3d`, `kit`).
+/// Returns the published rows of a data format (`humanml3d`, `kit`).
 pub(super) fn rows(format: &str) -> Vec<Row> {
     let mut lines =
         TABLE.lines().filter(|line| !line.starts_with('#')).map(|line| line.split('\t').collect::<Vec<_>>());
@@ -26,7 +26,7 @@ pub(super) fn rows(format: &str) -> Vec<Row> {
     of_format.map(row).collect()
 }
 
-/// `.504±.002`, `.504`, or nothing.
+/// Parses `.504±.002` or `.504`; `None` for an empty cell.
 fn measure(cell: &str) -> Option<Measure> {
     let (value, half) = cell.split_once('±').map_or((cell, None), |(value, half)| (value, half.parse().ok()));
     Some(Measure { value: value.parse().ok()?, half })

@@ -1,4 +1,4 @@
-//! A row of a table: what was measured of one model.
+//! A row of a table: the measurements of one model.
 
 use std::collections::BTreeMap;
 
@@ -9,19 +9,19 @@ use serde::{Deserialize, Serialize};
 pub struct Measure {
     /// The mean.
     pub value: f64,
-    /// Half the width of its interval, if repeats were measured.
+    /// Half the width of the interval, if repeats were measured.
     pub half: Option<f64>,
 }
 
 /// One evaluation of one model, or a published result.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Row {
-    /// What a table calls it.
+    /// Name of the row in tables.
     pub label: String,
-    /// `MODEL:VERSION` of ours; the paper of a published row.
+    /// `MODEL:VERSION` of our rows; the paper of published rows.
     pub source: String,
-    /// Whether a paper says so.
+    /// True for a row from a paper.
     pub published: bool,
-    /// By metric.
+    /// Measures by metric.
     pub measures: BTreeMap<String, Measure>,
 }

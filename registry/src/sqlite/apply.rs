@@ -1,31 +1,35 @@
-//! What each [`Write`] does to the tables. Runs inside the writer's transaction, which is what makes the check of a fence
-//! and the writes it guards one thing.
+//! Application of each [`Write`] to the tables, inside the writer's transaction, so that the check of a fence and the
+//! guarded writes are atomic.
 //!
-//! All that one order writes is checked one after the other against the fences as they stand in this transaction, then
-//! stored table by table: a statement for many rows, because with hundreds of workers the statements are what costs.
+//! The writes of one order are first checked one by one against the fences in this transaction, then stored table by
+//! table. One statement stores many rows, because with hundreds of workers the number of statements dominates the cost.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
 
-use protocol::message::{Grant, MetricRow};
+use protocol::message::Grant;
 use protocol::{Digest, Fence, TaskId};
 use sqlx::query_builder::Separated;
 use sqlx::{QueryBuilder, Row, Sqlite, SqliteConnection};
 
 use super::error::write_error;
-use super::moves;
-use super::statement::{int, json, one, run};
+use super::recording::Recording;
+use super::statement::{ROWS, insert, int, json, one, run, run_and_stage};
+use super::{history, logs, moves, owners};
 use crate::catalog::{PromoteOrder, Which};
-use crate::vouched::{Vouched, complete};
+use crate::proofs::{Artifact, Proofs};
 use crate::write::two_states;
 use crate::{Write, WriteError, clock};
 
 type Result<T> = std::result::Result<T, WriteError>;
 
-/// Rows of one statement: eight values each stay below SQLite's limit for a statement's values.
-const ROWS: usize = 250;
-
 /// Does all of `writes`, or says why one of them is refused; then the caller rolls back.
-pub(super) async fn apply(conn: &mut SqliteConnection, blobs: &Vouched, writes: &[Write]) -> Result<()> {
+pub(super) async fn apply(
+    conn: &mut SqliteConnection,
+    proofs: &Proofs,
+    recording: &mut Recording,
+    writes: &[Write],
+) -> Result<()> {
     let mut fences = Fences::read(conn, writes).await?;
     let (mut decisions, mut shards) = (Vec::new(), BTreeMap::new());
     for write in writes {
@@ -34,11 +38,14 @@ pub(super) async fn apply(conn: &mut SqliteConnection, blobs: &Vouched, writes: 
         }
         match write {
             Write::Facts { seq, facts } => decisions.push((*seq, facts.as_str())),
+            Write::SnapshotParts { seq, parts } => set_parts(conn, *seq, parts).await?,
             Write::Snapshot { seq, state } => set_snapshot(conn, *seq, state).await?,
             Write::Fence { task, fence } => fences.raise(task, *fence)?,
             Write::Run { run, pipeline, source, state, idempotency_key } => {
                 set_run(conn, run.as_str(), &pipeline.to_string(), source, state, idempotency_key.as_deref()).await?;
             }
+            Write::RunOwner { run, owner } => owners::own_run(conn, run, owner).await?,
+            Write::ModelOwner { model, owner } => owners::claim(conn, model, owner).await?,
             Write::RunState { run: of, state } => {
                 let set = sqlx::query("UPDATE runs SET state = ?, updated_ms = ? WHERE run = ?");
                 run(conn, set.bind(state).bind(clock::now_ms()).bind(of.as_str())).await?;
@@ -51,10 +58,11 @@ pub(super) async fn apply(conn: &mut SqliteConnection, blobs: &Vouched, writes: 
             Write::Archive { key, run: of, stage, execution } => {
                 set_archive(conn, *key, of.as_str(), stage.as_str(), execution.as_deref()).await?;
             }
-            Write::Metrics { grant, rows } => add_metrics(conn, grant, rows).await?,
-            Write::Logs { grant, first, lines } => add_logs(conn, grant, *first, lines).await?,
+            Write::History(entries) => history::add(conn, entries).await?,
+            Write::Metrics { grant, rows } => recording.add(conn, grant, rows).await?,
+            Write::Logs { grant, first, lines } => logs::add(conn, grant, *first, lines).await?,
             Write::Checkpoint { grant, step, manifest, metrics } => {
-                complete(blobs, *manifest)?;
+                proven(conn, proofs, *manifest).await?;
                 one_checkpoint_a_step(conn, &grant.task, *step, *manifest).await?;
                 let insert = sqlx::query(
                     "INSERT INTO checkpoints (task, attempt, step, manifest, metrics, at_ms) VALUES (?, ?, ?, ?, ?, ?) \
@@ -64,7 +72,7 @@ pub(super) async fn apply(conn: &mut SqliteConnection, blobs: &Vouched, writes: 
                 run(conn, insert.bind(manifest.to_string()).bind(json(metrics)).bind(clock::now_ms())).await?;
             }
             Write::Shard { grant, output } => {
-                complete(blobs, *output)?;
+                proven(conn, proofs, *output).await?;
                 add_shard(&mut shards, &grant.task, *output)?;
             }
             Write::StageResult { grant: _, key, run, stage, kind, outputs, metrics, inputs, wall_s } => {
@@ -78,11 +86,11 @@ pub(super) async fn apply(conn: &mut SqliteConnection, blobs: &Vouched, writes: 
                     inputs,
                     wall_s: *wall_s,
                 };
-                set_result(conn, blobs, &made).await?;
+                set_result(conn, proofs, &made).await?;
             }
             Write::Version { model, artifact, metrics, source } => {
-                let manifest = complete(blobs, *artifact)?;
-                moves::register(conn, model, *artifact, manifest.kind, metrics, source).await?;
+                let kind = proven(conn, proofs, *artifact).await?.kind;
+                moves::register(conn, model, *artifact, kind, metrics, source).await?;
             }
             Write::Promote { model, alias, artifact, require, reason, actor } => {
                 let order = PromoteOrder {
@@ -103,21 +111,16 @@ pub(super) async fn apply(conn: &mut SqliteConnection, blobs: &Vouched, writes: 
     fences.write(conn).await
 }
 
-/// Runs `begin` with a tuple of values for each row, and `end`, as few statements as there may be.
-async fn insert<T>(
-    conn: &mut SqliteConnection,
-    begin: &'static str,
-    rows: &[T],
-    values: impl Fn(&mut Separated<'_, Sqlite, &'static str>, &T),
-    end: &'static str,
-) -> Result<()> {
-    for rows in rows.chunks(ROWS) {
-        let mut query = QueryBuilder::<Sqlite>::new(begin);
-        query.push_values(rows, |mut row, value| values(&mut row, value)).push(end);
-        // Another number of rows is another statement: not worth keeping.
-        run(conn, query.build().persistent(false)).await?;
-    }
-    Ok(())
+/// Checks that an artifact which a row is about to name is proven, and records its blobs as stored.
+pub(super) async fn proven(conn: &mut SqliteConnection, proofs: &Proofs, digest: Digest) -> Result<Arc<Artifact>> {
+    let artifact = proofs.name(digest)?;
+    let now = clock::now_ms();
+    let rows: Vec<(&Digest, &u64)> = artifact.blobs.iter().collect();
+    let values = |row: &mut Separated<'_, Sqlite, &'static str>, (digest, bytes): &(&Digest, &u64)| {
+        row.push_bind(digest.to_string()).push_bind(int(**bytes)).push_bind(now);
+    };
+    insert(conn, "INSERT INTO blobs (digest, bytes, verified_ms) ", &rows, values, " ON CONFLICT DO NOTHING").await?;
+    Ok(artifact)
 }
 
 /// What `select` says of those of `tasks` that it finds, by task. `select` gives two columns, the task first, and ends in an open
@@ -139,7 +142,7 @@ where
     Ok(found)
 }
 
-/// The fences of the tasks that an order is about, as they stand in its transaction.
+/// The fences of an order's tasks, as of its transaction.
 struct Fences {
     known: BTreeMap<TaskId, Fence>,
     raised: BTreeSet<TaskId>,
@@ -158,18 +161,16 @@ impl Fences {
         Ok(Self { known, raised: BTreeSet::new() })
     }
 
-    /// The check that every write with a grant passes: the grant is the newest that the store knows for its task.
+    /// Checks that a write's grant is the newest one of its task.
     fn check(&self, grant: &Grant) -> Result<()> {
         match self.known.get(&grant.task) {
             Some(current) if *current == grant.fence => Ok(()),
             Some(current) if *current > grant.fence => {
                 Err(WriteError::StaleFence { task: grant.task.clone(), current: *current, carried: grant.fence })
             }
-            current => Err(WriteError::Conflict(format!(
-                "the write for task `{}` carries fence {}, which was never granted: the newest is {}",
-                grant.task,
-                grant.fence,
-                current.map_or_else(|| "none".into(), |fence| fence.to_string())
+            _ => Err(WriteError::Conflict(format!(
+                "the write for task `{}` carries fence {}, which was never granted",
+                grant.task, grant.fence
             ))),
         }
     }
@@ -202,7 +203,7 @@ async fn add_facts(conn: &mut SqliteConnection, decisions: &[(u64, &str)]) -> Re
         let newest: i64 = one(conn, sqlx::query(find)).await?.map_or(0, |row| row.get(0));
         if newest >= int(*first) {
             return Err(WriteError::Internal(format!(
-                "decision {first} is in the store already (the newest is {newest}): does another coordinator hold it?"
+                "decision {first} is already stored (the newest is {newest}); check if another coordinator uses the store"
             )));
         }
     }
@@ -212,8 +213,23 @@ async fn add_facts(conn: &mut SqliteConnection, decisions: &[(u64, &str)]) -> Re
     insert(conn, "INSERT INTO facts (seq, at_ms, facts) ", decisions, values, "").await
 }
 
-/// Facts that a snapshot stands for go with the snapshot before it.
+async fn set_parts(conn: &mut SqliteConnection, seq: u64, parts: &[(String, Option<String>)]) -> Result<()> {
+    let values = |row: &mut Separated<'_, Sqlite, &'static str>, (part, state): &(String, Option<String>)| {
+        row.push_bind(part.clone()).push_bind(int(seq)).push_bind(state.clone());
+    };
+    let begin = "INSERT INTO snapshot_parts (part, seq, state) ";
+    insert(conn, begin, parts, values, " ON CONFLICT DO UPDATE SET state = excluded.state").await
+}
+
+/// Stores a snapshot. Deletes the facts it covers, the previous snapshot, and replaced parts.
 async fn set_snapshot(conn: &mut SqliteConnection, seq: u64, state: &str) -> Result<()> {
+    // Parts of a snapshot that was never completed.
+    let given_up = "DELETE FROM snapshot_parts WHERE seq < ? AND seq > (SELECT coalesce(max(seq), 0) FROM snapshots WHERE seq < ?)";
+    run(conn, sqlx::query(given_up).bind(int(seq)).bind(int(seq))).await?;
+    let superseded = "DELETE FROM snapshot_parts WHERE (part, seq) IN (SELECT old.part, old.seq FROM snapshot_parts new \
+                      JOIN snapshot_parts old ON old.part = new.part AND old.seq < new.seq WHERE new.seq = ?)";
+    run(conn, sqlx::query(superseded).bind(int(seq))).await?;
+    run(conn, sqlx::query("DELETE FROM snapshot_parts WHERE seq = ? AND state IS NULL").bind(int(seq))).await?;
     let set = sqlx::query(
         "INSERT INTO snapshots (seq, at_ms, state) VALUES (?, ?, ?) ON CONFLICT (seq) DO UPDATE SET state = excluded.state",
     );
@@ -239,7 +255,7 @@ async fn set_archive(
     run(conn, set.bind(key.to_string()).bind(of).bind(stage).bind(execution).bind(clock::now_ms())).await.map(|_| ())
 }
 
-/// A step of a task has one state. Two are a promise broken, and going on from either would hide it.
+/// Refuses a second state of one step. Two states break a guarantee, and continuing from either would hide that.
 async fn one_checkpoint_a_step(conn: &mut SqliteConnection, task: &TaskId, step: u64, manifest: Digest) -> Result<()> {
     let find = "SELECT manifest FROM checkpoints WHERE task = ? AND step = ? AND manifest <> ?";
     let find = sqlx::query(find).bind(task.as_str()).bind(int(step)).bind(manifest.to_string());
@@ -261,7 +277,7 @@ async fn set_run(
         let holder = one(conn, sqlx::query("SELECT run FROM runs WHERE idempotency_key = ?").bind(key)).await?;
         let holder: Option<String> = holder.map(|row| row.get(0));
         if let Some(holder) = holder.filter(|holder| holder != run_id) {
-            return Err(WriteError::Conflict(format!("idempotency key `{key}` is run `{holder}`'s already")));
+            return Err(WriteError::Conflict(format!("idempotency key `{key}` already belongs to run `{holder}`")));
         }
     }
     let now = clock::now_ms();
@@ -273,57 +289,6 @@ async fn set_run(
     run(conn, set.bind(run_id).bind(pipeline).bind(source).bind(state).bind(key).bind(now).bind(now)).await.map(|_| ())
 }
 
-/// A task's run and stage, out of its name.
-pub(super) fn run_and_stage(task: &TaskId) -> (&str, &str) {
-    let mut parts = task.as_str().split('/');
-    (parts.next().unwrap_or_default(), parts.next().unwrap_or_default())
-}
-
-async fn add_metrics(conn: &mut SqliteConnection, grant: &Grant, rows: &[MetricRow]) -> Result<()> {
-    let (of_run, stage) = run_and_stage(&grant.task);
-    let mut series: BTreeMap<&str, i64> = BTreeMap::new();
-    let mut all = Vec::with_capacity(rows.len());
-    for row in rows {
-        let id = match series.get(row.key.as_str()) {
-            Some(id) => *id,
-            None => {
-                let (task, attempt) = (grant.task.as_str(), int(grant.attempt.0));
-                let find = "SELECT id FROM series WHERE task = ? AND attempt = ? AND key = ?";
-                let found = one(conn, sqlx::query(find).bind(task).bind(attempt).bind(&row.key)).await?;
-                let id = match found {
-                    Some(found) => found.get(0),
-                    None => {
-                        let add =
-                            "INSERT INTO series (run, stage, task, attempt, key) VALUES (?, ?, ?, ?, ?) RETURNING id";
-                        let add = sqlx::query(add).bind(of_run).bind(stage).bind(task).bind(attempt).bind(&row.key);
-                        add.fetch_one(&mut *conn).await.map_err(write_error)?.get(0)
-                    }
-                };
-                series.insert(&row.key, id);
-                id
-            }
-        };
-        all.push((id, int(row.step), (!row.value.is_nan()).then_some(row.value)));
-    }
-    let values = |row: &mut Separated<'_, Sqlite, &'static str>, (id, step, value): &(i64, i64, Option<f64>)| {
-        row.push_bind(*id).push_bind(*step).push_bind(*value);
-    };
-    insert(conn, "INSERT INTO metrics (series, step, value) ", &all, values, " ON CONFLICT DO NOTHING").await
-}
-
-async fn add_logs(conn: &mut SqliteConnection, grant: &Grant, first: u64, lines: &[String]) -> Result<()> {
-    let (of_run, stage) = run_and_stage(&grant.task);
-    let now = clock::now_ms();
-    let rows: Vec<(u64, &String)> = (first..).zip(lines).collect();
-    let values = |row: &mut Separated<'_, Sqlite, &'static str>, (number, line): &(u64, &String)| {
-        row.push_bind(of_run.to_owned()).push_bind(stage.to_owned()).push_bind(grant.task.as_str().to_owned());
-        row.push_bind(int(grant.attempt.0)).push_bind(grant.worker.as_str().to_owned());
-        row.push_bind(int(*number)).push_bind(now).push_bind((*line).clone());
-    };
-    let begin = "INSERT INTO logs (run, stage, task, attempt, worker, line, at_ms, text) ";
-    insert(conn, begin, &rows, values, " ON CONFLICT DO NOTHING").await
-}
-
 /// Adds a shard to those that an order stores.
 fn add_shard<'a>(shards: &mut BTreeMap<&'a TaskId, Digest>, task: &'a TaskId, output: Digest) -> Result<()> {
     match shards.insert(task, output) {
@@ -333,7 +298,7 @@ fn add_shard<'a>(shards: &mut BTreeMap<&'a TaskId, Digest>, task: &'a TaskId, ou
 }
 
 fn two_shards(task: &TaskId, stored: &str, output: Digest) -> WriteError {
-    WriteError::Conflict(format!("shard `{task}` is stored as {stored} already; now it is {output}"))
+    WriteError::Conflict(format!("shard `{task}` is already stored as {stored}, but this attempt made {output}"))
 }
 
 async fn add_shards(conn: &mut SqliteConnection, shards: &BTreeMap<&TaskId, Digest>) -> Result<()> {
@@ -365,7 +330,7 @@ struct Made<'a> {
     wall_s: f64,
 }
 
-async fn set_result(conn: &mut SqliteConnection, blobs: &Vouched, made: &Made<'_>) -> Result<()> {
+async fn set_result(conn: &mut SqliteConnection, proofs: &Proofs, made: &Made<'_>) -> Result<()> {
     let (key, outputs) = (made.key.to_string(), json(made.outputs));
     let stored = one(conn, sqlx::query("SELECT outputs FROM stage_results WHERE key = ?").bind(&key)).await?;
     match stored.map(|row| row.get::<String, _>(0)) {
@@ -378,7 +343,7 @@ async fn set_result(conn: &mut SqliteConnection, blobs: &Vouched, made: &Made<'_
         }
         None => {}
     }
-    blobs.named.note(made.inputs.values().copied());
+    proofs.note(made.inputs.values().copied());
     let now = clock::now_ms();
     let add = sqlx::query(
         "INSERT INTO stage_results (key, run, stage, kind, outputs, metrics, inputs, wall_s, at_ms) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
@@ -386,14 +351,13 @@ async fn set_result(conn: &mut SqliteConnection, blobs: &Vouched, made: &Made<'_
     let add = add.bind(&key).bind(made.run).bind(made.stage).bind(made.kind).bind(outputs).bind(json(made.metrics));
     run(conn, add.bind(json(made.inputs)).bind(made.wall_s).bind(now)).await?;
     for output in made.outputs.values() {
-        let manifest = complete(blobs, *output)?;
+        let artifact = proven(conn, proofs, *output).await?;
         let kind =
-            serde_json::to_value(manifest.kind).ok().and_then(|k| k.as_str().map(str::to_owned)).unwrap_or_default();
-        let bytes: u64 = manifest.files.values().map(|file| file.bytes).sum();
+            serde_json::to_value(artifact.kind).ok().and_then(|k| k.as_str().map(str::to_owned)).unwrap_or_default();
         let add = sqlx::query(
             "INSERT INTO artifacts (digest, kind, bytes, run, stage, key, at_ms) VALUES (?, ?, ?, ?, ?, ?, ?) ON CONFLICT DO NOTHING",
         );
-        let add = add.bind(output.to_string()).bind(kind).bind(int(bytes)).bind(made.run).bind(made.stage);
+        let add = add.bind(output.to_string()).bind(kind).bind(int(artifact.bytes)).bind(made.run).bind(made.stage);
         run(conn, add.bind(&key).bind(now)).await?;
         for (role, input) in made.inputs {
             let add = sqlx::query("INSERT INTO edges (parent, child, role) VALUES (?, ?, ?) ON CONFLICT DO NOTHING");

@@ -1,4 +1,4 @@
-//! Forgetting runs: which rows go. What each may take stands in [`crate::forget`].
+//! Deletion of runs in the tables; [`crate::forget`] describes the rules.
 
 use std::collections::BTreeSet;
 
@@ -6,11 +6,12 @@ use protocol::{RunId, StageName};
 use sqlx::{Row, SqliteConnection};
 
 use super::error::write_error;
+use super::owners;
 use super::statement::{one, run as execute};
 use crate::forget::Forgotten;
 use crate::{WriteError, clock};
 
-/// Forgets a run that has ended, and what earlier ones left that nobody needs any more.
+/// Deletes an ended run, and data of earlier ones that is no longer needed.
 pub(super) async fn forget(conn: &mut SqliteConnection, run: &RunId) -> Result<Forgotten, WriteError> {
     let find = sqlx::query("SELECT state, view IS NOT NULL FROM runs WHERE run = ?").bind(run.as_str());
     let Some(row) = one(conn, find).await? else {
@@ -19,10 +20,11 @@ pub(super) async fn forget(conn: &mut SqliteConnection, run: &RunId) -> Result<F
     let (state, has_ended): (String, bool) = (row.get(0), row.get(1));
     if !has_ended || !matches!(state.as_str(), "finished" | "failed" | "cancelled") {
         return Err(WriteError::Conflict(format!(
-            "run `{run}` is {state}, and only a run that has ended can be forgotten; `trainer cancel {run}` ends it"
+            "run `{run}` is {state}; only an ended run can be forgotten; `trainer cancel {run}` ends it"
         )));
     }
     execute(conn, sqlx::query("DELETE FROM runs WHERE run = ?").bind(run.as_str())).await?;
+    owners::disown_run(conn, run).await?;
     let note = sqlx::query("INSERT INTO forgotten (run, at_ms) VALUES (?, ?) ON CONFLICT DO NOTHING");
     execute(conn, note.bind(run.as_str()).bind(clock::now_ms())).await?;
     let mut gone = Forgotten::default();
@@ -32,8 +34,8 @@ pub(super) async fn forget(conn: &mut SqliteConnection, run: &RunId) -> Result<F
     Ok(gone)
 }
 
-/// Forgets what a run that ended before a time has left behind and nobody needs; the run itself, and what its stages gave, stay. To
-/// take it up again is to compute that anew.
+/// Deletes unreferenced data of a run that ended before a time. The run and its stages' values stay; resuming the run
+/// computes the deleted data again.
 pub(super) async fn forget_leftovers(
     conn: &mut SqliteConnection,
     run: &RunId,
@@ -66,13 +68,13 @@ async fn stages(conn: &mut SqliteConnection, sql: &'static str, run: &str) -> Re
     Ok(rows.iter().map(|row| row.get(0)).collect())
 }
 
-/// All stages that have a row in the run's name.
+/// All stages with rows of the run.
 const STAGES: &str = "SELECT stage FROM stage_results WHERE run = ?1 UNION SELECT stage FROM executions WHERE run = ?1 \
-    UNION SELECT stage FROM series WHERE run = ?1 UNION SELECT stage FROM logs WHERE run = ?1 \
+    UNION SELECT stage FROM series WHERE run = ?1 UNION SELECT stage FROM log_streams WHERE run = ?1 \
     UNION SELECT substr(task, length(?1) + 2) FROM checkpoints WHERE task >= ?1 || '/' AND task < ?1 || '0' \
     UNION SELECT substr(task, length(?1) + 2) FROM fences WHERE task >= ?1 || '/' AND task < ?1 || '0'";
 
-/// Stages that the lineage of a version or a pin names, or whose value another run has.
+/// Stages in the lineage of a version or a pin, or whose value another run has.
 const NEEDED: &str = "WITH RECURSIVE lineage (digest) AS (SELECT artifact FROM versions UNION SELECT digest FROM pins \
     UNION SELECT parent FROM edges JOIN lineage ON child = lineage.digest), \
     held (key) AS (SELECT json_extract(stage.value, '$.key') FROM runs, json_each(runs.view, '$.stages') AS stage) \
@@ -80,12 +82,12 @@ const NEEDED: &str = "WITH RECURSIVE lineage (digest) AS (SELECT artifact FROM v
     UNION SELECT stage FROM stage_results WHERE run = ?1 AND key IN (SELECT key FROM held) \
     UNION SELECT stage FROM executions WHERE run = ?1 AND key IN (SELECT key FROM held)";
 
-/// Stages in whose name there is something that names blobs.
+/// Stages with rows that name blobs.
 const LEFT: &str = "SELECT stage FROM stage_results WHERE run = ?1 \
     UNION SELECT substr(task, length(?1) + 2) FROM checkpoints WHERE task >= ?1 || '/' AND task < ?1 || '0' \
     UNION SELECT substr(task, length(?1) + 2) FROM shards WHERE task >= ?1 || '/' AND task < ?1 || '0'";
 
-/// Stages that the lineage of a version or a pin names, whose value a stage has that is no trial, or that a run which ended since has.
+/// Stages in the lineage of a version or a pin, or whose value a stage other than a trial or a recently ended run has.
 const STILL_NEEDED: &str = "WITH RECURSIVE lineage (digest) AS (SELECT artifact FROM versions UNION SELECT digest FROM pins \
     UNION SELECT parent FROM edges JOIN lineage ON child = lineage.digest), \
     held (key, is_trial, is_recent) AS (SELECT json_extract(stage.value, '$.key'), \
@@ -95,14 +97,15 @@ const STILL_NEEDED: &str = "WITH RECURSIVE lineage (digest) AS (SELECT artifact 
     UNION SELECT stage FROM stage_results WHERE run = ?1 AND key IN (SELECT key FROM held WHERE NOT is_trial OR is_recent) \
     UNION SELECT stage FROM executions WHERE run = ?1 AND key IN (SELECT key FROM held WHERE is_recent)";
 
-/// Names of the stages of runs under way.
+/// Names of the stages of running runs.
 const UNDER_WAY: &str = "SELECT json_extract(stage.value, '$.name') FROM runs, json_each(runs.pipeline, '$.stages') AS stage \
     WHERE state IN ('running', 'paused') AND ?1 = ?1";
 
 async fn forget_stages(conn: &mut SqliteConnection, run: &str, gone: &mut Forgotten) -> Result<(), WriteError> {
     let needed = stages(conn, NEEDED, run).await?;
     let under_way = stages(conn, UNDER_WAY, run).await?;
-    // A sweep's stages have the swept stage's name and a dot before their own; a shard's task its number behind a slash.
+    // The name of a sweep's stage starts with the swept stage and a dot; a shard's task ends with a slash and its
+    // number.
     let first = |name: &str| name.split(['.', '/']).next().unwrap_or_default().to_owned();
     let all: BTreeSet<String> = stages(conn, STAGES, run).await?;
     let all = all.iter().map(|name| name.split('/').next().unwrap_or_default().to_owned());
@@ -117,6 +120,7 @@ async fn forget_stages(conn: &mut SqliteConnection, run: &str, gone: &mut Forgot
     }
     if !kept_any {
         execute(conn, sqlx::query("DELETE FROM shards WHERE run = ?").bind(run)).await?;
+        execute(conn, sqlx::query("DELETE FROM usage WHERE run = ?").bind(run)).await?;
         execute(conn, sqlx::query("DELETE FROM forgotten WHERE run = ?").bind(run)).await?;
     }
     Ok(())
@@ -129,12 +133,23 @@ async fn forget_stage(
     gone: &mut Forgotten,
 ) -> Result<(), WriteError> {
     let mut delete = async |sql: &'static str| execute(conn, sqlx::query(sql).bind(run).bind(stage.as_str())).await;
+    delete("DELETE FROM rollups WHERE series IN (SELECT id FROM series WHERE run = ?1 AND stage = ?2)").await?;
+    delete("DELETE FROM recorded WHERE recorder IN (SELECT id FROM recorders WHERE run = ?1 AND stage = ?2)").await?;
+    delete("DELETE FROM recorders WHERE run = ?1 AND stage = ?2").await?;
     gone.values +=
         delete("DELETE FROM metrics WHERE series IN (SELECT id FROM series WHERE run = ?1 AND stage = ?2)").await?;
     delete("DELETE FROM series WHERE run = ?1 AND stage = ?2").await?;
-    gone.lines += delete("DELETE FROM logs WHERE run = ?1 AND stage = ?2").await?;
+    let streams = "SELECT coalesce(sum(count), 0) FROM log_batches WHERE stream IN \
+                   (SELECT id FROM log_streams WHERE run = ?1 AND stage = ?2)";
+    let lines = sqlx::query(streams).bind(run).bind(stage.as_str()).fetch_one(&mut *conn).await.map_err(write_error)?;
+    gone.lines += lines.get::<i64, _>(0).unsigned_abs();
+    let mut delete = async |sql: &'static str| execute(conn, sqlx::query(sql).bind(run).bind(stage.as_str())).await;
+    delete("DELETE FROM log_batches WHERE stream IN (SELECT id FROM log_streams WHERE run = ?1 AND stage = ?2)")
+        .await?;
+    delete("DELETE FROM log_streams WHERE run = ?1 AND stage = ?2").await?;
+    delete("DELETE FROM stage_times WHERE run = ?1 AND stage = ?2").await?;
     delete("DELETE FROM executions WHERE run = ?1 AND stage = ?2").await?;
-    // A task's name is `run/stage` or `run/stage/shard`; `0` comes right after `/`.
+    // A task's name is `run/stage` or `run/stage/shard`; `0` is the character after `/`.
     gone.checkpoints += delete(
         "DELETE FROM checkpoints WHERE task = ?1 || '/' || ?2 OR (task >= ?1 || '/' || ?2 || '/' AND task < ?1 || '/' || ?2 || '0')",
     )

@@ -1,18 +1,25 @@
-//! The catalog in SQLite: its connections, its migrations, and the one writer.
+//! The catalog in SQLite: connections, migrations, and the single writer.
 //!
-//! One connection writes, from a thread of its own ([`writer`]); queries use read-only connections and see what was
-//! committed. `database is locked` cannot happen: nobody else writes, and readers of a WAL database wait for nobody.
+//! One connection writes from its own thread ([`writer`]); queries use read-only connections and see committed data.
+//! `database is locked` cannot happen: there is no second writer, and readers of a WAL database never wait.
 
 mod apply;
+mod curves;
 mod error;
 mod forget;
+mod history;
+mod logs;
 mod models;
 mod moves;
 mod open;
+mod owners;
 mod query;
+mod recording;
 mod retention;
 mod rows;
 mod statement;
+mod times;
+mod usage;
 mod writer;
 
 use std::sync::Arc;

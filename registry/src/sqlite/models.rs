@@ -1,4 +1,4 @@
-//! Models, versions and moves as rows, from any connection.
+//! Reads of models, versions and moves, over any connection.
 
 use std::collections::BTreeMap;
 
@@ -9,7 +9,7 @@ use sqlx::{Row, SqliteConnection};
 
 use crate::versions::{self, Action, Model, Promotion, Version};
 
-/// Metrics as stored; what was no number is NaN again.
+/// Parses stored metrics; null becomes NaN.
 pub(super) fn numbers(text: &str) -> BTreeMap<String, f64> {
     let stored: BTreeMap<String, Option<f64>> = serde_json::from_str(text).unwrap_or_default();
     stored.into_iter().map(|(key, value)| (key, value.unwrap_or(f64::NAN))).collect()
@@ -41,7 +41,7 @@ const VERSIONS: &str = "SELECT v.*, (SELECT group_concat(alias, ',') FROM (SELEC
     WHERE a.model = v.model AND a.version = v.version ORDER BY alias)) AS aliases \
     FROM versions v WHERE v.model = ? ORDER BY v.version";
 
-/// All versions of a model, oldest first.
+/// Returns all versions of a model, oldest first.
 pub(super) async fn versions(conn: &mut SqliteConnection, model: &ModelName) -> Result<Vec<Version>, sqlx::Error> {
     let rows = sqlx::query(VERSIONS).bind(model.as_str()).fetch_all(&mut *conn).await?;
     rows.iter().map(version).collect()
@@ -60,14 +60,14 @@ async fn declared(
     Ok(Some((row.try_get("metric")?, mode)))
 }
 
-/// One model.
+/// Returns one model.
 pub(super) async fn model(conn: &mut SqliteConnection, name: &ModelName) -> Result<Option<Model>, sqlx::Error> {
     let Some((metric, mode)) = declared(conn, name).await? else { return Ok(None) };
     let versions = versions(conn, name).await?;
     Ok(Some(versions::summary(name.clone(), metric, mode, &versions)))
 }
 
-/// All models by name.
+/// Returns all models by name.
 pub(super) async fn models(conn: &mut SqliteConnection) -> Result<Vec<Model>, sqlx::Error> {
     let rows = sqlx::query("SELECT model FROM models ORDER BY model").fetch_all(&mut *conn).await?;
     let mut models = Vec::with_capacity(rows.len());
@@ -77,7 +77,7 @@ pub(super) async fn models(conn: &mut SqliteConnection) -> Result<Vec<Model>, sq
     Ok(models)
 }
 
-/// The moves of a model's aliases, or of one of them, oldest first.
+/// Returns the moves of a model's aliases, or of one alias, oldest first.
 pub(super) async fn history(
     conn: &mut SqliteConnection,
     model: &ModelName,

@@ -1,4 +1,4 @@
-//! What changes models and aliases: registering, promoting, rolling back. Each runs inside the writer's transaction.
+//! Changes of models and aliases: registration, promotion, rollback. Each runs inside the writer's transaction.
 
 use std::collections::BTreeMap;
 
@@ -7,13 +7,14 @@ use serde_json::Value;
 use sqlx::{Row, SqliteConnection};
 
 use super::error::write_error;
-use super::models;
 use super::statement::{int, json, one, run};
+use super::{history, models};
 use crate::catalog::{PromoteOrder, RollbackOrder, Which};
+use crate::history::{HistoryEntry, HistoryKind};
 use crate::versions::{self, Action, Gate, GateResult, ModelRef, Pick, Promotion, Version};
 use crate::{QueryError, WriteError, clock};
 
-/// Registers an artifact, or adds metrics to the version that it is already; returns the version's number.
+/// Registers an artifact, or adds metrics to its existing version. Returns the version's number.
 pub(super) async fn register(
     conn: &mut SqliteConnection,
     model: &ModelName,
@@ -41,7 +42,7 @@ pub(super) async fn register(
         run(conn, set.bind(json(&all)).bind(model.as_str()).bind(int(version.version))).await?;
         return Ok(version.version);
     }
-    // The one writer makes the next number safe; the primary key would refuse a second one all the same.
+    // The single writer makes the next number safe; the primary key refuses a duplicate as well.
     let add = sqlx::query(
         "INSERT INTO versions (model, version, artifact, metrics, source, at_ms) \
          SELECT ?1, coalesce(max(version), 0) + 1, ?2, ?3, ?4, ?5 FROM versions WHERE model = ?1 RETURNING version",
@@ -52,7 +53,7 @@ pub(super) async fn register(
     Ok(row.get::<i64, _>(0).unsigned_abs())
 }
 
-/// Which metric decides `@best` comes with the registration: `source.metric` and `source.mode`. The newest word counts.
+/// Stores the metric that ranks `@best`, from `source.metric` and `source.mode` of the newest registration.
 async fn declare(conn: &mut SqliteConnection, model: &ModelName, source: &Value) -> Result<(), WriteError> {
     let (Some(metric), mode) = (source["metric"].as_str(), source["mode"].as_str().unwrap_or("min")) else {
         return Ok(());
@@ -66,7 +67,7 @@ async fn declare(conn: &mut SqliteConnection, model: &ModelName, source: &Value)
     run(conn, set.bind(metric).bind(mode).bind(model.as_str())).await.map(|_| ())
 }
 
-/// The version that a reference points at.
+/// Returns the version that a reference names.
 async fn resolve(conn: &mut SqliteConnection, model: &ModelName, pick: Pick) -> Result<Version, QueryError> {
     let reference = ModelRef { model: model.clone(), pick: Some(pick) };
     match models::model(conn, model).await? {
@@ -75,7 +76,7 @@ async fn resolve(conn: &mut SqliteConnection, model: &ModelName, pick: Pick) -> 
     }
 }
 
-/// Moves an alias forward: compares, judges, moves, logs. Nothing changes if the alias points there already.
+/// Moves an alias forward: compares, checks the gates, moves, logs. Changes nothing if the alias already points there.
 pub(super) async fn promote(conn: &mut SqliteConnection, order: &PromoteOrder) -> Result<Promotion, WriteError> {
     let PromoteOrder { model, alias, .. } = order;
     versions::refuse_reserved(alias)?;
@@ -92,10 +93,10 @@ pub(super) async fn promote(conn: &mut SqliteConnection, order: &PromoteOrder) -
     versions::compare(model, alias, current, order.expect)?;
     let gates = versions::gates(&order.require)?;
     let others = compared_with(conn, order, &gates).await?;
-    let gates = versions::judge(&gates, &candidate, alias, &others)?;
+    let gates = versions::evaluate(&gates, &candidate, alias, &others)?;
     if current == Some(candidate.version) {
         let log = models::history(conn, model, Some(alias)).await.map_err(write_error)?;
-        // As it was moved, with what its gates say now.
+        // The logged move with the current results of its gates.
         let moved = log.into_iter().next_back();
         return moved
             .map(|moved| Promotion { gates, ..moved })
@@ -105,7 +106,7 @@ pub(super) async fn promote(conn: &mut SqliteConnection, order: &PromoteOrder) -
     set_alias(conn, moved, gates, &order.reason, &order.actor).await
 }
 
-/// The metrics of the versions that gates compare with, by alias.
+/// Returns the metrics of the versions that gates compare with, by alias.
 async fn compared_with(
     conn: &mut SqliteConnection,
     order: &PromoteOrder,
@@ -115,7 +116,7 @@ async fn compared_with(
     for alias in gates.iter().filter_map(Gate::alias) {
         match resolve(conn, &order.model, Pick::Alias(alias.clone())).await {
             Ok(version) => drop(metrics.insert(alias.clone(), version.metrics)),
-            // The first promotion to an alias has nothing to be worse than.
+            // The first promotion to an alias has no version to compare with.
             Err(QueryError::NotFound(_)) if *alias == order.alias => {}
             Err(e) => return Err(e.into()),
         }
@@ -123,7 +124,7 @@ async fn compared_with(
     Ok(metrics)
 }
 
-/// Moves an alias back: to `to`, or to where it pointed before its last move forward.
+/// Moves an alias back, to `to` or to its version before the last promotion.
 pub(super) async fn rollback(conn: &mut SqliteConnection, order: &RollbackOrder) -> Result<Promotion, WriteError> {
     let RollbackOrder { model, alias, .. } = order;
     versions::refuse_reserved(alias)?;
@@ -157,7 +158,7 @@ async fn pointed(conn: &mut SqliteConnection, model: &ModelName, alias: &Alias) 
     Ok(row.map(|row| row.get::<i64, _>(0).unsigned_abs()))
 }
 
-/// Which alias goes from where to where.
+/// A move of an alias.
 struct Move<'a> {
     model: &'a ModelName,
     alias: &'a Alias,
@@ -190,6 +191,14 @@ async fn set_alias(
     );
     let log = log.bind(at_ms).bind(model.as_str()).bind(alias.as_str()).bind(name).bind(from.map(int)).bind(int(to));
     let row = log.bind(actor).bind(reason).bind(json(&gates)).fetch_one(&mut *conn).await.map_err(write_error)?;
+    let kind = match action {
+        Action::Promote => HistoryKind::Promoted,
+        Action::Rollback => HistoryKind::RolledBack,
+    };
+    let (model_name, why) = (Some(model.clone()), format!("@{alias} is version {to}: {reason}"));
+    let entry =
+        HistoryEntry { model: model_name, actor: Some(actor.to_owned()), why: Some(why), ..HistoryEntry::new(kind) };
+    history::add(conn, &[entry]).await?;
     Ok(Promotion {
         id: row.get(0),
         at_ms,

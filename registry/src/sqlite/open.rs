@@ -1,4 +1,4 @@
-//! Opening a database: for writing, once its schema is the newest and its parts belong together, and for reading.
+//! Opening of a database: for writing after migrating and checking it, or for reading.
 
 use std::cmp::Ordering;
 use std::path::Path;
@@ -12,7 +12,7 @@ use super::error::open_error;
 use super::statement::int;
 use crate::clock;
 use crate::folder::{self, DATABASE};
-use crate::identity::{Found, Verdict};
+use crate::identity::{StoreParts, Verdict};
 use crate::open_error::OpenError;
 use crate::store_id::{StoreId, Stored};
 
@@ -33,18 +33,18 @@ fn options(dir: &Path) -> SqliteConnectOptions {
 pub(crate) struct Opened {
     pub(crate) conn: SqliteConnection,
     pub(crate) store: StoreId,
-    /// What the folder was found to be.
+    /// Result of the identity check.
     pub(crate) verdict: Verdict,
 }
 
-/// Opens the writing connection and brings the schema up to date, once the database belongs to what was `found` beside it. Only
-/// for the holder of the store's lock.
-pub(crate) async fn open_writer(dir: &Path, found: &Found, adopt: bool) -> Result<Opened, OpenError> {
+/// Opens the writing connection and migrates the schema, after checking that the database belongs to the parts `found`
+/// beside it. Only for the holder of the store's lock.
+pub(crate) async fn open_writer(dir: &Path, found: &StoreParts, adopt: bool) -> Result<Opened, OpenError> {
     let path = folder::database(dir);
     let existed = folder::has_database(dir);
     let mismatch = |mismatch| OpenError::Mismatch { dir: dir.to_owned(), mismatch };
     if !existed {
-        found.judge(None).map_err(mismatch)?;
+        found.classify(None).map_err(mismatch)?;
     }
     let mut conn = SqliteConnection::connect_with(&options(dir).create_if_missing(!existed))
         .await
@@ -52,7 +52,7 @@ pub(crate) async fn open_writer(dir: &Path, found: &Found, adopt: bool) -> Resul
     let verdict = match belongs(dir, found, adopt, existed, &mut conn).await {
         Ok(verdict) => verdict,
         Err(refused) => {
-            // Takes the empty log with it that opening has made. That it is refused matters more than how closing goes.
+            // Removes the empty log that opening has created. The refusal matters more than an error of closing.
             let _ = conn.close().await;
             return Err(refused);
         }
@@ -60,23 +60,29 @@ pub(crate) async fn open_writer(dir: &Path, found: &Found, adopt: bool) -> Resul
     if existed {
         back_up_before_migrating(dir, &mut conn).await?;
     }
-    // Not `run`: its future cannot be sent to another thread.
+    // Not `run`: its future is not `Send`.
     MIGRATOR.run_direct(None, &mut conn, false).await.map_err(|e| match e {
         MigrateError::VersionMissing(found) => OpenError::NewerSchema { path: path.clone(), found, known: newest() },
         MigrateError::Execute(e) | MigrateError::ExecuteMigration(e, _) => open_error(&path, &e),
         e => OpenError::Damaged { path: path.clone(), message: e.to_string() },
     })?;
     let store = match &verdict {
-        Verdict::Whole(store) | Verdict::Unfinished(store) => store.clone(),
+        Verdict::Whole(store) => store.clone(),
+        Verdict::Unfinished(store) => {
+            // Earlier records of blobs do not apply to the present ones.
+            let forget = sqlx::query("DELETE FROM blobs").execute(&mut conn).await;
+            forget.map_err(|e| open_error(&path, &e))?;
+            store.clone()
+        }
         Verdict::New => name(&path, &mut conn).await?,
     };
     Ok(Opened { conn, store, verdict })
 }
 
-/// Whether an open database belongs to what was `found` beside it.
+/// Checks that an open database belongs to the parts `found` beside it.
 async fn belongs(
     dir: &Path,
-    found: &Found,
+    found: &StoreParts,
     adopt: bool,
     existed: bool,
     conn: &mut SqliteConnection,
@@ -86,7 +92,7 @@ async fn belongs(
     }
     let failed = |e: &sqlx::Error| open_error(&folder::database(dir), e);
     let stored = stored(conn).await.map_err(|e| failed(&e))?;
-    match (found.judge(stored.as_ref()), stored) {
+    match (found.classify(stored.as_ref()), stored) {
         (Ok(verdict), _) => Ok(verdict),
         (Err(why), Some(stored)) if adopt && why.may_be_adopted() => {
             let reach = sqlx::query("UPDATE store SET commits = max(commits, ?), epoch = max(epoch, ?)");
@@ -98,7 +104,7 @@ async fn belongs(
     }
 }
 
-/// What a database says of its store; `None` if it was never one of a store.
+/// Reads the identity row of a database; `None` if it belongs to no store.
 pub(super) async fn stored(conn: &mut SqliteConnection) -> Result<Option<Stored>, sqlx::Error> {
     let has_table = sqlx::query("SELECT count(*) FROM sqlite_master WHERE type = 'table' AND name = 'store'");
     let has_table: i64 = has_table.fetch_one(&mut *conn).await?.try_get(0)?;
@@ -115,7 +121,7 @@ pub(super) async fn stored(conn: &mut SqliteConnection) -> Result<Option<Stored>
     .transpose()
 }
 
-/// Gives a new database the name of a new store.
+/// Names a new database as a new store.
 async fn name(path: &Path, conn: &mut SqliteConnection) -> Result<StoreId, OpenError> {
     let io = |e: std::io::Error| OpenError::Other { path: path.to_owned(), message: e.to_string() };
     let id = StoreId::random().map_err(io)?;
@@ -125,34 +131,34 @@ async fn name(path: &Path, conn: &mut SqliteConnection) -> Result<StoreId, OpenE
     Ok(id)
 }
 
-/// Raises the database's epoch: from here on a process that opened it before cannot write to it.
+/// Raises the database's epoch. From then on a process that opened it earlier cannot write to it.
 pub(crate) async fn raise_epoch(dir: &Path, conn: &mut SqliteConnection) -> Result<Stored, OpenError> {
     let failed = |e: &sqlx::Error| open_error(&folder::database(dir), e);
     let raise = "UPDATE store SET epoch = epoch + 1, commits = commits + 1";
     sqlx::query(raise).execute(&mut *conn).await.map_err(|e| failed(&e))?;
     let stored = stored(conn).await.map_err(|e| failed(&e))?;
-    stored.ok_or_else(|| OpenError::Damaged {
-        path: folder::database(dir),
-        message: "the row of the store is gone".into(),
-    })
+    stored
+        .ok_or_else(|| OpenError::Damaged { path: folder::database(dir), message: "the store's row is missing".into() })
 }
 
-/// Makes the epoch of a database that nobody has opened at least `epoch`.
+/// Raises the epoch of a closed database to at least `epoch`.
 pub(crate) async fn reach_epoch(dir: &Path, epoch: u64) -> Result<(), sqlx::Error> {
     let options = SqliteConnectOptions::new().filename(folder::database(dir)).synchronous(SqliteSynchronous::Full);
     let mut conn = SqliteConnection::connect_with(&options).await?;
     let reach = sqlx::query("UPDATE store SET epoch = max(epoch, ?)").bind(int(epoch));
     reach.execute(&mut conn).await?;
+    // Only needed blobs came with the copy.
+    sqlx::query("DELETE FROM blobs").execute(&mut conn).await?;
     conn.close().await
 }
 
-/// Read-only connections for queries. They connect when first used. `closed`: nobody writes as long as they are open, and there is
-/// no log.
+/// Makes a pool of read-only connections that connect on first use. With `closed` the database has no writer and no log
+/// while they are open.
 pub(crate) fn open_readers(dir: &Path, closed: bool) -> SqlitePool {
     SqlitePoolOptions::new().max_connections(4).connect_lazy_with(reading(dir, closed))
 }
 
-/// A copy of a database that nobody writes to.
+/// Opens a copy of a database that has no writer.
 pub(crate) async fn open_copy(path: &Path) -> Result<SqliteConnection, sqlx::Error> {
     SqliteConnection::connect_with(&SqliteConnectOptions::new().filename(path).read_only(true).immutable(true)).await
 }
@@ -166,22 +172,22 @@ fn reading(dir: &Path, closed: bool) -> SqliteConnectOptions {
         .statement_cache_capacity(200)
 }
 
-/// Whether a database that is only read belongs to what was `found` beside it and has the schema that this build reads; gives the
-/// store's name.
-pub(crate) async fn check_to_read(dir: &Path, found: &Found, closed: bool) -> Result<StoreId, OpenError> {
+/// Checks that a database opened for reading belongs to the parts `found` beside it and has this build's schema.
+/// Returns the store's identity.
+pub(crate) async fn check_to_read(dir: &Path, found: &StoreParts, closed: bool) -> Result<StoreId, OpenError> {
     let path = folder::database(dir);
     let mismatch = |mismatch| OpenError::Mismatch { dir: dir.to_owned(), mismatch };
     let failed = |e: &sqlx::Error| open_error(&path, e);
     if !folder::has_database(dir) {
-        found.judge(None).map_err(mismatch)?;
+        found.classify(None).map_err(mismatch)?;
         return Err(OpenError::NotAStore(dir.to_owned()));
     }
     let mut conn = SqliteConnection::connect_with(&reading(dir, closed)).await.map_err(|e| failed(&e))?;
     let Some(stored) = stored(&mut conn).await.map_err(|e| failed(&e))? else {
-        found.judge(None).map_err(mismatch)?;
+        found.classify(None).map_err(mismatch)?;
         return Err(OpenError::NotAStore(dir.to_owned()));
     };
-    found.judge(Some(&stored)).map_err(mismatch)?;
+    found.classify(Some(&stored)).map_err(mismatch)?;
     let applied = sqlx::query("SELECT coalesce(max(version), 0) FROM _sqlx_migrations");
     let applied: i64 = applied.fetch_one(&mut conn).await.map_err(|e| failed(&e))?.get(0);
     conn.close().await.map_err(|e| failed(&e))?;
@@ -196,7 +202,7 @@ fn newest() -> i64 {
     MIGRATOR.iter().map(|m| m.version).max().unwrap_or(0)
 }
 
-/// Keeps a copy beside the database when this build is about to change its schema.
+/// Copies the database to a file beside it before a migration.
 async fn back_up_before_migrating(dir: &Path, conn: &mut SqliteConnection) -> Result<(), OpenError> {
     let path = folder::database(dir);
     let has_table = sqlx::query("SELECT count(*) FROM sqlite_master WHERE name = '_sqlx_migrations'");
@@ -211,7 +217,7 @@ async fn back_up_before_migrating(dir: &Path, conn: &mut SqliteConnection) -> Re
     }
     let copy = dir.join(format!("{DATABASE}.before-{:04}", newest()));
     if copy.exists() {
-        // A migration that was cut short has been here; its copy is the older and so the better one.
+        // An interrupted migration has made the copy; the older copy is the right one.
         return Ok(());
     }
     let backup = sqlx::query("VACUUM INTO ?").bind(copy.to_string_lossy().into_owned());
@@ -226,11 +232,11 @@ mod tests {
     use super::*;
 
     async fn opened(dir: &Path) -> SqliteConnection {
-        let found = Found::look(dir, &crate::blob::fs::Folder::to_read(dir)).unwrap();
+        let found = StoreParts::read(dir, &crate::blob::fs::Folder::to_read(dir)).unwrap();
         open_writer(dir, &found, false).await.unwrap().conn
     }
 
-    /// A commit that SQLite does not sync is lost with the power, and with it what was acknowledged.
+    /// A commit that SQLite does not sync is lost in a power loss although it was acknowledged.
     #[tokio::test]
     async fn p2_the_writer_syncs_every_commit_and_appends_to_a_log() {
         let dir = tempfile::tempdir().unwrap();

@@ -1,10 +1,12 @@
-//! What is asked, as SQL over connections that only read.
+//! Queries in SQL over read-only connections.
 
 use std::collections::BTreeMap;
 use std::path::Path;
 
 use async_trait::async_trait;
-use protocol::{Alias, Attempt, Digest, ModelName, RunId, StageName, TaskId, WorkerId};
+use futures::TryStreamExt as _;
+use protocol::message::Times;
+use protocol::{Alias, Digest, Group, ModelName, RunId, StageName, TaskId};
 use sqlx::pool::PoolConnection;
 use sqlx::sqlite::SqliteRow;
 use sqlx::{Connection, Row, Sqlite, SqliteConnection, SqlitePool};
@@ -12,21 +14,24 @@ use sqlx::{Connection, Row, Sqlite, SqliteConnection, SqlitePool};
 use super::open::{open_copy, stored};
 use super::rows::{checkpoints, digest, run_row, stage_result};
 use super::statement::json;
-use super::{models, retention};
+use super::{curves, history, logs, models, owners, retention, usage};
 use crate::QueryError;
-use crate::catalog::{CheckpointRow, EndedRow, LineageNode, LogRow, Needs, Records, Recovery, RunRow, StageResultRow};
-use crate::curve::{Curve, Curves};
+use crate::catalog::{
+    CheckpointRow, EndedRow, HistoryQuery, HistoryRow, LineageNode, LogRow, Needs, Records, Recovery, RunRow,
+    StageResultRow, Usage,
+};
+use crate::curve::{Buckets, Curve, Page, Window};
 use crate::store_id::Stored;
 use crate::versions::{Model, Promotion, Version};
 
 type Result<T> = std::result::Result<T, QueryError>;
 
-/// Connections that read.
+/// A pool of read-only connections.
 #[derive(Debug)]
 pub(crate) struct SqliteRecords(SqlitePool);
 
 impl SqliteRecords {
-    /// Over connections that [`super::open_readers`] has made.
+    /// Wraps connections made by [`super::open_readers`].
     pub(crate) fn new(readers: SqlitePool) -> Self {
         Self(readers)
     }
@@ -44,17 +49,27 @@ impl Records for SqliteRecords {
 
     async fn recovery(&self) -> Result<Recovery> {
         let mut conn = self.connection().await?;
-        // One statement is one moment of the database; two might see a snapshot and no longer the facts before it.
-        let all = "SELECT 0 AS kind, seq, state AS text FROM (SELECT * FROM snapshots ORDER BY seq DESC LIMIT 1) \
-                   UNION ALL SELECT 1, seq, facts FROM facts ORDER BY kind, seq";
+        // One transaction sees one moment; two could see a snapshot without the facts after it.
+        let mut moment = conn.begin().await?;
         let mut recovery = Recovery::default();
-        for row in sqlx::query(all).fetch_all(&mut *conn).await? {
-            let (kind, seq, text): (i64, i64, String) = (row.try_get(0)?, row.try_get(1)?, row.try_get(2)?);
-            match kind {
-                0 => recovery.snapshot = Some((seq.unsigned_abs(), text)),
-                _ => recovery.facts.push((seq.unsigned_abs(), text)),
+        let newest = "SELECT seq, state FROM snapshots ORDER BY seq DESC LIMIT 1";
+        if let Some(row) = sqlx::query(newest).fetch_optional(&mut *moment).await? {
+            let seq: i64 = row.try_get(0)?;
+            recovery.snapshot = Some((seq.unsigned_abs(), row.try_get(1)?));
+            // SQLite takes the other columns of a group from the row with the maximum.
+            let parts = "SELECT part, state, max(seq) FROM snapshot_parts WHERE seq <= ? GROUP BY part";
+            let mut rows = sqlx::query(parts).bind(seq).fetch(&mut *moment);
+            while let Some(row) = rows.try_next().await? {
+                if let Some(state) = row.try_get(1)? {
+                    recovery.parts.insert(row.try_get(0)?, state);
+                }
             }
         }
+        let facts = "SELECT seq, facts FROM facts ORDER BY seq";
+        for row in sqlx::query(facts).fetch_all(&mut *moment).await? {
+            recovery.facts.push((row.try_get::<i64, _>(0)?.unsigned_abs(), row.try_get(1)?));
+        }
+        moment.rollback().await?;
         Ok(recovery)
     }
 
@@ -66,12 +81,31 @@ impl Records for SqliteRecords {
         row.map(ended).transpose()
     }
 
-    async fn ended_views(&self, limit: u32) -> Result<Vec<(RunId, String)>> {
+    async fn ended_views(&self, before: Option<&RunId>, limit: u32) -> Result<Vec<(RunId, String)>> {
         let mut conn = self.connection().await?;
         let find = "SELECT run, view FROM (SELECT rowid AS number, run, view FROM runs WHERE view IS NOT NULL \
-                    ORDER BY rowid DESC LIMIT ?) ORDER BY number";
-        let rows = sqlx::query(find).bind(limit).fetch_all(&mut *conn).await?;
+                    AND (?1 IS NULL OR rowid < (SELECT rowid FROM runs WHERE run = ?1)) \
+                    ORDER BY rowid DESC LIMIT ?2) ORDER BY number";
+        let rows = sqlx::query(find).bind(before.map(RunId::as_str)).bind(limit).fetch_all(&mut *conn).await?;
         rows.iter().map(|row| Ok((RunId::new(row.try_get::<String, _>(0)?), row.try_get(1)?))).collect()
+    }
+
+    async fn ended_views_of(&self, group: &Group, before: Option<&RunId>, limit: u32) -> Result<Vec<(RunId, String)>> {
+        let mut conn = self.connection().await?;
+        let find = "SELECT run, view FROM (SELECT runs.rowid AS number, run, view FROM run_owners JOIN runs USING (run) \
+                    WHERE owner = ?1 AND view IS NOT NULL AND (?2 IS NULL OR runs.rowid < (SELECT rowid FROM runs WHERE run = ?2)) \
+                    ORDER BY runs.rowid DESC LIMIT ?3) ORDER BY number";
+        let before = before.map(RunId::as_str);
+        let rows = sqlx::query(find).bind(group.as_str()).bind(before).bind(limit).fetch_all(&mut *conn).await?;
+        rows.iter().map(|row| Ok((RunId::new(row.try_get::<String, _>(0)?), row.try_get(1)?))).collect()
+    }
+
+    async fn run_owners(&self, runs: &[RunId]) -> Result<BTreeMap<RunId, Group>> {
+        Ok(owners::of_runs(&mut *self.connection().await?, runs).await?)
+    }
+
+    async fn model_owners(&self, model: Option<&ModelName>) -> Result<BTreeMap<ModelName, Group>> {
+        Ok(owners::of_models(&mut *self.connection().await?, model).await?)
     }
 
     async fn sources(&self, keys: &[Digest]) -> Result<BTreeMap<Digest, (RunId, StageName)>> {
@@ -83,7 +117,7 @@ impl Records for SqliteRecords {
             let (run, stage): (String, String) = (row.try_get("run")?, row.try_get("stage")?);
             Ok((digest(row, "key")?, (RunId::new(run), StageName::new(stage))))
         };
-        // A value that is there stands behind what was left on the way to it.
+        // A finished value replaces an archived execution of the same key.
         rows.iter().map(source).collect()
     }
 
@@ -133,23 +167,31 @@ impl Records for SqliteRecords {
     }
 
     async fn logs(&self, run: &RunId, stage: Option<&StageName>, after: i64, limit: u32) -> Result<Vec<LogRow>> {
-        let mut conn = self.connection().await?;
-        let find = sqlx::query(
-            "SELECT * FROM logs WHERE run = ?1 AND (?2 IS NULL OR stage = ?2) AND id > ?3 ORDER BY id LIMIT ?4",
-        );
-        let find = find.bind(run.as_str()).bind(stage.map(StageName::as_str)).bind(after).bind(limit);
-        let line = |row: &SqliteRow| -> Result<LogRow> {
-            Ok(LogRow {
-                id: row.try_get("id")?,
-                task: TaskId::new(row.try_get::<String, _>("task")?),
-                attempt: Attempt(row.try_get::<i64, _>("attempt")?.unsigned_abs()),
-                worker: WorkerId::new(row.try_get::<String, _>("worker")?),
-                line: row.try_get::<i64, _>("line")?.unsigned_abs(),
-                at_ms: row.try_get("at_ms")?,
-                text: row.try_get("text")?,
-            })
-        };
-        find.fetch_all(&mut *conn).await?.iter().map(line).collect()
+        logs::read(&mut *self.connection().await?, run, stage, after, limit).await
+    }
+
+    async fn last_logs(&self, run: &RunId, stage: Option<&StageName>, limit: u32) -> Result<Vec<LogRow>> {
+        logs::last(&mut *self.connection().await?, run, stage, limit).await
+    }
+
+    async fn usage(&self, run: &RunId) -> Result<Usage> {
+        usage::read(&mut *self.connection().await?, run).await
+    }
+
+    async fn timeline(&self, asked: &HistoryQuery) -> Result<Vec<HistoryRow>> {
+        history::read(&mut *self.connection().await?, asked, None).await
+    }
+
+    async fn timeline_of(&self, group: &Group, asked: &HistoryQuery) -> Result<Vec<HistoryRow>> {
+        history::read(&mut *self.connection().await?, asked, Some(group)).await
+    }
+
+    async fn run_times(&self, runs: &[RunId]) -> Result<BTreeMap<RunId, Times>> {
+        history::run_times(&mut *self.connection().await?, runs).await
+    }
+
+    async fn stage_times(&self, run: &RunId) -> Result<BTreeMap<StageName, Times>> {
+        history::stage_times(&mut *self.connection().await?, run).await
     }
 
     async fn models(&self) -> Result<Vec<Model>> {
@@ -185,32 +227,44 @@ impl Records for SqliteRecords {
         rows.iter().map(|row| Ok(RunId::new(row.try_get::<String, _>(0)?))).collect()
     }
 
-    async fn metrics(
+    async fn points(
         &self,
         run: &RunId,
         stage: &StageName,
         keys: Option<&[String]>,
-        points: usize,
+        page: Page,
     ) -> Result<BTreeMap<String, Curve>> {
         let mut conn = self.connection().await?;
-        let find = sqlx::query(
-            "SELECT s.key, s.task, s.attempt, m.step, m.value FROM series s JOIN metrics m ON m.series = s.id \
-             WHERE s.run = ?1 AND s.stage = ?2 AND (?3 IS NULL OR s.key IN (SELECT value FROM json_each(?3))) \
-             ORDER BY s.key, s.task, s.attempt DESC, m.step",
-        );
-        let keys = keys.map(|keys| json(&keys));
-        let rows = find.bind(run.as_str()).bind(stage.as_str()).bind(keys).fetch_all(&mut *conn).await?;
-        let mut curves = Curves::default();
-        for row in &rows {
-            let step = row.try_get::<i64, _>(3)?.unsigned_abs();
-            curves.push(row.try_get(0)?, row.try_get(1)?, row.try_get(2)?, step, row.try_get(4)?);
-        }
-        Ok(curves.finish(points))
+        let mut moment = conn.begin().await?;
+        let curves = curves::points(&mut moment, run, stage, keys, page).await?;
+        moment.rollback().await?;
+        Ok(curves)
+    }
+
+    async fn buckets(
+        &self,
+        run: &RunId,
+        stage: &StageName,
+        keys: Option<&[String]>,
+        window: &Window,
+    ) -> Result<BTreeMap<String, Buckets>> {
+        let mut conn = self.connection().await?;
+        let mut moment = conn.begin().await?;
+        let curves = curves::buckets(&mut moment, run, stage, keys, window).await?;
+        moment.rollback().await?;
+        Ok(curves)
+    }
+
+    async fn present(&self, blobs: &[Digest]) -> Result<BTreeMap<Digest, u64>> {
+        let mut conn = self.connection().await?;
+        let find = "SELECT digest, bytes FROM blobs WHERE digest IN (SELECT value FROM json_each(?))";
+        let rows = sqlx::query(find).bind(json(&blobs)).fetch_all(&mut *conn).await?;
+        rows.iter().map(|row| Ok((digest(row, "digest")?, row.try_get::<i64, _>("bytes")?.unsigned_abs()))).collect()
     }
 
     async fn needs(&self) -> Result<Needs> {
         let mut conn = self.connection().await?;
-        // A transaction that reads sees one moment of the database.
+        // A reading transaction sees one moment of the database.
         let mut moment = conn.begin().await?;
         let needs = retention::needs(&mut moment).await?;
         moment.rollback().await?;
@@ -227,7 +281,7 @@ impl Records for SqliteRecords {
             }
         }
         for row in sqlx::query("PRAGMA foreign_key_check").fetch_all(&mut *conn).await? {
-            problems.push(format!("database: a row of `{}` points at nothing", row.try_get::<String, _>(0)?));
+            problems.push(format!("database: a row of `{}` has a dangling reference", row.try_get::<String, _>(0)?));
         }
         Ok(problems)
     }

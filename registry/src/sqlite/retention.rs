@@ -1,4 +1,4 @@
-//! What may go, as rows: checkpoints by policy, shards whose stage is done, pins; and what rows need of the blobs.
+//! Retention in the tables: checkpoints by policy, shards of finished stages, pins, and the blobs that rows need.
 
 use std::collections::{BTreeSet, HashMap};
 
@@ -6,15 +6,22 @@ use protocol::stage::Keep;
 use protocol::{Digest, TaskId};
 use sqlx::{Row, SqliteConnection};
 
+use super::apply::proven;
 use super::error::write_error;
 use super::rows::{checkpoints, digest, digests};
-use super::statement::{int, run};
+use super::statement::{int, json, run};
 use crate::catalog::{Needs, Root};
-use crate::vouched::{Vouched, complete};
+use crate::proofs::Proofs;
 use crate::{QueryError, WriteError, clock};
 
-/// Forgets a task's checkpoints but those that `keep` names. A metric that none of them has is refused, and all of them stay.
-pub(super) async fn prune(conn: &mut SqliteConnection, task: &TaskId, keep: &Keep) -> Result<Vec<Digest>, WriteError> {
+/// Deletes a task's checkpoints that `keep` does not select, under way or `at_end`. Refuses a metric that none of them has
+/// and deletes nothing.
+pub(super) async fn prune(
+    conn: &mut SqliteConnection,
+    task: &TaskId,
+    keep: &Keep,
+    at_end: bool,
+) -> Result<Vec<Digest>, WriteError> {
     let mut rows = checkpoints(conn, task).await?;
     rows.reverse();
     let metrics: Vec<_> = rows.iter().map(|row| &row.metrics).collect();
@@ -22,7 +29,7 @@ pub(super) async fn prune(conn: &mut SqliteConnection, task: &TaskId, keep: &Kee
         let saved: BTreeSet<&str> = metrics.iter().flat_map(|row| row.keys().map(String::as_str)).collect();
         keep.check(saved).map_err(|why| WriteError::Conflict(format!("checkpoints of `{task}`: {why}")))?;
     }
-    let kept = keep.kept(&metrics);
+    let kept = if at_end { keep.kept_at_end(&metrics) } else { keep.kept(&metrics) };
     let mut forgotten = Vec::new();
     for (row, _) in rows.iter().zip(kept).filter(|(_, kept)| !kept) {
         let forget = sqlx::query("DELETE FROM checkpoints WHERE task = ? AND step = ? AND manifest = ?");
@@ -32,10 +39,10 @@ pub(super) async fn prune(conn: &mut SqliteConnection, task: &TaskId, keep: &Kee
     Ok(forgotten)
 }
 
-/// Sets a pin, or ends it.
+/// Sets or removes a pin.
 pub(super) async fn pin(
     conn: &mut SqliteConnection,
-    blobs: &Vouched,
+    proofs: &Proofs,
     digest: Digest,
     reason: Option<&str>,
 ) -> Result<(), WriteError> {
@@ -43,13 +50,25 @@ pub(super) async fn pin(
     let Some(reason) = reason else {
         return run(conn, sqlx::query("DELETE FROM pins WHERE digest = ?").bind(name)).await.map(|_| ());
     };
-    complete(blobs, digest)?;
+    proven(conn, proofs, digest).await?;
     let set =
         "INSERT INTO pins (digest, reason, at_ms) VALUES (?, ?, ?) ON CONFLICT DO UPDATE SET reason = excluded.reason";
     run(conn, sqlx::query(set).bind(name).bind(reason).bind(clock::now_ms())).await.map(|_| ())
 }
 
-/// Forgets the shards of finished runs, for which the stage's artifact stands; returns their tasks.
+/// Deletes the records of blobs that no row has named since the collection began, and returns these blobs.
+pub(super) async fn condemn(
+    conn: &mut SqliteConnection,
+    proofs: &Proofs,
+    blobs: &[Digest],
+) -> Result<Vec<Digest>, WriteError> {
+    let taken = proofs.condemn(blobs);
+    let forget = "DELETE FROM blobs WHERE digest IN (SELECT value FROM json_each(?))";
+    run(conn, sqlx::query(forget).bind(json(&taken))).await?;
+    Ok(taken)
+}
+
+/// Deletes the shards of finished runs, which the stage's artifact replaces. Returns their tasks.
 pub(super) async fn forget_shards(conn: &mut SqliteConnection) -> Result<Vec<TaskId>, WriteError> {
     let forget = "DELETE FROM shards WHERE run IN (SELECT run FROM runs WHERE state = 'finished') RETURNING task";
     let rows = sqlx::query(forget).fetch_all(conn).await.map_err(write_error)?;
@@ -58,7 +77,7 @@ pub(super) async fn forget_shards(conn: &mut SqliteConnection) -> Result<Vec<Tas
     Ok(tasks)
 }
 
-/// What the rows need of the blobs.
+/// Returns the blobs that rows need.
 pub(super) async fn needs(conn: &mut SqliteConnection) -> Result<Needs, QueryError> {
     let done = "SELECT task FROM shards WHERE run IN (SELECT run FROM runs WHERE state = 'finished') ORDER BY task";
     let done = sqlx::query(done).fetch_all(&mut *conn).await?;
@@ -72,7 +91,7 @@ pub(super) async fn needs(conn: &mut SqliteConnection) -> Result<Needs, QueryErr
     Ok(Needs { roots: roots(conn).await?, parents, done_shards, live })
 }
 
-/// Every digest that a row names and that must therefore be whole, with the row in words.
+/// Lists every digest that a row names and that must be whole, with a description of the row.
 async fn roots(conn: &mut SqliteConnection) -> Result<Vec<Root>, QueryError> {
     let mut roots = Vec::new();
     let mut add = |digest: Digest, what: String, shard: Option<TaskId>| roots.push(Root { digest, what, shard });

@@ -1,4 +1,4 @@
-//! Rows as the catalog's types.
+//! Conversion of rows to the catalog's types.
 
 use std::collections::BTreeMap;
 
@@ -18,7 +18,7 @@ pub(super) fn digest(row: &SqliteRow, column: &str) -> Result<Digest> {
 }
 
 pub(super) fn digests(text: &str) -> Result<BTreeMap<String, Digest>> {
-    serde_json::from_str(text).map_err(|e| QueryError::Blob(format!("a list of artifacts does not read: {e}")))
+    serde_json::from_str(text).map_err(|e| QueryError::Blob(format!("cannot parse a list of artifacts: {e}")))
 }
 
 pub(super) fn stage_result(row: &SqliteRow) -> Result<StageResultRow> {
@@ -40,7 +40,7 @@ pub(super) fn run_row(row: &SqliteRow) -> Result<RunRow> {
     Ok(RunRow {
         run: RunId::new(row.try_get::<String, _>("run")?),
         pipeline: serde_json::from_str(pipeline)
-            .map_err(|e| QueryError::Blob(format!("a stored pipeline is no JSON: {e}")))?,
+            .map_err(|e| QueryError::Blob(format!("a stored pipeline is not JSON: {e}")))?,
         source: row.try_get("source")?,
         state: row.try_get("state")?,
         idempotency_key: row.try_get("idempotency_key")?,

@@ -1,8 +1,8 @@
-//! The one writer: a thread with the one connection that writes.
+//! The single writer: a thread with the only writing connection.
 //!
-//! What waits when it is free goes into one transaction, so that many callers share the cost of one sync (group commit).
-//! Each order stands in a savepoint of its own: one that is refused leaves no trace and does not fail its neighbours.
-//! Nobody is answered before the transaction is on disk.
+//! Orders that wait when it is free share one transaction, and thus the cost of one sync (group commit). Each order has
+//! its own savepoint: a refused one leaves no trace and does not fail the others. Answers are sent only after the
+//! transaction is on disk.
 
 use std::io;
 use std::sync::Arc;
@@ -13,22 +13,23 @@ use sqlx::{Connection, Row, SqliteConnection};
 use tokio::sync::{mpsc, oneshot};
 
 use super::error::write_error;
+use super::recording::Recording;
 use super::statement::int;
-use super::{apply, forget, moves, retention};
+use super::{apply, forget, history, moves, retention};
 use crate::WriteError;
 use crate::catalog::{Done, Order};
 use crate::identity::Witness;
 use crate::lock::StoreLock;
-use crate::vouched::Vouched;
+use crate::proofs::Proofs;
 
-/// Orders of one transaction at most. Beyond it the latency of the first grows and the share of the sync is small.
+/// Most orders in one transaction. Beyond it the first one waits longer while the cost of the sync hardly falls.
 const GROUP: usize = 256;
-/// Orders that may wait; more callers than this wait themselves.
+/// Length of the queue; further callers wait to enqueue.
 const QUEUE: usize = 4096;
 
 type Answer = oneshot::Sender<Result<Done, WriteError>>;
 
-/// The connection that writes, and the epoch under which it may.
+/// The writing connection, and the epoch under which it may write.
 #[derive(Debug)]
 pub(crate) struct Session {
     pub(crate) conn: SqliteConnection,
@@ -44,18 +45,18 @@ pub(crate) struct Writer {
 }
 
 impl Writer {
-    /// Starts the thread on an open database. It keeps the lock until its last commit.
-    pub(crate) fn start(session: Session, blobs: Vouched, lock: Arc<StoreLock>) -> io::Result<Self> {
+    /// Starts the thread on an open database. The thread keeps the lock until its last commit.
+    pub(crate) fn start(session: Session, proofs: Arc<Proofs>, lock: Arc<StoreLock>) -> io::Result<Self> {
         let (queue, orders) = mpsc::channel(QUEUE);
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
         let thread = std::thread::Builder::new().name("registry-writer".into()).spawn(move || {
-            runtime.block_on(serve(session, orders, &blobs));
+            runtime.block_on(serve(session, orders, &proofs));
             drop(lock);
         })?;
         Ok(Self { queue: Some(queue), thread: Some(thread) })
     }
 
-    /// Returns once the order is on disk, or refused.
+    /// Commits an order and returns when it is on disk or refused.
     pub(crate) async fn order(&self, order: Order) -> Result<Done, WriteError> {
         let gone = || WriteError::Internal("the store's writer has ended".into());
         let (answer, done) = oneshot::channel();
@@ -66,7 +67,7 @@ impl Writer {
 }
 
 impl Drop for Writer {
-    /// Waits for the last commit, so that the next process to open the store finds it free and whole.
+    /// Waits for the last commit, so that the next process finds the store free and complete.
     fn drop(&mut self) {
         self.queue = None;
         if let Some(thread) = self.thread.take() {
@@ -75,7 +76,8 @@ impl Drop for Writer {
     }
 }
 
-async fn serve(mut session: Session, mut orders: mpsc::Receiver<(Order, Answer)>, blobs: &Vouched) {
+async fn serve(mut session: Session, mut orders: mpsc::Receiver<(Order, Answer)>, proofs: &Proofs) {
+    let mut recording = Recording::default();
     let mut group = Vec::with_capacity(GROUP);
     loop {
         let received = if session.witness.is_behind() {
@@ -92,7 +94,7 @@ async fn serve(mut session: Session, mut orders: mpsc::Receiver<(Order, Answer)>
         if received == 0 {
             break;
         }
-        commit(&mut session, blobs, &mut group).await;
+        commit(&mut session, proofs, &mut recording, &mut group).await;
     }
     session.witness.catch_up();
     if let Err(e) = session.conn.close().await {
@@ -100,10 +102,10 @@ async fn serve(mut session: Session, mut orders: mpsc::Receiver<(Order, Answer)>
     }
 }
 
-async fn commit(session: &mut Session, blobs: &Vouched, group: &mut Vec<(Order, Answer)>) {
+async fn commit(session: &mut Session, proofs: &Proofs, recording: &mut Recording, group: &mut Vec<(Order, Answer)>) {
     let mut results = Vec::with_capacity(group.len());
     let conn = &mut session.conn;
-    let mut outcome = run_all(conn, session.epoch, blobs, group, &mut results).await;
+    let mut outcome = run_all(conn, session.epoch, proofs, recording, group, &mut results).await;
     if outcome.is_ok() {
         fail_point!("db::before_commit");
         outcome = match (exec(conn, "COMMIT").await, outcome) {
@@ -115,6 +117,7 @@ async fn commit(session: &mut Session, blobs: &Vouched, group: &mut Vec<(Order, 
     let commits = match outcome {
         Ok(commits) => commits,
         Err(e) => {
+            recording.forget();
             // Some errors (a full disk) have ended the transaction by themselves; then there is nothing to roll back.
             let _ = exec(conn, "ROLLBACK").await;
             for (_, answer) in group.drain(..) {
@@ -124,13 +127,13 @@ async fn commit(session: &mut Session, blobs: &Vouched, group: &mut Vec<(Order, 
         }
     };
     for ((_, answer), result) in group.drain(..).zip(results) {
-        // A caller that has gone away finds its write stored; writes are idempotent.
+        // The write of a caller that has stopped waiting is stored; writes are idempotent.
         let _ = answer.send(result);
     }
     session.witness.committed(commits);
 }
 
-/// Counts the transaction, if no other process has opened the database since. Returns the count.
+/// Counts the transaction if no other process has opened the database since. Returns the count.
 async fn count(conn: &mut SqliteConnection, epoch: u64) -> Result<u64, WriteError> {
     let count = sqlx::query("UPDATE store SET commits = commits + 1 WHERE epoch = ? RETURNING commits");
     let row = count.bind(int(epoch)).fetch_optional(conn).await.map_err(write_error)?;
@@ -138,11 +141,12 @@ async fn count(conn: &mut SqliteConnection, epoch: u64) -> Result<u64, WriteErro
     Ok(row.get::<i64, _>(0).unsigned_abs())
 }
 
-/// Runs every order in its savepoint; returns the transaction's number. An error here is one of the whole transaction.
+/// Runs every order in its savepoint and returns the transaction's number. An error concerns the whole transaction.
 async fn run_all(
     conn: &mut SqliteConnection,
     epoch: u64,
-    blobs: &Vouched,
+    proofs: &Proofs,
+    recording: &mut Recording,
     group: &[(Order, Answer)],
     results: &mut Vec<Result<Done, WriteError>>,
 ) -> Result<u64, WriteError> {
@@ -150,12 +154,13 @@ async fn run_all(
     let commits = count(conn, epoch).await?;
     for (order, _) in group {
         exec(conn, "SAVEPOINT o").await?;
-        let result = run(conn, blobs, order).await;
-        if let Err(e) = &result
-            && exec(conn, "ROLLBACK TO o").await.is_err()
-        {
-            // The database ended the whole transaction, as it does on a full disk; that is every order's error.
-            return Err(copy_of(e));
+        let result = run(conn, proofs, recording, order).await;
+        if let Err(e) = &result {
+            recording.forget();
+            if exec(conn, "ROLLBACK TO o").await.is_err() {
+                // The database ended the whole transaction, as it does on a full disk; that is every order's error.
+                return Err(copy_of(e));
+            }
         }
         exec(conn, "RELEASE o").await?;
         results.push(result);
@@ -163,24 +168,36 @@ async fn run_all(
     Ok(commits)
 }
 
-async fn run(conn: &mut SqliteConnection, blobs: &Vouched, order: &Order) -> Result<Done, WriteError> {
+async fn run(
+    conn: &mut SqliteConnection,
+    proofs: &Proofs,
+    recording: &mut Recording,
+    order: &Order,
+) -> Result<Done, WriteError> {
+    if let Order::Forget(_) | Order::ForgetLeftovers { .. } = order {
+        recording.forget();
+    }
     match order {
-        Order::Write(writes) => apply::apply(conn, blobs, writes).await.map(|()| Done::Nothing),
+        Order::Write(writes) => apply::apply(conn, proofs, recording, writes).await.map(|()| Done::Nothing),
         Order::Promote(order) => moves::promote(conn, order).await.map(|p| Done::Promoted(Box::new(p))),
         Order::Rollback(order) => moves::rollback(conn, order).await.map(|p| Done::Promoted(Box::new(p))),
-        Order::PruneCheckpoints { task, keep } => retention::prune(conn, task, keep).await.map(Done::Pruned),
+        Order::PruneCheckpoints { task, keep, at_end } => {
+            retention::prune(conn, task, keep, *at_end).await.map(Done::Pruned)
+        }
         Order::Pin { digest, reason } => {
-            retention::pin(conn, blobs, *digest, reason.as_deref()).await.map(|()| Done::Nothing)
+            retention::pin(conn, proofs, *digest, reason.as_deref()).await.map(|()| Done::Nothing)
         }
         Order::Forget(run) => forget::forget(conn, run).await.map(Done::Forgotten),
         Order::ForgetLeftovers { run, before_ms } => {
             forget::forget_leftovers(conn, run, *before_ms).await.map(Done::Forgotten)
         }
+        Order::PruneHistory { before_ms } => history::prune(conn, *before_ms).await.map(Done::PrunedHistory),
         Order::BeginCollection => {
-            // Rows of this transaction before here are committed when the answer comes, which is when marking begins.
-            blobs.named.begin();
+            // Earlier rows of this transaction are committed before the answer, and marking starts after the answer.
+            proofs.begin_collection();
             retention::forget_shards(conn).await.map(Done::Begun)
         }
+        Order::Condemn(blobs) => retention::condemn(conn, proofs, blobs).await.map(Done::Condemned),
     }
 }
 

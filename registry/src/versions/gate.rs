@@ -1,20 +1,21 @@
 //! Promotion gates: `latent_fid <= 0.2`, `eval.r_precision_top1 >= staging - 0.005`.
 //!
-//! `fid.upper <= 0.05` asks it of the bad end of the metric's 95 % interval.
+//! `fid.upper <= 0.05` checks the upper end of the metric's 95 % interval.
 //!
-//! On the left a metric of the candidate; on the right a number, or an alias of the same model with a number added or
-//! taken away, which stands for the same metric of the version it points at. A metric that the candidate does not have, or
-//! has as something that is no number, never passes. The alias being promoted to may not exist yet: there is then nothing
-//! to be worse than, and the gate holds; any other unknown alias is an error.
+//! The left side is a metric of the candidate. The right side is a number, or an alias of the same model with an
+//! optional number added or subtracted. An alias means the same metric of the version it points at. A missing metric or
+//! NaN never passes. If the alias being promoted to does not exist yet, the gate holds, because there is no version to
+//! compare with; any other unknown alias is an error.
 
 use std::collections::BTreeMap;
 use std::fmt;
 use std::str::FromStr;
 
 use protocol::Alias;
+use protocol::spelling::question;
 use serde::{Deserialize, Serialize};
 
-/// A comparison.
+/// A comparison operator.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Op {
     Le,
@@ -51,26 +52,26 @@ pub struct Gate {
     bound: Bound,
 }
 
-/// A text that is not a gate.
+/// Error of a text that is not a gate.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("`{text}` is not a gate: {why}; expected such as `latent_fid <= 0.2` or `r_precision >= staging - 0.005`")]
+#[error("`{text}` is not a gate: {why}; expected for example `latent_fid <= 0.2` or `r_precision >= staging - 0.005`")]
 pub struct ParseGateError {
     text: String,
     why: String,
 }
 
-/// A gate as it was judged.
+/// Result of a gate.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct GateResult {
     /// The gate as written.
     pub gate: String,
     /// The candidate's value.
     pub value: Option<f64>,
-    /// What it was compared with.
+    /// The bound it was compared with.
     pub bound: Option<f64>,
-    /// Whether it holds.
+    /// True if the gate holds.
     pub holds: bool,
-    /// In words, with by how much it fails.
+    /// Description of the result, with the distance from the bound.
     pub message: String,
 }
 
@@ -125,7 +126,7 @@ impl fmt::Display for Gate {
 }
 
 impl Gate {
-    /// The alias that the gate compares with, if it does.
+    /// Returns the alias that the gate compares with, if it has one.
     pub fn alias(&self) -> Option<&Alias> {
         match &self.bound {
             Bound::Number(_) => None,
@@ -133,9 +134,9 @@ impl Gate {
         }
     }
 
-    /// Judges the gate on the candidate's metrics and, if it compares with an alias, on those of its version; `None` if
-    /// the alias is the one being promoted to and does not exist yet.
-    pub fn judge(&self, candidate: &BTreeMap<String, f64>, other: Option<&BTreeMap<String, f64>>) -> GateResult {
+    /// Checks the gate on the candidate's metrics. `other` has the metrics of the version at the gate's alias; `None`
+    /// if that alias is the one being promoted to and does not exist yet.
+    pub fn evaluate(&self, candidate: &BTreeMap<String, f64>, other: Option<&BTreeMap<String, f64>>) -> GateResult {
         let result =
             |value, bound, holds, message| GateResult { gate: self.text.clone(), value, bound, holds, message };
         let value = match find(candidate, &self.metric) {
@@ -149,11 +150,11 @@ impl Gate {
                 Err(why) => return result(Some(value), None, false, format!("the version at `{alias}` has {why}")),
             },
             (Bound::Alias { alias, .. }, None) => {
-                let message = format!("{} is {}; `{alias}` points at nothing yet", self.metric, digits(value));
+                let message = format!("{} is {}; `{alias}` does not exist yet", self.metric, digits(value));
                 return result(Some(value), None, value.is_finite(), message);
             }
         };
-        // A value that is no number compares as false with everything.
+        // NaN compares as false with everything.
         let holds = self.op.holds(value, bound);
         let mut message = format!("{} is {}, bound {}", self.metric, digits(value), digits(bound));
         if !holds {
@@ -163,18 +164,18 @@ impl Gate {
     }
 }
 
-/// Six digits: who needs more reads the JSON.
+/// Rounds to six digits for messages; JSON has the full number.
 fn digits(number: f64) -> f64 {
     format!("{number:.5e}").parse().unwrap_or(number)
 }
 
-/// Enough digits to see a difference.
+/// Rounds to four digits for messages.
 fn short(number: f64) -> String {
     format!("{}", format!("{number:.3e}").parse::<f64>().unwrap_or(number))
 }
 
-/// A metric by its name; or by the last parts of its name, if one metric alone ends so: `fid` and `fid.upper` find `eval.fid` and
-/// `eval.fid.upper`.
+/// Finds a metric by its full name, or by the last parts of it if they are unique: `fid` and `fid.upper` find
+/// `eval.fid` and `eval.fid.upper`.
 fn find(metrics: &BTreeMap<String, f64>, name: &str) -> Result<f64, String> {
     if let Some(value) = metrics.get(name) {
         return Ok(*value);
@@ -184,7 +185,10 @@ fn find(metrics: &BTreeMap<String, f64>, name: &str) -> Result<f64, String> {
     match ends[..] {
         [(_, value)] => Ok(*value),
         [] if metrics.is_empty() => Err(format!("no metric `{name}`: it has none at all")),
-        [] => Err(format!("no metric `{name}`: it has {}", list(metrics.keys()))),
+        [] => {
+            let meant = question(name, metrics.keys().map(String::as_str));
+            Err(format!("no metric `{name}`{meant}: it has {}", list(metrics.keys())))
+        }
         _ => Err(format!("several metrics `{name}`: name one of {}", list(ends.into_iter().map(|(key, _)| key)))),
     }
 }
@@ -193,7 +197,7 @@ fn list<'a>(names: impl Iterator<Item = &'a String>) -> String {
     names.map(|name| format!("`{name}`")).collect::<Vec<_>>().join(", ")
 }
 
-/// A metric of a version by the name that its model declares.
+/// Returns the finite value of the metric that a model declares.
 pub(crate) fn metric(metrics: &BTreeMap<String, f64>, name: &str) -> Option<f64> {
     find(metrics, name).ok().filter(|value| value.is_finite())
 }
@@ -207,45 +211,45 @@ mod tests {
         pairs.iter().map(|(key, value)| ((*key).to_owned(), *value)).collect()
     }
 
-    fn judge(gate: &str, candidate: &[(&str, f64)], other: Option<&[(&str, f64)]>) -> GateResult {
-        gate.parse::<Gate>().unwrap().judge(&metrics(candidate), other.map(metrics).as_ref())
+    fn evaluate(gate: &str, candidate: &[(&str, f64)], other: Option<&[(&str, f64)]>) -> GateResult {
+        gate.parse::<Gate>().unwrap().evaluate(&metrics(candidate), other.map(metrics).as_ref())
     }
 
     #[test]
     fn gates_compare_with_numbers() {
-        assert!(judge("latent_fid<=0.2", &[("latent_fid", 0.2)], None).holds);
-        assert!(!judge("latent_fid<0.2", &[("latent_fid", 0.2)], None).holds);
-        assert!(judge("r >= 1e-3", &[("r", 0.5)], None).holds);
-        let missed = judge("latent_fid <= 0.2", &[("latent_fid", 0.25)], None);
+        assert!(evaluate("latent_fid<=0.2", &[("latent_fid", 0.2)], None).holds);
+        assert!(!evaluate("latent_fid<0.2", &[("latent_fid", 0.2)], None).holds);
+        assert!(evaluate("r >= 1e-3", &[("r", 0.5)], None).holds);
+        let missed = evaluate("latent_fid <= 0.2", &[("latent_fid", 0.25)], None);
         assert!(!missed.holds && missed.message.ends_with("misses by 0.05"), "{}", missed.message);
     }
 
     #[test]
     fn gates_compare_with_the_version_at_an_alias() {
-        assert!(judge("r >= staging - 0.005", &[("r", 0.496)], Some(&[("r", 0.5)])).holds);
-        assert!(!judge("r >= staging - 0.005", &[("r", 0.494)], Some(&[("r", 0.5)])).holds);
-        assert!(judge("r >= my-alias", &[("r", 0.5)], Some(&[("r", 0.5)])).holds);
-        assert!(judge("r >= staging", &[("r", 0.1)], None).holds, "nothing to be worse than");
+        assert!(evaluate("r >= staging - 0.005", &[("r", 0.496)], Some(&[("r", 0.5)])).holds);
+        assert!(!evaluate("r >= staging - 0.005", &[("r", 0.494)], Some(&[("r", 0.5)])).holds);
+        assert!(evaluate("r >= my-alias", &[("r", 0.5)], Some(&[("r", 0.5)])).holds);
+        assert!(evaluate("r >= staging", &[("r", 0.1)], None).holds, "nothing to be worse than");
     }
 
     #[test]
     fn what_is_missing_or_no_number_never_passes() {
-        assert!(!judge("r <= 1", &[], None).holds);
-        assert!(!judge("r <= 1", &[("r", f64::NAN)], None).holds);
-        assert!(!judge("r >= 1", &[("r", f64::NAN)], None).holds);
-        assert!(!judge("r >= staging", &[("r", 0.1)], Some(&[])).holds);
-        assert!(!judge("r >= staging", &[("r", f64::NAN)], None).holds);
+        assert!(!evaluate("r <= 1", &[], None).holds);
+        assert!(!evaluate("r <= 1", &[("r", f64::NAN)], None).holds);
+        assert!(!evaluate("r >= 1", &[("r", f64::NAN)], None).holds);
+        assert!(!evaluate("r >= staging", &[("r", 0.1)], Some(&[])).holds);
+        assert!(!evaluate("r >= staging", &[("r", f64::NAN)], None).holds);
     }
 
     #[test]
     fn the_last_part_of_a_name_is_enough_if_it_is_unique() {
-        assert!(judge("fid <= 1", &[("eval.fid", 0.1)], None).holds);
+        assert!(evaluate("fid <= 1", &[("eval.fid", 0.1)], None).holds);
         let interval = [("eval.fid", 0.1), ("eval.fid.lower", 0.08), ("eval.fid.upper", 0.12)];
-        assert!(judge("fid.upper <= 0.12", &interval, None).holds);
-        let missed = judge("fid.upper <= 0.11", &interval, None);
+        assert!(evaluate("fid.upper <= 0.12", &interval, None).holds);
+        let missed = evaluate("fid.upper <= 0.11", &interval, None);
         assert!(!missed.holds && missed.message.ends_with("misses by 0.01"), "{}", missed.message);
-        assert!(judge("fid.upper <= staging", &interval, Some(&[("eval.fid.upper", 0.2)])).holds);
-        let two = judge("fid <= 1", &[("a.fid", 0.1), ("b.fid", 0.1)], None);
+        assert!(evaluate("fid.upper <= staging", &interval, Some(&[("eval.fid.upper", 0.2)])).holds);
+        let two = evaluate("fid <= 1", &[("a.fid", 0.1), ("b.fid", 0.1)], None);
         assert!(!two.holds && two.message.contains("`a.fid`, `b.fid`"), "{}", two.message);
     }
 

@@ -1,8 +1,8 @@
 //! Models, their versions, and the aliases that point at them.
 //!
-//! A version is numbered in the transaction that registers it: 1, 2, 3, without gaps. An alias moves by `promote` or
-//! `rollback`, each one transaction that compares, judges the gates on stored metrics, moves and logs. `@best` is a
-//! query over stored metrics, never state.
+//! The transaction that registers a version numbers it: 1, 2, 3, without gaps. `promote` and `rollback` move an alias
+//! in one transaction that compares, checks the gates on stored metrics, moves and logs. `@best` is a query over stored
+//! metrics and never stored itself.
 
 mod gate;
 mod rules;
@@ -18,83 +18,82 @@ use serde_json::Value;
 
 pub use gate::{Gate, GateResult, ParseGateError};
 pub use protocol::model_ref::{BEST, LATEST, ModelRef, Pick};
-pub(crate) use rules::{compare, gates, judge, pick, previous, refuse_reserved, summary, unknown};
+pub(crate) use rules::{compare, evaluate, gates, pick, previous, refuse_reserved, summary, unknown};
 
-/// A model as a list shows it.
+/// A model in a listing.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Model {
-    /// Its name.
     pub model: ModelName,
-    /// The metric that decides `@best`.
+    /// The metric that ranks `@best`.
     pub metric: Option<String>,
-    /// Its direction.
+    /// Direction of that metric.
     pub mode: Option<Mode>,
-    /// How many versions there are; the newest has this number.
+    /// Number of versions, which is also the newest version's number.
     pub versions: u64,
     /// The best version, if one has a finite value of the metric.
     pub best: Option<u64>,
-    /// Where the aliases point.
+    /// Aliases with their versions.
     pub aliases: BTreeMap<String, u64>,
 }
 
-/// A registered artifact. Never edited, except that metrics are added.
+/// A registered artifact. Only its metrics can be extended.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Version {
     pub model: ModelName,
-    /// Its number, from 1.
+    /// Number of the version, from 1.
     pub version: u64,
-    /// A manifest of kind `model`.
+    /// Digest of a manifest of kind `model`.
     pub artifact: Digest,
     /// Metrics by name.
     pub metrics: BTreeMap<String, f64>,
-    /// Run, stage, stage key.
+    /// Origin: run, stage, stage key.
     pub source: Value,
-    /// When it was registered, in milliseconds since 1970.
+    /// Time of registration, in milliseconds since 1970.
     pub created_ms: i64,
-    /// Aliases that point at it now.
+    /// Aliases that point at this version.
     pub aliases: Vec<String>,
 }
 
-/// Whether an alias moved forward or back.
+/// Kind of an alias's move.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Action {
-    /// By `promote`.
+    /// A move by `promote`.
     Promote,
-    /// By `rollback`.
+    /// A move by `rollback`.
     Rollback,
 }
 
 /// One move of an alias.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Promotion {
-    /// Its place in the log.
+    /// Number of the log entry.
     pub id: i64,
-    /// When, in milliseconds since 1970.
+    /// Time of the move, in milliseconds since 1970.
     pub at_ms: i64,
     pub model: ModelName,
     pub alias: Alias,
-    /// Which way.
+    /// Kind of the move.
     pub action: Action,
-    /// Where the alias pointed before.
+    /// Version before the move, if the alias existed.
     pub from: Option<u64>,
-    /// Where it points since.
+    /// Version after the move.
     pub to: u64,
-    /// Who.
+    /// Name of the caller.
     pub actor: String,
-    /// Why.
+    /// Reason given by the caller.
     pub reason: String,
-    /// The gates, and the numbers that they were judged by.
+    /// Results of the gates.
     pub gates: Vec<GateResult>,
 }
 
-/// What a caller believes an alias to point at.
+/// Expected target of an alias.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(into = "String", try_from = "String")]
 pub enum Expect {
     /// The alias does not exist yet.
     None,
-    /// It points at this version.
+    /// The alias points at this version.
     Version(u64),
 }
 

@@ -1,4 +1,4 @@
-//! What follows from versions and moves alone, wherever they are stored.
+//! Rules about versions and moves that are independent of the database.
 
 use std::collections::BTreeMap;
 
@@ -11,7 +11,7 @@ use super::{
 };
 use crate::{QueryError, WriteError};
 
-/// The best version: by the declared metric, the older one of two equals. What is no finite number is never best.
+/// Returns the best version by the declared metric, the older one of two equals. Skips values that are not finite.
 pub(crate) fn best<'a>(versions: &'a [Version], metric: &str, mode: Mode) -> Option<&'a Version> {
     let mut best: Option<(&Version, f64)> = None;
     for version in versions {
@@ -27,14 +27,14 @@ pub(crate) fn best<'a>(versions: &'a [Version], metric: &str, mode: Mode) -> Opt
     best.map(|(version, _)| version)
 }
 
-/// A model as a list shows it, from what it declares and its versions.
+/// Summarises a model from its declared metric and its versions.
 pub(crate) fn summary(model: ModelName, metric: Option<String>, mode: Option<Mode>, versions: &[Version]) -> Model {
     let aliases = versions.iter().flat_map(|v| v.aliases.iter().map(|alias| (alias.clone(), v.version))).collect();
     let best = metric.as_ref().zip(mode).and_then(|(metric, mode)| best(versions, metric, mode)).map(|v| v.version);
     Model { model, metric, mode, versions: versions.len() as u64, best, aliases }
 }
 
-/// What is said of a model that is none of the `known` ones.
+/// Error for a model that is not among the `known` ones.
 pub(crate) fn unknown(model: &ModelName, known: &[Model]) -> QueryError {
     let known: Vec<_> = known.iter().map(|m| format!("`{}`", m.model)).collect();
     let known = match known.len() {
@@ -44,7 +44,7 @@ pub(crate) fn unknown(model: &ModelName, known: &[Model]) -> QueryError {
     QueryError::NotFound(format!("no model `{model}`: {known}"))
 }
 
-/// The version of a model that a reference points at.
+/// Returns the version of a model that a reference points at.
 pub(crate) fn pick(reference: &ModelRef, model: &Model, versions: &[Version]) -> Result<Version, QueryError> {
     let name = &reference.model;
     let found = match &reference.pick {
@@ -80,7 +80,7 @@ pub(crate) fn pick(reference: &ModelRef, model: &Model, versions: &[Version]) ->
     })
 }
 
-/// Refuses to move what is computed.
+/// Refuses to move a computed alias.
 pub(crate) fn refuse_reserved(alias: &Alias) -> Result<(), WriteError> {
     if matches!(alias.as_str(), BEST | LATEST) {
         return Err(WriteError::Conflict(format!(
@@ -89,13 +89,13 @@ pub(crate) fn refuse_reserved(alias: &Alias) -> Result<(), WriteError> {
     }
     if is_number(alias.as_str()) {
         return Err(WriteError::Conflict(format!(
-            "`@{alias}` names version {alias}, so no alias may be called that; choose another alias"
+            "`@{alias}` means version {alias} and cannot be an alias; choose another name"
         )));
     }
     Ok(())
 }
 
-/// Whether an alias points where the caller believes.
+/// Checks that an alias points at the version that the caller expects.
 pub(crate) fn compare(
     model: &ModelName,
     alias: &Alias,
@@ -105,51 +105,51 @@ pub(crate) fn compare(
     let found = current.map_or(Expect::None, Expect::Version);
     match expect {
         Some(expected) if expected != found => Err(WriteError::Conflict(format!(
-            "alias `{alias}` of `{model}` points at {found}, not at {expected} as expected: somebody moved it; look at \
-             `registry history {model}` and decide again"
+            "alias `{alias}` of `{model}` points at {found}, expected {expected}: it was moved meanwhile; see \
+             `registry history {model}`"
         ))),
         _ => Ok(()),
     }
 }
 
-/// Reads gates as written.
+/// Parses gates.
 pub(crate) fn gates(texts: &[String]) -> Result<Vec<Gate>, WriteError> {
     let gate = |text: &String| text.parse().map_err(|e: ParseGateError| WriteError::Conflict(e.to_string()));
     texts.iter().map(gate).collect()
 }
 
-/// Judges the gates of a promotion of `candidate` to `alias`. `others` has the metrics of the versions at the aliases that gates
-/// name; it lacks `alias` if the first promotion to it is being judged, which has nothing to be worse than.
-pub(crate) fn judge(
+/// Checks the gates of a promotion of `candidate` to `alias`. `others` has the metrics of the versions at the gates'
+/// aliases. It lacks `alias` at the first promotion to it, which has no version to compare with.
+pub(crate) fn evaluate(
     gates: &[Gate],
     candidate: &Version,
     alias: &Alias,
     others: &BTreeMap<Alias, BTreeMap<String, f64>>,
 ) -> Result<Vec<GateResult>, WriteError> {
-    let result = |gate: &Gate| gate.judge(&candidate.metrics, gate.alias().and_then(|alias| others.get(alias)));
+    let result = |gate: &Gate| gate.evaluate(&candidate.metrics, gate.alias().and_then(|alias| others.get(alias)));
     let results: Vec<_> = gates.iter().map(result).collect();
     let failed: Vec<_> = results.iter().filter(|r| !r.holds).map(|r| format!("`{}`: {}", r.gate, r.message)).collect();
     if failed.is_empty() {
         return Ok(results);
     }
     Err(WriteError::Gate(format!(
-        "{}:{} may not become `{alias}`: {}",
+        "{}:{} cannot be promoted to `{alias}`: {}",
         candidate.model,
         candidate.version,
         failed.join("; ")
     )))
 }
 
-/// Where an alias goes that is rolled back: to where it pointed before its last move forward. Reads the log as a stack: a promotion
-/// pushes, a rollback drops down to where it went. So two rollbacks in a row go back two promotions instead of swinging between
-/// two versions.
+/// Returns the version to which a rollback moves an alias: the one before its last promotion. Reads the log as a stack:
+/// a promotion pushes, a rollback pops down to its target. Two rollbacks thus go back two promotions instead of
+/// alternating between two versions.
 pub(crate) fn previous(log: &[Promotion]) -> Option<u64> {
     let mut stack: Vec<u64> = Vec::new();
     for entry in log {
         if entry.action == Action::Rollback {
             match stack.iter().rposition(|version| *version == entry.to) {
                 Some(at) => stack.truncate(at + 1),
-                // `--to` went somewhere the alias had never been.
+                // `--to` named a version that the alias never had.
                 None => {
                     stack.pop();
                     stack.push(entry.to);

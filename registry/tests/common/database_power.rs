@@ -1,4 +1,4 @@
-//! A disk under SQLite that can lose its power: what a file holds is then what it held when it was synced last.
+//! A power loss under SQLite: a file's content falls back to that of its last sync.
 #![allow(unsafe_code, reason = "SQLite's file systems are tables of C functions")]
 
 use std::collections::BTreeMap;
@@ -12,11 +12,11 @@ use libsqlite3_sys as ffi;
 
 type Sync = unsafe extern "C" fn(*mut ffi::sqlite3_file, c_int) -> c_int;
 
-/// What was opened and what was synced.
+/// Open files and their synced content.
 struct Files {
-    /// The operating system's file system, by its address; 0 until it was taken.
+    /// Address of the operating system's file system; 0 before it is known.
     system: usize,
-    /// By the address of the open file: where it lies, and the system's sync.
+    /// Path and system sync function of each open file, by its address.
     open: BTreeMap<usize, (PathBuf, Sync)>,
     synced: BTreeMap<PathBuf, Vec<u8>>,
 }
@@ -27,9 +27,9 @@ fn files() -> MutexGuard<'static, Files> {
     FILES.lock().unwrap()
 }
 
-/// Stands between SQLite and the system, for every database that this process opens from now on. Call it before any is opened.
+/// Intercepts the file system of every database that this process opens later. Call it before the first one is opened.
 pub fn stand_between() {
-    // SAFETY: the table that SQLite gives is never freed, and neither is the copy that is registered in its place.
+    // SAFETY: SQLite never frees its table, and the registered copy is leaked.
     unsafe {
         let system = ffi::sqlite3_vfs_find(std::ptr::null());
         files().system = system as usize;
@@ -41,7 +41,7 @@ pub fn stand_between() {
     }
 }
 
-/// Opens a file as the system does, and takes the place of its sync.
+/// Opens a file through the system and replaces its sync function.
 unsafe extern "C" fn open(
     _: *mut ffi::sqlite3_vfs,
     name: *const c_char,
@@ -50,8 +50,8 @@ unsafe extern "C" fn open(
     got: *mut c_int,
 ) -> c_int {
     let system = files().system as *mut ffi::sqlite3_vfs;
-    // SAFETY: what SQLite passes is passed on. Once it is open a file has a table of functions, of which it gets a copy that
-    // is never freed; the system's functions find all that they need in the file.
+    // SAFETY: the arguments are SQLite's own. An open file has a table of functions; it gets a copy that is leaked. The
+    // system's functions find all their data in the file.
     unsafe {
         let done = ((*system).xOpen.unwrap())(system, name, file, flags, got);
         if done == ffi::SQLITE_OK && !name.is_null() {
@@ -68,9 +68,9 @@ unsafe extern "C" fn open(
 unsafe extern "C" fn sync(file: *mut ffi::sqlite3_file, flags: c_int) -> c_int {
     let mut files = files();
     let (path, system) = files.open[&(file as usize)].clone();
-    // SAFETY: the system's own function, on its own file.
+    // SAFETY: the system's own function is called on its own file.
     let done = unsafe { system(file, flags) };
-    // A file whose folder is gone with its test is nobody's any more.
+    // The file may be gone with its test's folder.
     if done == ffi::SQLITE_OK
         && let Ok(bytes) = fs::read(&path)
     {
@@ -79,11 +79,11 @@ unsafe extern "C" fn sync(file: *mut ffi::sqlite3_file, flags: c_int) -> c_int {
     done
 }
 
-/// Copies the store in `dir` to `to` as it is after a loss of power right now: of the database and its log what was synced.
+/// Copies the store in `dir` to `to` as after a power loss now: database and log have their last synced content.
 pub fn lose_power(dir: &Path, to: &Path) {
     let files = files();
     copy(dir, to);
-    // What SQLite has removed stays removed.
+    // Files that SQLite has removed stay removed.
     for (path, bytes) in files.synced.iter().filter(|(path, _)| path.parent() == Some(dir) && path.exists()) {
         fs::write(to.join(path.file_name().unwrap()), bytes).unwrap();
     }
@@ -96,7 +96,7 @@ fn copy(dir: &Path, to: &Path) {
         if entry.file_type().unwrap().is_dir() {
             copy(&from, &into);
         } else if !entry.file_name().to_string_lossy().starts_with("stride.db") {
-            // A small file that is replaced at this moment is there under its new name.
+            // A small file that is being replaced already exists under its new name.
             let _ = fs::copy(&from, &into);
         }
     }

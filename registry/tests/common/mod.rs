@@ -1,4 +1,4 @@
-//! What the tests of this crate share.
+//! Shared helpers of this crate's tests.
 #![allow(dead_code, unreachable_pub, reason = "not every test file uses all of it")]
 
 pub mod database_power;
@@ -8,10 +8,12 @@ use std::collections::BTreeMap;
 
 use protocol::message::{Grant, MetricRow};
 use protocol::{ArtifactKind, Attempt, Digest, Fence, FileEntry, Incarnation, Manifest, TaskId};
-use registry::{BlobStore, Holder, OpenError, Store, Write};
+use registry::blob::Backend;
+use registry::{BlobStore, Holder, LeaseTerms, OpenError, Store, Write};
 use serde_json::json;
 
-/// Opens a store. A process that another test is starting right now may have a copy of a lock that was let go.
+/// Opens a store. Retries while it is busy, because a child process of another test may briefly inherit a released
+/// lock.
 pub async fn try_open(dir: &std::path::Path) -> Result<Store, OpenError> {
     let until = std::time::Instant::now() + std::time::Duration::from_secs(10);
     loop {
@@ -22,11 +24,23 @@ pub async fn try_open(dir: &std::path::Path) -> Result<Store, OpenError> {
     }
 }
 
+/// Opens a store over the test's backend of blobs.
+pub async fn open_over(dir: &std::path::Path, blobs: std::sync::Arc<dyn Backend>) -> Store {
+    let until = std::time::Instant::now() + std::time::Duration::from_secs(10);
+    loop {
+        let blobs = std::sync::Arc::clone(&blobs);
+        match Store::open_over(dir, blobs, Holder::this_process("test"), LeaseTerms::default()).await {
+            Err(OpenError::Busy { .. }) if std::time::Instant::now() < until => tokio::task::yield_now().await,
+            opened => return opened.unwrap(),
+        }
+    }
+}
+
 pub async fn open(dir: &std::path::Path) -> Store {
     try_open(dir).await.unwrap()
 }
 
-/// Uploads an artifact of one file.
+/// Uploads an artifact with one file.
 pub fn artifact(blobs: &BlobStore, kind: ArtifactKind, content: &str) -> Digest {
     let bytes = content.as_bytes();
     let mut manifest = Manifest::new(kind, json!({}));
@@ -49,14 +63,14 @@ pub fn fence(task: &str, fence: u64) -> Write {
     Write::Fence { task: TaskId::new(task), fence: Fence(fence) }
 }
 
-/// Something to be stored that nothing else refers to.
+/// A write that no other row refers to.
 pub fn note(what: impl Into<serde_json::Value>) -> Write {
     static NEXT: std::sync::atomic::AtomicU64 = std::sync::atomic::AtomicU64::new(1);
     let seq = NEXT.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
     Write::Facts { seq, facts: what.into().to_string() }
 }
 
-/// All notes, in the order in which they were stored.
+/// Returns all notes in the order in which they were stored.
 pub async fn notes(store: &Store) -> Vec<serde_json::Value> {
     let facts = store.recovery().await.unwrap().facts;
     facts.iter().map(|(_, text)| serde_json::from_str(text).unwrap()).collect()
@@ -80,7 +94,7 @@ pub fn rows(steps: std::ops::Range<u64>, value: f64) -> Vec<MetricRow> {
     steps.map(|step| MetricRow { step, key: "loss".into(), value }).collect()
 }
 
-/// A stage's value that the coordinator made.
+/// A stage's value computed by the coordinator.
 pub fn result(key: &str, output: Digest) -> Write {
     Write::StageResult {
         grant: None,

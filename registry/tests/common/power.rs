@@ -1,4 +1,4 @@
-//! A disk that can lose its power: what was not synced by then is gone.
+//! A disk with power losses: a loss removes unsynced data.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -9,29 +9,29 @@ use std::time::SystemTime;
 
 use registry::blob::disk::{Disk, DiskFile, Os};
 
-/// Passes everything on to the operating system, and remembers what a real disk might still have to write.
+/// Passes every call to the operating system and records what a real disk might not have written yet.
 #[derive(Debug, Clone, Default)]
 pub struct Power(Arc<Mutex<Unsynced>>);
 
 #[derive(Debug, Default)]
 struct Unsynced {
-    /// Length that is on disk, by the file's number.
+    /// Synced length of each file, by number.
     lengths: BTreeMap<u64, u64>,
-    /// Numbers of files, by their present path.
+    /// Numbers of files by their current path.
     files: BTreeMap<PathBuf, u64>,
-    /// Names that were given and whose folder was not synced since.
+    /// New names whose folder was not synced since.
     names: Vec<PathBuf>,
     next: u64,
     deaf: bool,
 }
 
 impl Power {
-    /// Whether syncs are ignored, as if the process had been killed before each of them.
+    /// Ignores syncs, as if the process had been killed before each of them.
     pub fn ignore_syncs(&self, ignore: bool) {
         self.0.lock().unwrap().deaf = ignore;
     }
 
-    /// Takes away what was not synced.
+    /// Removes all unsynced data.
     pub fn lose(&self) {
         let mut unsynced = self.0.lock().unwrap();
         for path in std::mem::take(&mut unsynced.names) {

@@ -1,4 +1,4 @@
-//! The suite over a real server of the S3 protocol, and what is said and kept when that refuses or its connections end.
+//! The suite on a real S3 server, with messages and data after refusals and lost connections.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -13,7 +13,7 @@ use registry::blob::{Backend, BlobStore};
 
 use super::{common, objects};
 
-/// A client as `Remote::connect` makes it, but for its sources: patient for a second, not for half a minute.
+/// A client like that of `Remote::connect`, except for its credentials and a retry time of one second.
 fn client(bucket: &Bucket, name: &str, secret: &str) -> Arc<dyn ObjectStore> {
     let _ = rustls::crypto::ring::default_provider().install_default();
     let backoff = BackoffConfig { max_backoff: Duration::from_millis(200), ..BackoffConfig::default() };
@@ -24,7 +24,7 @@ fn client(bucket: &Bucket, name: &str, secret: &str) -> Arc<dyn ObjectStore> {
     Arc::new(builder.with_conditional_put(S3ConditionalPut::ETagMatch).with_retry(retry).build().unwrap())
 }
 
-/// The blobs at a prefix, by a client, of a store in a folder of its own.
+/// Opens the blobs at a prefix through a client, with a separate store folder.
 fn open(store: Arc<dyn ObjectStore>) -> (tempfile::TempDir, Objects) {
     let dir = tempfile::tempdir().unwrap();
     let remote = Remote::over(&Bucket::url("p"), store).unwrap();
@@ -32,7 +32,7 @@ fn open(store: Arc<dyn ObjectStore>) -> (tempfile::TempDir, Objects) {
     (dir, objects)
 }
 
-/// All files of the bucket, but for what the server notes for itself.
+/// Lists all files of the bucket, except the server's own metadata.
 fn files(dir: &std::path::Path) -> Vec<std::path::PathBuf> {
     let Ok(entries) = std::fs::read_dir(dir) else { return Vec::new() };
     let paths = entries.map(|entry| entry.unwrap().path());
@@ -46,7 +46,7 @@ fn bytes(length: u32) -> Vec<u8> {
 #[test]
 fn objects_on_an_s3_server() {
     let bucket = Bucket::start();
-    // Without `a_marker_is_taken_by_one_of_many`: this server checks a condition first and writes afterwards, which is not one step.
+    // Without `a_marker_is_taken_by_one_of_many`: this server checks a condition and then writes, which is not atomic.
     objects(&client(&bucket, NAME, SECRET));
 }
 
@@ -59,19 +59,20 @@ fn a_wrong_key_and_a_missing_bucket_are_said() {
         let parts = ["access was refused", "SignatureDoesNotMatch", "AWS_SECRET_ACCESS_KEY", "s3://stride-tests/p"];
         assert!(parts.iter().all(|part| said.contains(part)), "{said}");
     }
-    // An answer to a question about a single object has no body that would say more.
+    // The answer to a request for a single object's metadata has no body with details.
     let refused = place.stat(Digest::of(b"x")).unwrap_err();
     assert!(matches!(&refused, BlobError::Storage(said) if said.contains("access was refused")), "{refused}");
 
     let (_dir, place) = open(client(&bucket, "nowhere", SECRET));
-    // Opening a store asks this first. A put would not show it: this server makes the bucket that is missing.
+    // Opening a store sends this request first. A put would not fail, because this server creates a missing bucket.
     let refused = place.is_empty().unwrap_err();
     let BlobError::Storage(said) = &refused else { panic!("{refused}") };
     assert!(said.contains("there is no bucket") && said.contains("`--blobs`"), "{said}");
     assert!(files(&bucket.objects()).is_empty(), "nobody has written anything");
 }
 
-/// A put that must not write over anything is not simply sent again by the client: it may have been done. The next try finds out.
+/// The client does not resend a put that must not overwrite, because it may have succeeded. The store's next try finds
+/// out.
 #[test]
 fn a_cut_put_is_done_once_or_not_at_all() {
     let bucket = Bucket::start();
@@ -81,13 +82,13 @@ fn a_cut_put_is_done_once_or_not_at_all() {
         let bytes = bytes(60_000 + u32::try_from(i).unwrap());
         bucket.cut_after(after);
         if let Err(error) = store.put(&bytes) {
-            assert!(matches!(error, BlobError::Unavailable(_)), "{error}");
+            assert!(matches!(error, BlobError::Unreachable(_)), "{error}");
             store.put(&bytes).unwrap();
         }
         assert_eq!(bucket.cuts(), i as u64 + 1, "cut after {after} bytes");
         assert!(store.get(Digest::of(&bytes)).unwrap() == bytes);
     }
-    // A question is asked again without anybody's noticing.
+    // A read is resent unnoticed.
     let digest = Digest::of(&bytes(60_000));
     bucket.cut_after(0);
     assert_eq!(store.size(digest).unwrap(), Some(60_000));
@@ -112,8 +113,8 @@ fn a_part_whose_connection_is_cut_is_sent_again_by_itself() {
     assert_eq!(bucket.cuts(), 2);
 }
 
-/// The server goes away in the middle of an upload in parts. Nothing is shown under the blob's name, what a worker had sent is still here,
-/// and when the server is back it goes from here alone.
+/// The server disappears during an upload in parts. The blob's name shows nothing, the worker's bytes are kept here,
+/// and after the server's return they are sent from here alone.
 #[test]
 fn an_upload_in_parts_that_is_given_up_leaves_nothing_and_goes_on_from_here() {
     let bucket = Bucket::start();
@@ -130,14 +131,14 @@ fn an_upload_in_parts_that_is_given_up_leaves_nothing_and_goes_on_from_here() {
         }
         bucket.close();
         let error = sending.join().unwrap().unwrap_err();
-        let BlobError::Unavailable(said) = &error else { panic!("{error}") };
+        let BlobError::Unreachable(said) = &error else { panic!("{error}") };
         assert!(said.contains("AWS_ENDPOINT_URL") && said.contains("s3://stride-tests/p/sha256"), "{said}");
     });
     bucket.open();
     assert_eq!(store.size(digest).unwrap(), None, "no part of it has its name");
     assert!(store.list().unwrap().is_empty());
 
-    // Nothing comes any more: all that is missing is its name.
+    // The bytes are complete; only the name is missing.
     assert_eq!(store.staged(&grant, digest).unwrap(), total);
     assert!(store.take_up(&grant, digest, total, total).unwrap().finish().unwrap());
     assert!(store.get(digest).unwrap() == bytes);

@@ -1,1 +1,1 @@
-//! Nothing: only the features in `Cargo.toml` matter.
+//! Empty: only the features in `Cargo.toml` matter.

@@ -1,7 +1,8 @@
-//! Runs a target for a time in a process of its own, so that a stack that overflows or memory that is refused ends the process and not the test.
+//! Runs a target for a limited time in a separate process, so that a stack overflow or a refused allocation ends that
+//! process and not the test.
 //!
-//! The process says in a file which input it is at. What ends it, or what takes too long, is written to a file by the test that waits for it; inputs follow from
-//! their number, so that nothing but the number has to survive.
+//! The process writes the number of its current input to a file. If an input ends the process or takes too long, the
+//! waiting test writes that input to a file. Inputs are a function of their number, so only the number has to survive.
 
 use std::alloc::System;
 use std::cell::RefCell;
@@ -19,17 +20,17 @@ use protocol::Digest;
 
 use crate::{CPU_S, MEMORY_FACTOR, Target, mutate};
 
-/// Seconds of each target in `cargo test`.
+/// Seconds per target in `cargo test`.
 const SECONDS: u64 = 20;
-/// How many seconds each target is run for.
+/// Variable with the seconds per target.
 pub const SECONDS_VARIABLE: &str = "STRIDE_FUZZ_SECONDS";
-/// The key of the inputs, in place of 1.
+/// Variable with the seed of the inputs; 1 by default.
 pub const SEED_VARIABLE: &str = "STRIDE_FUZZ_SEED";
-/// A file that is run alone, or a folder whose files are.
+/// Variable with a file to run alone, or a folder of such files.
 pub const INPUT_VARIABLE: &str = "STRIDE_FUZZ_INPUT";
-/// Where the process that tries inputs says which one it is at; set for it alone.
+/// Variable with the file for the number of the current input; set only for the fuzzing process.
 const STATE_VARIABLE: &str = "STRIDE_FUZZ_STATE";
-/// An input that takes so long by the clock never ends.
+/// Wall time after which an input counts as hanging.
 const HANGS: Duration = Duration::from_secs(120);
 
 fn variable(name: &str) -> Option<String> {
@@ -40,15 +41,15 @@ fn seed() -> u64 {
     variable(SEED_VARIABLE).map_or(1, |value| value.parse().expect("STRIDE_FUZZ_SEED is a number"))
 }
 
-/// What is tried: inputs as they are, then changed ones without end.
+/// Inputs to run: unchanged ones first, then endless mutations.
 struct Inputs<'a> {
     target: &'a Target,
     seed: u64,
-    /// Tried as they are: the named files, or what was asked for.
+    /// Inputs that are only run unchanged: the named files, or the requested ones.
     whole: Vec<Vec<u8>>,
-    /// Tried as they are and changed: the seeds and the regressions.
+    /// Inputs that are run unchanged and mutated: the seeds and the regressions.
     seeds: Vec<Vec<u8>>,
-    /// Whether changed ones follow.
+    /// True if mutations follow.
     changes: bool,
 }
 
@@ -76,7 +77,7 @@ fn words(target: &Target) -> Vec<&'static str> {
     target.words.split('¦').filter(|word| !word.is_empty()).collect()
 }
 
-/// The files of a folder by name, or the one file; nothing if there is neither.
+/// Reads the files of a folder by name, or a single file; empty if the path does not exist.
 fn files(path: &Path) -> Vec<Vec<u8>> {
     if path.is_file() {
         return vec![fs::read(path).expect("a file that is there")];
@@ -87,11 +88,11 @@ fn files(path: &Path) -> Vec<Vec<u8>> {
     paths.iter().map(|path| fs::read(path).expect("a file that is there")).collect()
 }
 
-/// Runs the target `name` of `targets`: the body of a test of that name. `memory` is the test's allocator, `corpus` has a folder of regressions for each target, and
-/// what fails is kept in `found`.
+/// Runs the target `name` of `targets`: the body of a test of that name. `memory` is the test's allocator, `corpus` has
+/// a folder of regressions for each target, and failing inputs are kept in `found`.
 ///
 /// # Panics
-/// If an input breaks a rule; it says which, and how to run it again.
+/// If an input breaks a rule; the message names the input and the command to run it again.
 pub fn run(name: &str, targets: &[Target], memory: &Cap<System>, corpus: &Path, found: &Path) {
     let target = targets.iter().find(|target| target.name == name).expect("a target of that name");
     match variable(STATE_VARIABLE) {
@@ -104,14 +105,14 @@ thread_local! {
     static SAID: RefCell<String> = const { RefCell::new(String::new()) };
 }
 
-/// Seconds of a processor that this thread has taken.
+/// CPU seconds that this thread has used.
 fn cpu() -> f64 {
     let used = getrusage(UsageWho::RUSAGE_THREAD).expect("the system counts");
     let seconds = |time: nix::sys::time::TimeVal| time.tv_sec() as f64 + time.tv_usec() as f64 * 1e-6;
     seconds(used.user_time()) + seconds(used.system_time())
 }
 
-/// Why an input fails, if it does.
+/// Runs one input. Returns the reason if it fails.
 fn verdict(target: &Target, bytes: &[u8], memory: &Cap<System>) -> Result<bool, String> {
     let before = cpu();
     let most = target.memory + MEMORY_FACTOR * bytes.len();
@@ -127,7 +128,7 @@ fn verdict(target: &Target, bytes: &[u8], memory: &Cap<System>) -> Result<bool, 
 }
 
 fn child(target: &Target, inputs: &Inputs<'_>, memory: &Cap<System>, state: &Path) {
-    // What is caught is told by whom it concerns; thousands of backtraces would be told by nobody.
+    // The caller reports a caught panic; thousands of backtraces would only hide it.
     std::panic::set_hook(Box::new(|info| SAID.set(info.to_string().chars().take(2_000).collect())));
     let state = File::options().write(true).open(state).expect("the file that the test made");
     let seconds =
@@ -142,7 +143,7 @@ fn child(target: &Target, inputs: &Inputs<'_>, memory: &Cap<System>, state: &Pat
         match verdict(target, &bytes, memory) {
             Ok(good) => accepted += u64::from(good),
             Err(why) => {
-                // The hook is silent.
+                // The panic hook prints nothing.
                 eprintln!("input {index} of `{}` {why}", target.name);
                 std::process::exit(1);
             }
@@ -154,7 +155,7 @@ fn child(target: &Target, inputs: &Inputs<'_>, memory: &Cap<System>, state: &Pat
     std::process::exit(0);
 }
 
-/// Waits for the process while it goes from input to input.
+/// Waits for the process as long as it advances from input to input.
 fn wait(child: &mut Child, state: &File) -> Option<std::process::ExitStatus> {
     let at = || {
         let mut bytes = [0; 8];
@@ -200,7 +201,7 @@ fn parent(target: &Target, corpus: &Path, found: &Path) {
     let what = match status {
         None => format!("did not end in {} s", HANGS.as_secs()),
         Some(status) if status.code() == Some(1) => "broke a rule (see above)".into(),
-        // What std does where memory is refused, and where a stack overflows.
+        // SIGABRT: std's reaction to a failed allocation and to a stack overflow.
         Some(status) if status.signal() == Some(6) => format!(
             "was stopped: it asked for more than {} bytes and {MEMORY_FACTOR} times its {} bytes, or overflowed the stack (see above)",
             target.memory,

@@ -1,11 +1,16 @@
-//! Broken and hostile files for every parser of other people's files.
+//! Broken and hostile files for every parser of untrusted files.
 //!
-//! A [`Target`] is a parser with files that it reads. [`mutate`] makes others of these, from a key alone; [`fuzz`] runs a target on them for a time and holds it to
-//! three rules: no panic, no more than [`MEMORY`] bytes and [`MEMORY_FACTOR`] times the input's length at a time, no more than [`CPU_S`] seconds of a
-//! processor. `tests/fuzz.rs` does so in every `cargo test`, and `fuzz/` at the root has the same functions for `cargo fuzz`.
+//! A [`Target`] is a parser with sample files. [`mutate`] derives other files from these by a key. [`fuzz`] runs a
+//! target on them for a limited time and checks three rules:
+//! - no panic;
+//! - at most [`MEMORY`] bytes plus [`MEMORY_FACTOR`] times the input's length at a time;
+//! - at most [`CPU_S`] seconds of CPU time.
 //!
-//! Not its job: that what is read is right; each parser's own tests say so.
+//! `tests/fuzz.rs` does this in every `cargo test`, and `fuzz/` at the root runs the same functions with `cargo fuzz`.
+//!
+//! Not its job: the correctness of parsed values, which each parser's own tests check.
 
+pub mod canary;
 pub mod fuzz;
 pub mod mutate;
 pub mod named;
@@ -13,49 +18,49 @@ pub mod scratch;
 pub mod seeds;
 pub mod targets;
 
-/// Bytes that a parser may allocate whatever its input, together with what it reads into.
+/// Bytes that a parser may allocate for any input, including its buffers.
 pub const MEMORY: usize = 64 << 20;
-/// Bytes that it may allocate besides for each byte of input.
+/// Further bytes that it may allocate per byte of input.
 pub const MEMORY_FACTOR: usize = 16;
-/// Seconds of a processor that an input may take.
+/// CPU seconds that an input may take.
 pub const CPU_S: f64 = 2.0;
 
-/// A parser, and what to try it with.
+/// A parser with the inputs to try.
 #[derive(Debug, Clone, Copy)]
 pub struct Target {
-    /// Its name: of the test, of the fuzz target and of the folder in `fuzz/corpus`.
+    /// Name of the test, of the fuzz target and of the folder in `fuzz/corpus`.
     pub name: &'static str,
-    /// Reads the bytes and uses what they gave; whether they were accepted.
+    /// Parses the bytes and uses the result. Returns true if they were accepted.
     pub run: fn(&[u8]) -> bool,
-    /// Small files, most of which are accepted.
+    /// Small files; most of them are accepted.
     pub seeds: fn() -> Vec<Vec<u8>>,
-    /// Files that were made to do harm: all are refused.
+    /// Hostile files; all of them are refused.
     pub named: fn() -> Vec<named::Named>,
-    /// What stands in such files, to be put where it does not belong; `¦` between them.
+    /// Words of such files, to be inserted at wrong places; separated by `¦`.
     pub words: &'static str,
-    /// Bytes in the place of [`MEMORY`].
+    /// Limit of allocated bytes that replaces [`MEMORY`].
     pub memory: usize,
 }
 
 impl Target {
-    /// A target within [`MEMORY`].
+    /// Creates a target with the limit [`MEMORY`].
     pub const fn new(name: &'static str, run: fn(&[u8]) -> bool, seeds: fn() -> Vec<Vec<u8>>) -> Self {
         Self { name, run, seeds, named: named::none, words: "", memory: MEMORY }
     }
 
-    /// With files that were made to do harm.
+    /// Adds hostile files.
     #[must_use]
     pub const fn named(self, named: fn() -> Vec<named::Named>) -> Self {
         Self { named, ..self }
     }
 
-    /// With what stands in its files.
+    /// Adds words of its files.
     #[must_use]
     pub const fn words(self, words: &'static str) -> Self {
         Self { words, ..self }
     }
 
-    /// Within so many bytes.
+    /// Sets the limit of allocated bytes.
     #[must_use]
     pub const fn within(self, memory: usize) -> Self {
         Self { memory, ..self }

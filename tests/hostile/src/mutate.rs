@@ -1,18 +1,18 @@
-//! Files made of other files: a function of a key, so that an input is found again by its number.
+//! Mutates files. The result is a function of a key, so that an input can be found again by its number.
 
 use motion::random::Stream;
 use protocol::Seed;
 
-/// Bytes that an input has at most, but for one in [`LARGE_ONE_IN`].
+/// Largest size of most inputs; one in [`LARGE_ONE_IN`] may be larger.
 const USUAL: usize = 64 << 10;
-/// Bytes that any input has at most.
+/// Largest size of any input.
 const LARGEST: usize = 2 << 20;
-/// How rare large ones are, for what grows with the square shows only there.
+/// Rate of large inputs. Only they reveal quadratic behaviour.
 const LARGE_ONE_IN: usize = 400;
-/// Changes to one input.
+/// Changes per input.
 const CHANGES: usize = 5;
 
-/// Numbers where parsers count, allocate, divide or convert.
+/// Numbers at which parsers count, allocate, divide or convert.
 const NUMBERS: [&str; 24] = [
     "0",
     "-1",
@@ -40,10 +40,10 @@ const NUMBERS: [&str; 24] = [
     "255",
 ];
 
-/// Bytes that mean something to some parser.
+/// Bytes with a special meaning for some parser.
 const BYTES: &[u8] = b"\x00\xff\x7f\x80\x01\n\r\t \"'{}[](),:;#-+.eE0129/\\<>&%|*?!~^PK\xfe\xef\xbb\xbf";
 
-/// What stands in files of all kinds.
+/// Words of files of all kinds.
 const WORDS: [&str; 12] =
     ["\"", "{", "}", "[", "]", "\n", "\0", "..", "/etc/passwd", "\u{202e}", "\u{1b}[31m", "\u{1f600}"];
 
@@ -60,14 +60,14 @@ pub fn input(seed: u64, purpose: &str, index: u64, seeds: &[Vec<u8>], words: &[&
     bytes
 }
 
-/// A range of at most `longest` bytes.
+/// Draws a range of at most `longest` bytes.
 fn range(draw: &mut Stream, length: usize, longest: usize) -> std::ops::Range<usize> {
     let begin = draw.below(length + 1);
     let end = begin + draw.below((length - begin).min(longest) + 1);
     begin..end
 }
 
-/// A length of which short ones are likelier.
+/// Draws a length; short ones are likelier.
 fn short(draw: &mut Stream) -> usize {
     1 << draw.below(12)
 }
@@ -78,7 +78,7 @@ fn insert(bytes: &mut Vec<u8>, at: usize, what: &[u8], times: usize, most: usize
     bytes.splice(at..at, what.repeat(times)).for_each(drop);
 }
 
-/// Digits, with sign, point and exponent, around a place that is drawn.
+/// Digits with sign, point and exponent near a random position.
 fn number_near(bytes: &[u8], draw: &mut Stream) -> Option<std::ops::Range<usize>> {
     let is_part = |byte: &u8| byte.is_ascii_digit() || b"+-.eE".contains(byte);
     let from = draw.below(bytes.len());
@@ -103,14 +103,14 @@ fn change(bytes: &mut Vec<u8>, draw: &mut Stream, seeds: &[Vec<u8>], words: &[&s
             let longest = short(draw);
             bytes.drain(range(draw, length, longest)).for_each(drop);
         }
-        // A part again, once or very often.
+        // Repeat a part, once or very often.
         4 => {
             let longest = short(draw);
             let part = bytes[range(draw, length, longest)].to_vec();
             let (at, times) = (draw.below(length + 1), short(draw) * draw.below(5));
             insert(bytes, at, &part, times, most);
         }
-        // The beginning of this one and the end of another.
+        // Join the beginning of this file and the end of another.
         5 => {
             let Some(other) = seeds.get(draw.below(seeds.len())) else { return };
             let (here, there) = (draw.below(length + 1), draw.below(other.len() + 1));
@@ -122,7 +122,7 @@ fn change(bytes: &mut Vec<u8>, draw: &mut Stream, seeds: &[Vec<u8>], words: &[&s
             let with = NUMBERS[draw.below(NUMBERS.len())];
             bytes.splice(place, with.bytes()).for_each(drop);
         }
-        // A length or a count as bytes.
+        // Overwrite bytes with a binary length or count.
         8 if length >= 8 => {
             let width = [1, 2, 4, 8][draw.below(4)];
             let value = [0, 1, u64::MAX, 1 << 31, 1 << 60, 1 << 62, length as u64, 1 << 16][draw.below(8)];
@@ -133,7 +133,7 @@ fn change(bytes: &mut Vec<u8>, draw: &mut Stream, seeds: &[Vec<u8>], words: &[&s
             let (at, what) = (draw.below(length + 1), word(draw).to_vec());
             insert(bytes, at, &what, 1, most);
         }
-        // Deep nesting, or very many of something.
+        // Nest deeply, or repeat a word very often.
         11 => {
             let (at, what) = (draw.below(length + 1), word(draw).to_vec());
             let times = short(draw) * (1 + draw.below(32));

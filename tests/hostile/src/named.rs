@@ -1,4 +1,4 @@
-//! Files that somebody made to do harm, each of which is refused: what mutation would hardly find.
+//! Hostile files that mutation would hardly find. Each is refused.
 
 use std::fmt::Write as _;
 
@@ -6,15 +6,15 @@ use serde_json::json;
 
 use crate::seeds;
 
-/// What a file does, and the file.
+/// Description and content of a file.
 pub type Named = (&'static str, Vec<u8>);
 
-/// Nothing.
+/// No hostile files.
 pub fn none() -> Vec<Named> {
     Vec::new()
 }
 
-/// Recordings with too much of everything.
+/// Recordings with excessive counts.
 pub fn bvh() -> Vec<Named> {
     let head = "HIERARCHY\nROOT r\n{\n";
     let motion = |frames: &str, time: &str| {
@@ -39,7 +39,7 @@ pub fn bvh() -> Vec<Named> {
     ]
 }
 
-/// Deep and wide YAML.
+/// Deeply nested and exponentially expanding YAML.
 pub fn yaml() -> Vec<Named> {
     let mut laughs = "a: &a [x, x, x, x, x, x, x, x, x]\n".to_owned();
     for (before, name) in
@@ -63,7 +63,7 @@ pub fn yaml() -> Vec<Named> {
     ]
 }
 
-/// Arrays that say that they are enormous.
+/// Arrays whose headers claim enormous sizes.
 pub fn npy() -> Vec<Named> {
     let array = |shape: &str| {
         let header = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}\n");
@@ -77,7 +77,7 @@ pub fn npy() -> Vec<Named> {
     ]
 }
 
-/// Archives that unpack to far more than they are.
+/// Archives that unpack to far more than their size.
 pub fn npz() -> Vec<Named> {
     vec![
         ("zeros packed a thousandfold", seeds::zip_bomb(&["joints.npy"], 90 << 20)),
@@ -85,7 +85,7 @@ pub fn npz() -> Vec<Named> {
     ]
 }
 
-/// Deep JSON and long lines.
+/// Deeply nested JSON and long lines.
 pub fn json() -> Vec<Named> {
     vec![
         ("lists nested 100,000 deep", "[".repeat(100_000).into_bytes()),
@@ -94,7 +94,7 @@ pub fn json() -> Vec<Named> {
     ]
 }
 
-/// Headers that lie.
+/// Headers with false lengths and offsets.
 pub fn safetensors() -> Vec<Named> {
     let file = |length: u64, header: &str| [&length.to_le_bytes()[..], header.as_bytes()].concat();
     let shaped = |shape: &str| {
@@ -110,7 +110,7 @@ pub fn safetensors() -> Vec<Named> {
     ]
 }
 
-/// Tokenizers that grow where they are read, or make much of little.
+/// Tokenizers that grow during parsing, or expand a short text to a long one.
 pub fn tokenizer() -> Vec<Named> {
     let with = |change: &dyn Fn(&mut serde_json::Value)| {
         let mut file: serde_json::Value = serde_json::from_slice(&seeds::tokenizer()[0]).expect("one of ours");
@@ -138,18 +138,19 @@ pub fn tokenizer() -> Vec<Named> {
     ]
 }
 
-/// A token that a tree with a level a byte has no stack for.
+/// A token so long that a tree with one level per byte overflows the stack.
 fn long_token() -> Vec<u8> {
     let mut file: serde_json::Value = serde_json::from_slice(&seeds::tokenizer()[1]).expect("one of ours");
     file["model"]["vocab"][4] = json!(["a".repeat(60_000), -1.5]);
     file.to_string().into_bytes()
 }
 
-/// Pickles that run a command in Python, archives that unpack to more than they are, and what copies itself.
+/// Pickles that run a command in Python, archives that unpack to far more than their size, and structures that multiply
+/// themselves.
 pub fn torch() -> Vec<Named> {
     let ran = crate::scratch::folder().join("ran");
     let command = format!("touch {}", ran.display());
-    // A list of lists of lists, each named again ten times.
+    // A list of lists of lists, each referenced ten times.
     let mut copies = b"\x80\x02]q\x00".to_vec();
     for i in 0..20_u8 {
         copies.extend([b"]q", &[i + 1][..], b"("].concat());

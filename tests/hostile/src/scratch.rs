@@ -4,16 +4,16 @@ use std::fs;
 use std::path::PathBuf;
 use std::sync::OnceLock;
 
-/// The folder, which stays as it was left.
+/// The folder. Its content stays between calls.
 ///
 /// # Panics
-/// If there is no place for it.
+/// If it cannot be created.
 pub fn folder() -> PathBuf {
     static FOLDER: OnceLock<tempfile::TempDir> = OnceLock::new();
     FOLDER.get_or_init(|| tempfile::tempdir().expect("a folder for temporary files")).path().to_owned()
 }
 
-/// A file in it with these bytes.
+/// Writes a file with these bytes into the folder.
 ///
 /// # Panics
 /// If it cannot be written.

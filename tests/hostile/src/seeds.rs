@@ -1,4 +1,4 @@
-//! Small files of every kind, made by us: where mutation begins.
+//! Small self-made files of every kind, from which mutation starts.
 
 use std::io::{Cursor, Write as _};
 
@@ -15,12 +15,12 @@ pub(crate) fn joints() -> Vec<f32> {
     joints[..5 * 66].to_vec()
 }
 
-/// Texts as files.
+/// Converts texts to files.
 fn texts(texts: &[&str]) -> Vec<Vec<u8>> {
     texts.iter().map(|text| text.as_bytes().to_vec()).collect()
 }
 
-/// Recordings: one of ours, and what other programs write.
+/// Recordings: one of ours, and the styles of other programs.
 pub fn bvh() -> Vec<Vec<u8>> {
     let skeleton = motion::Skeleton::of(protocol::stage::DataFormat::Humanml3d);
     let ours = Rig::fit(&joints(), skeleton).expect("a clip of ours").to_bvh(20.0, 100.0).to_text();
@@ -32,7 +32,7 @@ pub fn bvh() -> Vec<Vec<u8>> {
     all
 }
 
-/// Joint maps: shipped ones.
+/// Shipped joint maps.
 pub fn joint_map() -> Vec<Vec<u8>> {
     let shipped = mocap::joint_map::SHIPPED;
     shipped.iter().step_by(2).map(|(_, text)| text.as_bytes().to_vec()).collect()
@@ -42,7 +42,7 @@ fn array(header: &str, data: &[u8]) -> Vec<u8> {
     [b"\x93NUMPY\x01\x00", &(header.len() as u16).to_le_bytes()[..], header.as_bytes(), data].concat()
 }
 
-/// Arrays: of joints, of features, in 64 bits.
+/// Arrays of joints, of features, and in 64 bits.
 pub fn npy() -> Vec<Vec<u8>> {
     let numbers: Vec<u8> = (0..66).flat_map(|i| (f64::from(i) * 0.1).to_le_bytes()).collect();
     vec![
@@ -63,7 +63,7 @@ fn archive(members: &[(&str, Vec<u8>)], packed: bool) -> Vec<u8> {
     archive.finish().expect("in memory").into_inner()
 }
 
-/// Archives of arrays, packed and not, and arrays alone, which are read in their place.
+/// Archives of arrays, packed and unpacked, and a plain array, which is accepted in place of an archive.
 pub fn npz() -> Vec<Vec<u8>> {
     let joints = npy::to_bytes(&[5, 22, 3], &joints()).expect("an array");
     let rate = array("{'descr': '<f8', 'fortran_order': False, 'shape': (), }\n", &60_f64.to_le_bytes());
@@ -93,7 +93,7 @@ pub fn captions() -> Vec<Vec<u8>> {
     ])
 }
 
-/// Sentences to draw, in both forms.
+/// Sentences to generate from, in both formats.
 pub fn sentences() -> Vec<Vec<u8>> {
     texts(&[
         "a person walks\n  a man, \"waving\" # 120 \nwaves#4.5s\njumps#NA\n",
@@ -101,7 +101,7 @@ pub fn sentences() -> Vec<Vec<u8>> {
     ])
 }
 
-/// Pipelines: the shortest that trains, and one with anchors, lists and a sweep.
+/// Pipelines: a minimal training, and one with anchors, lists and a sweep.
 pub fn pipeline() -> Vec<Vec<u8>> {
     texts(&[
         "name: p\nseed: 7\ndataset: {format: synthetic, clips: 40}\nstages:\n  vae: {kind: train.vae, steps: 10, batch: {global: 8, slices: 2}, lr: 1e-3}\n  latents: {kind: encode.latents, vae: vae}\n  mld: {kind: train.mld, steps: 20}\n",
@@ -109,7 +109,7 @@ pub fn pipeline() -> Vec<Vec<u8>> {
     ])
 }
 
-/// Paths that a motion is told, as a table and as a document.
+/// Target paths of a motion, as a table and as a document.
 pub fn waypoints() -> Vec<Vec<u8>> {
     texts(&[
         "t,joint,x,y,z\n0,pelvis,0,0.9,0\n\n1.01, left_wrist ,0.2,1.2,0.5\n0.5,pelvis,0,0.9,1\n",
@@ -124,7 +124,7 @@ fn tensors(header: &Value, data: &[u8]) -> Vec<u8> {
     [&(header.len() as u64).to_le_bytes()[..], header.as_bytes(), data].concat()
 }
 
-/// Safetensors of all types that are read.
+/// Safetensors of all supported types.
 pub fn safetensors() -> Vec<Vec<u8>> {
     let header = json!({
         "__metadata__": {"format": "pt"},
@@ -168,7 +168,7 @@ fn clip_tokenizer() -> Value {
     })
 }
 
-/// A T5 tokenizer of seven tokens, whose table of characters is empty.
+/// A T5 tokenizer of seven tokens with an empty table of characters.
 fn t5_tokenizer() -> Value {
     json!({
         "version": "1.0", "truncation": null, "padding": null,
@@ -193,7 +193,7 @@ pub fn tokenizer() -> Vec<Vec<u8>> {
     [clip_tokenizer(), t5_tokenizer()].map(|value| value.to_string().into_bytes()).to_vec()
 }
 
-/// The files of a small CLIP and of a small Sentence-T5, by path; each of these may be changed.
+/// The files of a small CLIP and of a small Sentence-T5, by path; each may be mutated.
 pub fn encoder_folder(sentence: bool) -> Vec<(&'static str, Vec<u8>)> {
     let text = |value: Value| value.to_string().into_bytes();
     if sentence {
@@ -271,7 +271,7 @@ pub fn encoder_folder(sentence: bool) -> Vec<(&'static str, Vec<u8>)> {
     ]
 }
 
-/// Zeros under these names.
+/// Safetensors of zeros with these names and shapes.
 fn weights(specs: &[(String, Vec<usize>)]) -> Vec<u8> {
     let (mut header, mut end) = (serde_json::Map::new(), 0);
     for (name, shape) in specs {
@@ -282,18 +282,18 @@ fn weights(specs: &[(String, Vec<usize>)]) -> Vec<u8> {
     tensors(&Value::Object(header), &vec![0; end])
 }
 
-/// For each file of the two folders: which one it is, in a byte, and the file.
+/// Each file of the two folders, preceded by one byte with its index.
 pub fn encoder() -> Vec<Vec<u8>> {
     let folders = [encoder_folder(false), encoder_folder(true)].concat();
     folders.into_iter().enumerate().map(|(i, (_, bytes))| [vec![i as u8], bytes].concat()).collect()
 }
 
-/// A pickled text.
+/// Pickles a text.
 fn text(text: &str) -> Vec<u8> {
     [b"X", &(text.len() as u32).to_le_bytes()[..], text.as_bytes()].concat()
 }
 
-/// `torch._utils._rebuild_tensor_v2` of three by four numbers of storage `0`, as `torch.save` pickles it.
+/// Pickles `torch._utils._rebuild_tensor_v2` of three by four numbers of storage `0`, as `torch.save` does.
 fn tensor(module: &str) -> Vec<u8> {
     let storage = [
         b"(".to_vec(),
@@ -311,7 +311,7 @@ fn tensor(module: &str) -> Vec<u8> {
     .concat()
 }
 
-/// A pickled dict of a tensor; or, for `keys`, a dict of such dicts.
+/// Pickles a dict with a tensor; with `keys`, a dict of such dicts.
 fn state_dict(keys: &[&str]) -> Vec<u8> {
     let one = [b"}".to_vec(), text("linear.weight"), tensor("torch"), b"s".to_vec()].concat();
     let all = keys.iter().map(|key| [text(key), one.clone(), b"s".to_vec()].concat());
@@ -319,13 +319,13 @@ fn state_dict(keys: &[&str]) -> Vec<u8> {
     [b"\x80\x02".to_vec(), body, b".".to_vec()].concat()
 }
 
-/// A pickled dict from words to numbers.
+/// Pickles a dict from words to numbers.
 pub fn pickled_rows(rows: &[(&str, u8)]) -> Vec<u8> {
     let pairs = rows.iter().map(|(word, row)| [text(word), vec![b'K', *row], b"s".to_vec()].concat());
     [b"\x80\x02}".to_vec(), pairs.collect::<Vec<_>>().concat(), b".".to_vec()].concat()
 }
 
-/// What `torch.save` writes of such a dict.
+/// The archive that `torch.save` writes for such a dict.
 pub fn torch_archive(keys: &[&str]) -> Vec<u8> {
     let members = [
         ("archive/data.pkl", state_dict(keys)),
@@ -336,7 +336,7 @@ pub fn torch_archive(keys: &[&str]) -> Vec<u8> {
     archive(&members, false)
 }
 
-/// The form before the archive: pickles behind each other, then storages.
+/// The format before the archive: consecutive pickles, then storages.
 pub fn torch_legacy(keys: &[&str]) -> Vec<u8> {
     let magic = b"\x80\x02\x8a\x0a\x6c\xfc\x9c\x46\xf9\x20\x6a\xa8\x50\x19.";
     let system = [b"\x80\x02}".to_vec(), text("little_endian"), b"\x88s.".to_vec()].concat();
@@ -354,28 +354,28 @@ pub fn torch_legacy(keys: &[&str]) -> Vec<u8> {
     .concat()
 }
 
-/// Pickles of tensors in both forms.
+/// Pickles of tensors in both formats.
 pub fn torch() -> Vec<Vec<u8>> {
     vec![torch_archive(&[]), torch_legacy(&[]), state_dict(&[])]
 }
 
-/// A pickle that runs a command where it is unpickled by Python, in place of a dict.
+/// A pickle that runs a command if Python unpickles it.
 pub fn pickle_that_runs(command: &str) -> Vec<u8> {
     [b"\x80\x02cposix\nsystem\n(".to_vec(), text(command), b"tR.".to_vec()].concat()
 }
 
-/// The same in the archive of `torch.save`.
+/// Like [`pickle_that_runs`], in the archive format of `torch.save`.
 pub fn archive_that_runs(command: &str) -> Vec<u8> {
     archive(&[("archive/data.pkl", pickle_that_runs(command)), ("archive/version", b"3\n".to_vec())], false)
 }
 
-/// Members of zeros that take a thousandth packed.
+/// An archive of zeros that pack to a thousandth.
 pub fn zip_bomb(members: &[&str], bytes: usize) -> Vec<u8> {
     let members: Vec<(&str, Vec<u8>)> = members.iter().map(|name| (*name, vec![0; bytes])).collect();
     archive(&members, true)
 }
 
-/// Joints as bytes: of a clip, and of a figure that lies in a point.
+/// Joints as bytes: of a clip, and of a figure whose joints coincide.
 pub fn motions() -> Vec<Vec<u8>> {
     let bytes = |values: &[f32]| values.iter().flat_map(|v| v.to_le_bytes()).collect();
     vec![bytes(&joints()), bytes(&[0.0; 132]), bytes(&[1e30; 66])]

@@ -1,4 +1,4 @@
-//! What reads each kind of file, and uses what it gives as the program does.
+//! The parsers of all kinds of files, with the uses that the program makes of their results.
 
 use std::path::Path;
 use std::sync::Once;
@@ -10,16 +10,17 @@ use mocap::rotations::Rig;
 use mocap::take::{Reading, Take, resample};
 use mocap::{Body, arrays, captions, glb, requests};
 use motion::text::Caption;
-use motion::{Skeleton, npy, text, waypoints};
+use motion::{DataPath, Skeleton, npy, text, waypoints};
 use protocol::stage::DataFormat;
 use text_models::{EncoderFolder, Kind, ReadAt, Request, Rules, TokenIds, Tokenizer, WeightsFile};
 
-use crate::{Target, named, scratch, seeds};
+use crate::{Target, canary, named, scratch, seeds};
 
-/// A pickle reader copies what a pickle names again, up to a million values: its own bound, far above [`crate::MEMORY`].
+/// A pickle reader copies values that a pickle references repeatedly, up to a million values. Its own limit is
+/// therefore far above [`crate::MEMORY`].
 pub const PICKLE_MEMORY: usize = 512 << 20;
 
-/// Every parser of this crate's.
+/// All targets of this crate.
 pub const TARGETS: [Target; 16] = [
     Target::new("bvh", bvh, seeds::bvh)
         .named(named::bvh)
@@ -63,7 +64,7 @@ pub const TARGETS: [Target; 16] = [
     Target::new("html", html, seeds::motions),
 ];
 
-/// The function of a target, for `fuzz/`.
+/// Runs a target by name, for `fuzz/`.
 ///
 /// # Panics
 /// If there is no such target.
@@ -72,15 +73,17 @@ pub fn run(name: &str, bytes: &[u8]) -> bool {
     (target.run)(bytes)
 }
 
-/// Characters of an error: of many mistakes, each of a line or two.
+/// Longest error in bytes: a list of many mistakes, each a line or two.
 const ERROR: usize = 64 << 10;
 
-/// What was read, if an error is short enough to be read too.
+/// Returns the parsed value, and checks that an error is short and quotes nothing.
 fn read<T, E: ToString>(result: Result<T, E>) -> Option<T> {
     match result {
         Ok(value) => Some(value),
         Err(error) => {
-            let length = error.to_string().len();
+            let error = error.to_string();
+            canary::expect_absent(&error);
+            let length = error.len();
             assert!(length <= ERROR, "an error of {length} bytes");
             None
         }
@@ -91,7 +94,7 @@ fn bvh(bytes: &[u8]) -> bool {
     let Some(bvh) = read(Bvh::parse(Path::new("x.bvh"), bytes)) else { return false };
     assert_eq!(bvh.values.len(), bvh.frames * bvh.channels());
     assert!(bvh.rate > 0.0 && bvh.values.iter().all(|value| value.is_finite()));
-    if let Ok(take) = Take::of_bvh(&bvh, &Reading::default()) {
+    if let Some(take) = read(Take::of_bvh(&bvh, &Reading::default())) {
         let skeleton = Skeleton::of(DataFormat::Humanml3d);
         assert_eq!(take.joints.len(), 66 * bvh.frames);
         assert!(!resample(&take.joints, 66, take.rate, skeleton.fps).is_empty());
@@ -104,7 +107,7 @@ fn joint_map(bytes: &[u8]) -> bool {
     assert_eq!(JointMap::parse(Path::new("x.yaml"), &map.to_yaml()).ok().as_ref(), Some(&map), "{}", map.to_yaml());
     // Our own recording has all joints by their names.
     let recording = Bvh::parse(Path::new("x.bvh"), &seeds::bvh()[2]).expect("one of ours");
-    if let Ok(places) = map.resolve(&recording) {
+    if let Some(places) = read(map.resolve(&recording)) {
         assert_eq!(places.joints(&recording.placed(0), 0.01).len(), 22);
     }
     true
@@ -112,9 +115,9 @@ fn joint_map(bytes: &[u8]) -> bool {
 
 fn npy(bytes: &[u8]) -> bool {
     let file = Path::new("x.npy");
-    let strict = npy::parse(file, bytes, false);
-    let Ok(array) = npy::parse(file, bytes, true) else {
-        assert!(strict.is_err());
+    let strict = read(npy::parse(file, bytes, false));
+    let Some(array) = read(npy::parse(file, bytes, true)) else {
+        assert!(strict.is_none());
         return false;
     };
     assert_eq!(array.shape.iter().product::<usize>(), array.data.len());
@@ -128,7 +131,7 @@ fn npz(bytes: &[u8]) -> bool {
     true
 }
 
-/// A caption that was read is written and read again as it is.
+/// Checks that writing a caption and parsing it again returns the same caption.
 fn survives(caption: &Caption) {
     assert_eq!(Caption::parse(&caption.to_line()).as_ref(), Ok(caption));
     let mirrored = captions::mirrored(caption);
@@ -149,7 +152,8 @@ fn texts(bytes: &[u8]) -> bool {
     if let Some(captions) = &beside {
         captions.iter().for_each(survives);
     }
-    if let Ok(found) = text::parse_file(file, content) {
+    let errors = |errors: Vec<text::TextError>| errors.iter().map(ToString::to_string).collect::<Vec<_>>().join("\n");
+    if let Some(found) = read(text::parse_file(file, content).map_err(errors)) {
         for (_, caption) in &found.captions {
             if let Some((from, to)) = caption.frames(20.0) {
                 assert!(from <= to);
@@ -186,7 +190,7 @@ fn waypoints(bytes: &[u8]) -> bool {
     read.iter().any(Option::is_some)
 }
 
-/// Bytes that are read where they lie.
+/// Bytes in memory, read in place.
 struct Slice<'a>(&'a [u8]);
 
 impl ReadAt for Slice<'_> {
@@ -203,7 +207,7 @@ fn safetensors(bytes: &[u8]) -> bool {
     let Some(file) = read(WeightsFile::open(Slice(bytes))) else { return false };
     for (name, tensor) in &file.tensors {
         let count: usize = tensor.shape.iter().product();
-        // What is asked for is known by who reads, never by the file; here it is what the file holds at most.
+        // The caller knows the expected size, never the file; here it is at most the size of the file.
         if tensor.element.is_some() && count <= bytes.len() {
             file.read(name, &mut vec![0.0; count]).expect("its place was held against the file");
         }
@@ -219,7 +223,7 @@ fn tokenizer(bytes: &[u8]) -> bool {
         let Some(tokenizer) = read(Tokenizer::new("x", bytes, &rules, 7)) else { continue };
         accepted = true;
         for caption in ["ab a b \u{1f600}", "", "a person walks forward, turns around & sits\u{2028}down"] {
-            if let Ok(ids) = tokenizer.ids(caption) {
+            if let Some(ids) = read(tokenizer.ids(caption)) {
                 assert!(ids.len() <= rules.most && ids.iter().all(|id| *id < 7), "{ids:?}");
             }
         }
@@ -230,9 +234,11 @@ fn tokenizer(bytes: &[u8]) -> bool {
 /// Opens an encoder's folder and reads all of it.
 fn opened(root: &str, kind: Kind) -> bool {
     let request = Request { kind, ids: TokenIds::HuggingFace, most: 0 };
-    let Some(folder) = read(EncoderFolder::open(&scratch::folder().join(root), &request)) else { return false };
+    let Some(folder) = read(EncoderFolder::open(&DataPath::local(scratch::folder().join(root)), &request)) else {
+        return false;
+    };
     folder.description.check().expect("it was checked");
-    // Any answer will do.
+    // Any result is fine.
     let _ = folder.tokenizer().expect("it was made").ids("ab a b");
     let _ = folder.weights().map(|weights| (folder.digest(&weights), folder.skipped_line()));
     true
@@ -261,7 +267,7 @@ fn encoder(bytes: &[u8]) -> bool {
     accepted
 }
 
-/// As the dense layer of a Sentence-T5, all else of which is sound.
+/// Uses the bytes as the dense layer of an otherwise valid Sentence-T5.
 fn torch(bytes: &[u8]) -> bool {
     static WRITTEN: Once = Once::new();
     WRITTEN.call_once(|| {
@@ -275,7 +281,7 @@ fn torch(bytes: &[u8]) -> bool {
     opened("torch", Kind::SentenceT5)
 }
 
-/// Joints of a motion out of bytes, perhaps none.
+/// Reads the joints of a motion from bytes; the motion may be empty.
 fn rig(bytes: &[u8]) -> Option<(Vec<f32>, Rig)> {
     let joints: Vec<f32> = bytes.as_chunks::<4>().0.iter().map(|b| f32::from_le_bytes(*b)).collect();
     let whole = joints.len() / 66 * 66;
@@ -284,7 +290,7 @@ fn rig(bytes: &[u8]) -> Option<(Vec<f32>, Rig)> {
     Some((joints, rig))
 }
 
-/// What we write we read.
+/// Checks that our parser reads our own output.
 fn bvh_out(bytes: &[u8]) -> bool {
     let Some((joints, rig)) = rig(bytes) else { return false };
     if joints.iter().any(|v| v.abs() > 1e4) {
@@ -296,7 +302,7 @@ fn bvh_out(bytes: &[u8]) -> bool {
     true
 }
 
-/// Either no file, or one whose chunks are as long as they say and whose JSON is JSON, with finite numbers alone.
+/// Checks that the result is no file, or a file with correct chunk lengths and valid JSON of finite numbers.
 fn glb(bytes: &[u8]) -> bool {
     let Some((_, rig)) = rig(bytes) else { return false };
     let name = String::from_utf8_lossy(&bytes[..bytes.len().min(100)]).into_owned();
@@ -322,7 +328,7 @@ fn glb(bytes: &[u8]) -> bool {
     true
 }
 
-/// Either no page, or one in which a caption is text.
+/// Checks that the result is no page, or a page that escapes its caption.
 fn html(bytes: &[u8]) -> bool {
     let Some((joints, _)) = rig(bytes) else { return false };
     let body = Body::of(Skeleton::of(DataFormat::Humanml3d));

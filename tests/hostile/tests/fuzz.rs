@@ -1,6 +1,8 @@
-//! Every parser of other people's files on changed files, for a time; see [`hostile::fuzz`] for the rules and for what to do with what is found.
+//! Fuzzes every parser of untrusted files for a limited time; see [`hostile::fuzz`] for the rules and for reproducing a
+//! failure.
 //!
-//! `STRIDE_FUZZ_SECONDS` says for how long each, `STRIDE_FUZZ_SEED` takes other inputs, `STRIDE_FUZZ_INPUT` runs a file.
+//! `STRIDE_FUZZ_SECONDS` sets the time per target, `STRIDE_FUZZ_SEED` draws other inputs, `STRIDE_FUZZ_INPUT` runs a
+//! file.
 
 use std::alloc::System;
 use std::path::Path;

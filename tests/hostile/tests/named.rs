@@ -1,5 +1,5 @@
-//! Files that were made to do harm are refused, and those that run a command elsewhere run none here. That they are refused within bounds of memory and time is
-//! what `tests/fuzz.rs` holds, which begins with the same files.
+//! Hostile files are refused, and files that would run a command run none. `tests/fuzz.rs` starts with the same files
+//! and checks the limits of memory and time.
 
 use std::path::Path;
 
@@ -35,9 +35,10 @@ impl ReadAt for Bytes {
     }
 }
 
-/// What is said names the file or the place, what was found and what was expected.
+/// Errors name the file or the position, the value found and the value expected.
 #[test]
 fn what_is_wrong_is_said() {
+    protocol::show_excerpts();
     let file =
         |all: Vec<named::Named>, what: &str| all.into_iter().find(|(name, _)| *name == what).expect("a named file").1;
     let bvh = |what: &str| Bvh::parse(Path::new("x.bvh"), &file(named::bvh(), what)).expect_err(what).to_string();

@@ -1,5 +1,6 @@
-//! Fills a template with numbers of a run: `tables TEMPLATE RUN.json PIPELINE.json OUT.md [README NAME]`. With the last two the text also takes the
-//! place of what stands between README's lines of that name. `docs/results/regenerate.sh` calls it.
+//! Fills a template with numbers of a run: `tables TEMPLATE RUN.json PIPELINE.json OUT.md [README NAME]`. With the last
+//! two arguments, the text also replaces README's section between the lines of that name. `docs/results/regenerate.sh`
+//! calls it.
 
 use std::path::Path;
 use std::process::ExitCode;

@@ -1,4 +1,4 @@
-//! A server as a client sees it.
+//! The client's side of a connection to a server.
 
 use std::net::IpAddr;
 use std::path::{Path, PathBuf};
@@ -9,48 +9,42 @@ use reqwest::{Method, RequestBuilder, Url};
 use crate::secret::{FileError, Token};
 use crate::tls;
 
-/// Shorter than a server keeps an idle connection, so that none is closed under a request.
+/// Shorter than the idle timeout of a server, so that no request meets a closed connection.
 const IDLE: Duration = Duration::from_secs(10);
 
-/// Why a server cannot even be asked.
+/// Errors that prevent a request from being sent.
 #[derive(Debug, thiserror::Error)]
 pub enum ConnectError {
-    /// Not an address of ours.
-    #[error("`{url}` is no server: {why}; expected `http://HOST:PORT` or `https://HOST:PORT`")]
-    Url {
-        /// What was given.
-        url: String,
-        /// What is wrong with it.
-        why: String,
-    },
-    /// A certificate was pinned and nothing would be checked against it.
-    #[error("`{0}` is not encrypted, so there is nothing to check with --ca; expected `https://`")]
+    /// The address is not a server's.
+    #[error("`{url}` is not the address of a server: {why}; expected `http://HOST:PORT` or `https://HOST:PORT`")]
+    Url { url: String, why: String },
+    /// A certificate is pinned, but the connection is not encrypted.
+    #[error("`{0}` is not encrypted, so --ca has no effect; expected `https://`")]
     Plain(String),
-    /// Everybody on the way would read the token.
+    /// The token would be readable on the network.
     #[error("the token would cross the network to `{0}` unencrypted")]
     Unencrypted(String),
-    /// A file with a secret or a certificate is not used.
+    /// A file with a secret or a certificate cannot be used.
     #[error(transparent)]
     File(#[from] FileError),
-    /// A store is held by somebody else's process.
-    #[error("the token of the process that holds `{}` cannot be read: {error}; run this as the user who started it", dir.display())]
+    /// The store is held by a process of another user.
+    #[error("cannot read the token of the process that holds `{}`: {error}; run this as the user who started that process", dir.display())]
     Holder {
-        /// The store.
+        /// The store's folder.
         dir: PathBuf,
-        /// Why not.
         error: std::io::Error,
     },
-    /// The system gives no client.
-    #[error("no HTTP client: {0}")]
+    /// The HTTP client cannot be built.
+    #[error("cannot create an HTTP client: {0}")]
     Client(String),
 }
 
 impl ConnectError {
-    /// What to do about it.
+    /// The user's next action, if there is a general one.
     pub fn advice(&self) -> Option<&str> {
         match self {
             Self::Unencrypted(_) => Some(
-                "ask it by `https://`, with --ca FILE if its certificate is your own; on a network that only you see, or one that encrypts by itself, say --insecure",
+                "use `https://`, with --ca FILE if its certificate is your own; on a private or encrypted network, use --insecure",
             ),
             Self::File(file) => file.advice(),
             Self::Url { .. } | Self::Plain(_) | Self::Holder { .. } | Self::Client(_) => None,
@@ -58,7 +52,7 @@ impl ConnectError {
     }
 }
 
-/// A server's address, with the token that is shown to it and whom to believe that it is the one.
+/// A server's address, the token sent to it and the certificates trusted for it.
 #[derive(Debug, Clone)]
 pub struct Server {
     http: reqwest::Client,
@@ -67,10 +61,12 @@ pub struct Server {
 }
 
 impl Server {
-    /// A server at `url`; a host and a port alone are taken for `http://`. With `ca`, only what that certificate signs is believed.
+    /// Creates a client of the server at `url`; `HOST:PORT` alone means `http://`. With `ca`, only certificates signed
+    /// by it are trusted.
     ///
     /// # Errors
-    /// [`ConnectError::Unencrypted`] if the token would leave this machine over plain HTTP, besides wrong addresses and files.
+    /// [`ConnectError::Unencrypted`] if the token would leave this machine over plain HTTP; errors for invalid
+    /// addresses and files.
     pub fn new(url: &str, token: Option<Token>, ca: Option<&Path>) -> Result<Self, ConnectError> {
         let server = Self::insecure(url, token, ca)?;
         if server.token.is_some() && !server.is_encrypted() && !server.is_local() {
@@ -79,23 +75,23 @@ impl Server {
         Ok(server)
     }
 
-    /// The same, and the token may cross a network unencrypted.
+    /// Like [`Server::new`], but allows the token to cross a network unencrypted.
     pub fn insecure(url: &str, token: Option<Token>, ca: Option<&Path>) -> Result<Self, ConnectError> {
         let base = url.trim().trim_end_matches('/');
         let base = if base.contains("://") { base.to_owned() } else { format!("http://{base}") };
         let wrong = |why: String| ConnectError::Url { url: url.to_owned(), why };
         let parsed = Url::parse(&base).map_err(|error| wrong(error.to_string()))?;
         if !matches!(parsed.scheme(), "http" | "https") || parsed.host().is_none() {
-            return Err(wrong("not an address".to_owned()));
+            return Err(wrong("unsupported scheme or missing host".to_owned()));
         }
         if !matches!(parsed.path(), "" | "/") || parsed.query().is_some() || !parsed.username().is_empty() {
-            return Err(wrong("more than an address".to_owned()));
+            return Err(wrong("it has a path, a query or a user name".to_owned()));
         }
         let http = reqwest::Client::builder()
             .connect_timeout(Duration::from_secs(5))
             .pool_idle_timeout(IDLE)
             .tcp_nodelay(true)
-            // An answer that sends us elsewhere is none of ours, and must not get the token.
+            // Redirects are not followed: the server never sends any, and another host must not get the token.
             .redirect(reqwest::redirect::Policy::none());
         let http = match (parsed.scheme(), ca) {
             ("https", Some(ca)) => http.tls_backend_preconfigured(tls::pinned(ca)?),
@@ -110,17 +106,18 @@ impl Server {
         Ok(Self { http, base, token })
     }
 
-    /// Its address, without a slash at the end.
+    /// The address without a trailing slash.
     pub fn url(&self) -> &str {
         &self.base
     }
 
-    /// Whether TLS protects what passes.
+    /// Returns true if the connection uses TLS.
     pub fn is_encrypted(&self) -> bool {
         self.base.starts_with("https://")
     }
 
-    /// Whether the address is this machine's own, so that no packet leaves it. A name counts only if it is `localhost`.
+    /// Returns true if the address is on this machine, so that no packet leaves it. The only name accepted is
+    /// `localhost`.
     pub fn is_local(&self) -> bool {
         let url = Url::parse(&self.base).ok();
         let host = url.as_ref().and_then(Url::host_str).unwrap_or_default();
@@ -131,7 +128,7 @@ impl Server {
         }
     }
 
-    /// A call of `path`, which begins with a slash.
+    /// Builds a request of `path`, which starts with a slash.
     pub fn request(&self, method: Method, path: &str) -> RequestBuilder {
         let request = self.http.request(method, format!("{}{path}", self.base));
         match &self.token {
@@ -141,20 +138,22 @@ impl Server {
     }
 }
 
-/// How long a server that has too much to do wants to be left alone: what its answer says, between a moment and a minute.
+/// The delay that an overloaded server asks for in `Retry-After`, limited to 1 to 60 seconds.
 pub fn retry_after(answer: &reqwest::Response) -> Duration {
     let seconds =
         answer.headers().get(reqwest::header::RETRY_AFTER).and_then(|value| value.to_str().ok()?.parse().ok());
     Duration::from_secs(seconds.unwrap_or(1).clamp(1, 60))
 }
 
-/// What went wrong with a call, down to its cause, in words that say what to do where TLS is at fault; `reqwest` alone says
-/// only "error sending request".
+/// Describes a failed request down to its root cause, with advice for TLS errors. `reqwest` alone says only "error
+/// sending request".
 pub fn explain(error: &reqwest::Error) -> String {
     let mut text = error.to_string();
+    let mut root = text.clone();
     let mut cause: Option<&dyn std::error::Error> = std::error::Error::source(error);
     while let Some(error) = cause {
         let more = error.to_string();
+        root.clone_from(&more);
         if !text.contains(&more) {
             text.push_str(": ");
             text.push_str(&more);
@@ -162,13 +161,15 @@ pub fn explain(error: &reqwest::Error) -> String {
         cause = error.source();
     }
     let advice = [
-        ("InvalidContentType", "it does not speak TLS there: is it `http://`?"),
-        ("UnknownIssuer", "its certificate is signed by nobody who is trusted: is --ca the right file?"),
-        ("not valid for name", "its certificate is for another name: ask it by a name that stands in the certificate"),
-        ("certificate expired", "make a new one, or set the clock"),
+        ("InvalidContentType", "the server does not speak TLS there; try `http://`"),
+        ("UnknownIssuer", "its certificate is not signed by a trusted authority; check the file of --ca"),
+        ("not valid for name", "its certificate is for another name; use a name in the certificate"),
+        ("certificate expired", "renew the certificate, or correct the clock"),
     ];
     match advice.iter().find(|(sign, _)| text.contains(sign)) {
         Some((_, advice)) => format!("{text}; {advice}"),
+        // The intermediate causes only repeat that connecting to this address failed.
+        None if error.is_connect() => root,
         None => text,
     }
 }

@@ -1,4 +1,4 @@
-//! Files with secrets and settings: only regular files are read.
+//! Reading of files with secrets and settings; only regular files are read.
 
 use std::fs::{File, OpenOptions};
 use std::io::{self, Read};
@@ -20,7 +20,7 @@ pub fn open_regular(path: &Path) -> io::Result<File> {
     ))
 }
 
-/// The bytes of a regular file that has at most `limit`.
+/// Reads a regular file of at most `limit` bytes.
 pub fn read_regular(path: &Path, limit: u64) -> io::Result<Vec<u8>> {
     let mut bytes = Vec::new();
     open_regular(path)?.take(limit + 1).read_to_end(&mut bytes)?;
@@ -46,7 +46,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let pipe = dir.path().join("token");
         nix::unistd::mkfifo(&pipe, Mode::from_bits_truncate(0o600)).unwrap();
-        // Without the refusal each of these waits for a writer that never comes.
+        // Without the refusal each of these would wait for a writer that never comes.
         let errors = [
             Token::from_file(&pipe).unwrap_err().to_string(),
             Tokens::read(&pipe).unwrap_err().to_string(),

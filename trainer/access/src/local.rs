@@ -1,5 +1,5 @@
-//! How the commands of the user who holds a store are let in: by a token in a file of the store's folder that only this user
-//! can read. It is another one at every start of the holder.
+//! Local authentication: a token in the store's folder that only the store's user can read. Every start of the holder
+//! makes a new token.
 
 use std::fs::{self, OpenOptions};
 use std::io::{self, Write};
@@ -9,24 +9,25 @@ use std::path::{Path, PathBuf};
 use crate::file::read_regular;
 use crate::secret::Token;
 
-/// The file has one token.
+/// Limit of the file, which contains one token.
 const FILE_BYTES: u64 = 4096;
 
 fn path(dir: &Path) -> PathBuf {
     dir.join("token")
 }
 
-/// The file, while its token is good for something. Removed with this; to be dropped before the store's lock is.
+/// The published token file, removed on drop. Drop it before the store's lock, so that the next holder's file is not
+/// removed.
 #[derive(Debug)]
 pub struct Published {
     path: PathBuf,
 }
 
-/// Puts `token` into the folder of the store that this process holds.
+/// Writes `token` to the folder of the store that this process holds.
 pub fn publish(dir: &Path, token: &Token) -> io::Result<Published> {
     let (path, fresh) = (path(dir), dir.join(format!("token.{}", std::process::id())));
     let _ = fs::remove_file(&fresh);
-    // New, so that it is ours with this mode, whatever lay under the name before.
+    // `create_new` guarantees our owner and mode, even if another file had this name before.
     let mut file = OpenOptions::new().write(true).create_new(true).mode(0o600).open(&fresh)?;
     file.write_all(token.secret().as_bytes())?;
     fs::rename(&fresh, &path)?;
@@ -35,12 +36,12 @@ pub fn publish(dir: &Path, token: &Token) -> io::Result<Published> {
 
 impl Drop for Published {
     fn drop(&mut self) {
-        // What stays is of no use to anybody: the next holder makes another.
+        // A file left behind is harmless: its token is invalid and the next holder replaces it.
         let _ = fs::remove_file(&self.path);
     }
 }
 
-/// The token of the process that holds the store in `dir`; `None` if there is none.
+/// Reads the token of the process that holds the store in `dir`; `None` if there is no file.
 pub fn read(dir: &Path) -> io::Result<Option<Token>> {
     match read_regular(&path(dir), FILE_BYTES).map(|bytes| String::from_utf8_lossy(&bytes).into_owned()) {
         Ok(text) => text.parse().map(Some).map_err(|error| io::Error::new(io::ErrorKind::InvalidData, error)),

@@ -1,4 +1,4 @@
-//! The options of every command that asks a server, declared once.
+//! Command-line options shared by all commands that connect to a server.
 
 use std::path::{Path, PathBuf};
 
@@ -6,10 +6,10 @@ use crate::connection::{ConnectError, Server};
 use crate::local;
 use crate::secret::{FileError, Token};
 
-/// What shows who is asking.
+/// Options for the token.
 #[derive(Debug, Clone, Default, clap::Args)]
 pub struct TokenOptions {
-    /// Token; other users of this machine see command lines, so rather use --token-file
+    /// Token; other users of this machine can see command lines, so prefer --token-file
     #[arg(long, env = "STRIDE_TOKEN", hide_env_values = true, global = true, conflicts_with = "token_file")]
     pub token: Option<Token>,
     /// File with the token, closed to other users
@@ -18,7 +18,7 @@ pub struct TokenOptions {
 }
 
 impl TokenOptions {
-    /// The token, if there is one.
+    /// Reads the token from the option or the file, if one is given.
     pub fn read(&self) -> Result<Option<Token>, FileError> {
         match (&self.token, &self.token_file) {
             (Some(token), _) => Ok(Some(token.clone())),
@@ -28,47 +28,45 @@ impl TokenOptions {
     }
 }
 
-/// How a server is asked.
+/// Options for the token and the trust of a connection.
 #[derive(Debug, Clone, Default, clap::Args)]
 pub struct ConnectionOptions {
-    /// Who is asking.
     #[command(flatten)]
     pub token: TokenOptions,
     /// Certificate (PEM) that signs the server's; no other is trusted [default: the system's]
     #[arg(long, env = "STRIDE_CA", value_name = "FILE", global = true)]
     pub ca: Option<PathBuf>,
-    /// Let tokens and data cross a network without TLS: everybody who sees the traffic has them
+    /// Allow tokens and data to cross a network without TLS, where others can read them
     #[arg(long, global = true)]
     pub insecure: bool,
 }
 
 impl ConnectionOptions {
-    /// The server at `url`.
+    /// Creates a client of the server at `url`.
     pub fn connect(&self, url: &str) -> Result<Server, ConnectError> {
         let (token, ca) = (self.token.read()?, self.ca.as_deref());
         if self.insecure { Server::insecure(url, token, ca) } else { Server::new(url, token, ca) }
     }
 }
 
-/// Which server to ask, and how.
+/// Options for a server and its connection.
 #[derive(Debug, Clone, Default, clap::Args)]
 pub struct ServerOptions {
     /// Server to ask instead of the store's folder
     #[arg(long, env = "STRIDE_SERVER", value_name = "URL", global = true)]
     pub server: Option<String>,
-    /// How it is asked.
     #[command(flatten)]
     pub connection: ConnectionOptions,
 }
 
 impl ServerOptions {
-    /// The server of `--server`, if one is named.
+    /// Creates a client of the server named by `--server`, if any.
     pub fn connect(&self) -> Result<Option<Server>, ConnectError> {
         self.server.as_deref().map(|url| self.connection.connect(url)).transpose()
     }
 
-    /// The process that holds the store in `dir` and answers at `address`: by the token that it left for its user, or by
-    /// one that was given.
+    /// Creates a client of the process that holds the store in `dir` and listens at `address`. Uses the token in the
+    /// store's folder, or else the token given by option.
     pub fn holder(&self, dir: &Path, address: &str) -> Result<Server, ConnectError> {
         let token = match (local::read(dir), self.connection.token.read()?) {
             (Ok(Some(token)), _) | (_, Some(token)) => Some(token),

@@ -1,28 +1,27 @@
-//! What a token may do.
+//! Permissions of tokens.
 
 use std::fmt;
 use std::str::FromStr;
 
-/// A kind of call. Which call is of which kind stands in the coordinator's table of routes.
+/// A class of calls. The coordinator's table of routes assigns each call to one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Scope {
-    /// Looking: runs, logs, metrics, models and their files.
+    /// Reading runs, logs, metrics, models and their files.
     Read,
-    /// Submitting, pausing, resuming and cancelling runs.
+    /// Submitting, pausing, resuming and cancelling runs; importing models.
     Submit,
-    /// Computing: joining, polling, uploading.
+    /// Joining, polling and uploading as a worker.
     Worker,
-    /// Moving aliases.
+    /// Moving aliases, by a command or by a pipeline.
     Promote,
-    /// What touches everybody's data: collecting, checking, and all of the above.
+    /// Operations on everyone's data, such as garbage collection and verification; includes all other scopes.
     Admin,
 }
 
 impl Scope {
-    /// All scopes.
     pub const ALL: [Self; 5] = [Self::Read, Self::Submit, Self::Worker, Self::Promote, Self::Admin];
 
-    /// Its word in a token file.
+    /// The word for it in a token file.
     pub fn name(self) -> &'static str {
         match self {
             Self::Read => "read",
@@ -44,27 +43,37 @@ impl fmt::Display for Scope {
     }
 }
 
-/// The scopes of one token. `admin` holds all others; one who submits or promotes may also read what came of it.
+/// The bit for [`Scopes::read_all`], above those of the scopes.
+const READ_ALL: u8 = 1 << 7;
+
+/// The scopes of one token. `admin` includes all others. `submit` and `promote` include reading the caller's own data;
+/// only an explicit `read` includes everyone's.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Scopes(u8);
 
 impl Scopes {
-    /// These, and what they imply.
+    /// The set of these scopes and of all that they imply.
     pub fn of(scopes: &[Scope]) -> Self {
         let one = |scope: Scope| match scope {
-            Scope::Read | Scope::Worker => scope.bit(),
+            Scope::Read => scope.bit() | READ_ALL,
+            Scope::Worker => scope.bit(),
             Scope::Submit | Scope::Promote => scope.bit() | Scope::Read.bit(),
-            Scope::Admin => Scope::ALL.iter().fold(0, |all, scope| all | scope.bit()),
+            Scope::Admin => Scope::ALL.iter().fold(READ_ALL, |all, scope| all | scope.bit()),
         };
         Self(scopes.iter().fold(0, |all, scope| all | one(*scope)))
     }
 
-    /// Everything.
+    /// All scopes.
     pub fn all() -> Self {
         Self::of(&[Scope::Admin])
     }
 
-    /// Whether a call of this kind is allowed.
+    /// Returns true if it may read the data of other owners, because `read` is given explicitly.
+    pub fn read_all(self) -> bool {
+        self.0 & READ_ALL != 0
+    }
+
+    /// Returns true if calls of this class are allowed.
     pub fn allow(self, scope: Scope) -> bool {
         self.0 & scope.bit() != 0
     }
@@ -84,7 +93,7 @@ impl FromStr for Scopes {
         let one = |word: &str| {
             Scope::ALL.into_iter().find(|scope| scope.name() == word).ok_or_else(|| {
                 let known = Scope::ALL.map(Scope::name).join(", ");
-                format!("`{word}` is no scope; expected some of {known}, separated by commas")
+                format!("`{word}` is not a scope; expected some of {known}, separated by commas")
             })
         };
         Ok(Self::of(&text.split(',').map(one).collect::<Result<Vec<_>, _>>()?))
@@ -104,6 +113,11 @@ mod tests {
         assert_eq!(allowed("promote").as_deref(), Ok("read,promote"));
         assert_eq!(allowed("worker,submit").as_deref(), Ok("read,submit,worker"));
         assert_eq!(allowed("admin").as_deref(), Ok("read,submit,worker,promote,admin"));
+        let read_all = |text: &str| text.parse::<Scopes>().map(Scopes::read_all);
+        assert_eq!(
+            ["read", "submit", "promote", "worker", "submit,read", "admin"].map(|text| read_all(text) == Ok(true)),
+            [true, false, false, false, true, true]
+        );
         for wrong in ["", "root", "read,", "Read"] {
             assert!(allowed(wrong).is_err_and(|error| error.contains("read, submit, worker")), "{wrong}");
         }

@@ -1,4 +1,4 @@
-//! Tokens as texts, and the files they stand in.
+//! Parsing of tokens and reading of files that contain them.
 
 use std::fmt;
 use std::io::Read;
@@ -10,35 +10,36 @@ use protocol::Digest;
 
 use crate::file::open_regular;
 
-/// Shorter tokens could be guessed.
+/// Minimum length in bytes; shorter tokens could be guessed.
 const SHORTEST: usize = 16;
 const LONGEST: usize = 512;
-/// A token file has a line a person or machine.
+/// Limit of a token file, which has one line per caller.
 const FILE_BYTES: u64 = 1 << 20;
 
-/// What a caller shows to be let in. Does not appear in debug output.
+/// The secret by which a caller authenticates. Debug output does not show it.
 #[derive(Clone, PartialEq, Eq)]
 pub struct Token(String);
 
 impl Token {
-    /// 256 bits from the system's generator.
+    /// Creates a token of 256 bits from the system's random generator.
     pub fn random() -> Self {
         let mut bytes = [0; 32];
         getrandom::fill(&mut bytes).expect("the system has random bytes");
         Self(bytes.iter().map(|byte| format!("{byte:02x}")).collect())
     }
 
-    /// The text, for the header that carries it.
+    /// The text, for the `Authorization` header.
     pub fn secret(&self) -> &str {
         &self.0
     }
 
     /// What a server keeps of it: comparing digests says nothing about the token by the time it takes.
-    pub(crate) fn digest(&self) -> Digest {
+    pub fn digest(&self) -> Digest {
         Digest::of(self.0.as_bytes())
     }
 
-    /// The one token of a client's file: alone, or as the line `NAME SCOPES TOKEN` of a server's file.
+    /// Reads a client's token: a file with the token alone, or with a line `NAME SCOPES TOKEN KEY=VALUE ...` of a
+    /// server's file.
     pub fn from_file(path: &Path) -> Result<Self, FileError> {
         let text = read_secret(path)?;
         let mut lines = entries(&text);
@@ -47,7 +48,7 @@ impl Token {
                 .hint("a client's file has a line with its own token and nothing else"));
         };
         let word = match words.as_slice() {
-            [token] | [_, _, token] => token,
+            [token] | [_, _, token, ..] => token,
             _ => return Err(FileError::line(path, line, "expected a token, or `NAME SCOPES TOKEN`")),
         };
         word.parse().map_err(|error: TokenError| FileError::line(path, line, error))
@@ -60,20 +61,20 @@ impl fmt::Debug for Token {
     }
 }
 
-/// A text that is no token. Says nothing of what it was.
+/// Errors in the text of a token. Messages do not repeat the text.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum TokenError {
-    /// Nothing but white space.
+    /// The text has only white space.
     #[error("the token is empty; `openssl rand -hex 32` makes one")]
     Empty,
-    /// It could be guessed.
+    /// The token is short enough to be guessed.
     #[error("the token has {0} characters, expected at least {SHORTEST}; `openssl rand -hex 32` makes one")]
     Short(usize),
-    /// It does not fit a header.
+    /// The token does not fit into a header.
     #[error("the token has more than {LONGEST} characters")]
     Long,
-    /// It does not fit a header.
-    #[error("the token has a blank or a character that is not plain ASCII")]
+    /// The token has characters that headers do not allow.
+    #[error("the token has a space or a character that is not printable ASCII")]
     Characters,
 }
 
@@ -96,7 +97,7 @@ impl FromStr for Token {
     }
 }
 
-/// Why a file with a secret is not used.
+/// An error in a file with a secret.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("`{}`{}: {message}", path.display(), line.map_or_else(String::new, |line| format!(", line {line}")))]
 pub struct FileError {
@@ -120,13 +121,13 @@ impl FileError {
         self
     }
 
-    /// What to do about it.
+    /// The user's next action, if there is one.
     pub fn advice(&self) -> Option<&str> {
         self.hint.as_deref()
     }
 }
 
-/// The text of a file that must not be readable by everybody.
+/// Reads a file that must be closed to other users.
 pub(crate) fn read_secret(path: &Path) -> Result<String, FileError> {
     let failed = |error: std::io::Error| FileError::new(path, error);
     let file = open_regular(path).map_err(failed)?;
@@ -144,7 +145,7 @@ pub(crate) fn read_secret(path: &Path) -> Result<String, FileError> {
     Ok(text)
 }
 
-/// The lines that say something, with their numbers and words.
+/// Lines that are neither empty nor comments, with their numbers and words.
 pub(crate) fn entries(text: &str) -> impl Iterator<Item = (usize, Vec<&str>)> {
     let lines = text.lines().enumerate().map(|(i, line)| (i + 1, line.split_whitespace().collect::<Vec<_>>()));
     lines.filter(|(_, words)| words.first().is_some_and(|word| !word.starts_with('#')))
@@ -197,6 +198,7 @@ mod tests {
             Token::from_file(&path).map(|token| token.secret().to_owned()).map_err(|error| error.to_string())
         };
         assert_eq!(read("# mine\nw worker 0123456789abcdef\n").unwrap(), "0123456789abcdef");
+        assert_eq!(read("w worker 0123456789abcdef workers=w*\n").unwrap(), "0123456789abcdef");
         assert!(read("").is_err() && read("a read 0123456789abcdef\nb read 0123456789abcdeg\n").is_err());
         assert!(
             read("\n secret\n").unwrap_err().ends_with(

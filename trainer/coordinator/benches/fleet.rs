@@ -1,147 +1,28 @@
-//! A thousand workers over TCP against one coordinator with a store on disk, all on this machine: how long a heartbeat
-//! takes, how many claims and metric rows a second become durable, how long a restart takes. `cargo bench -p coordinator`.
+//! A thousand workers over TCP against one coordinator with a store on disk, all on one machine. Measures heartbeat
+//! latency, durable claims and metric rows per second, and the time of a restart. `cargo bench -p coordinator`.
 //!
-//! A claim is a report of a finished shard: in one transaction it ends the shard and gives its worker the next one.
+//! A claim is a report of a finished shard: one transaction ends the shard and grants the next one to its worker.
 
-use std::collections::{BTreeMap, HashSet};
+mod common;
+
+use std::collections::BTreeMap;
 use std::io::Write as _;
-use std::net::SocketAddr;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use coordinator::{Config, Connections, Coordinator};
-use protocol::message::{
-    Assignment, DesiredAssignments, Grant, Join, Joined, MetricBatch, MetricRow, PROTOCOL_VERSION, Poll, ReportOutcome,
-    Submit, TaskOutcome,
-};
+use protocol::Seed;
+use protocol::message::{Assignment, MetricBatch, MetricRow, Submit};
 use protocol::pipeline::{Pipeline, PipelineStage, StageInput};
 use protocol::stage::{Backend, DataSynthetic, EncodeLatents, Placement, StageSettings, TrainVae, WorkerRange};
-use protocol::{ArtifactKind, Digest, Incarnation, Manifest, Seed};
 use registry::{Holder, Store};
-use serde::Serialize;
-use serde::de::DeserializeOwned;
-use tokio::io::{AsyncReadExt, AsyncWriteExt};
-use tokio::net::TcpStream;
 
-type Result<T = ()> = std::result::Result<T, Box<dyn std::error::Error + Send + Sync>>;
+use crate::common::{Result, Worker};
 
 const WORKERS: usize = 1000;
 const RUNS: u64 = 50;
 const SHARDS: usize = 100;
-
-/// One connection that is kept.
-struct Connection {
-    stream: TcpStream,
-    buffer: Vec<u8>,
-    token: String,
-}
-
-impl Connection {
-    async fn open(address: SocketAddr, token: &str) -> Result<Self> {
-        let stream = TcpStream::connect(address).await?;
-        stream.set_nodelay(true)?;
-        Ok(Self { stream, buffer: Vec::new(), token: token.to_owned() })
-    }
-
-    async fn send(&mut self, what: &str, headers: &str, body: &[u8]) -> Result<Vec<u8>> {
-        let length = body.len();
-        let token = &self.token;
-        let headers = format!("authorization: Bearer {token}\r\n{headers}content-length: {length}");
-        let head = format!("{what} HTTP/1.1\r\nhost: localhost\r\n{headers}\r\n\r\n");
-        let mut request = head.into_bytes();
-        request.extend_from_slice(body);
-        self.stream.write_all(&request).await?;
-        self.buffer.clear();
-        let (mut end, mut length) = (None, 0);
-        loop {
-            if end.is_none()
-                && let Some(at) = self.buffer.windows(4).position(|w| w == b"\r\n\r\n")
-            {
-                let head = std::str::from_utf8(&self.buffer[..at])?.to_lowercase();
-                let value = head.lines().find_map(|line| line.strip_prefix("content-length: "));
-                length = value.ok_or("no length")?.trim().parse()?;
-                end = Some(at + 4);
-            }
-            if let Some(end) = end
-                && self.buffer.len() >= end + length
-            {
-                let answer = self.buffer[end..end + length].to_vec();
-                if &self.buffer[9..12] == b"200" {
-                    return Ok(answer);
-                }
-                return Err(String::from_utf8_lossy(&answer).into_owned().into());
-            }
-            if self.stream.read_buf(&mut self.buffer).await? == 0 {
-                return Err("the server closed the connection".into());
-            }
-        }
-    }
-
-    async fn post<T: DeserializeOwned>(&mut self, path: &str, body: &impl Serialize) -> Result<T> {
-        let body = serde_json::to_vec(body)?;
-        let answer = self.send(&format!("POST {path}"), "content-type: application/json\r\n", &body).await?;
-        Ok(serde_json::from_slice(&answer)?)
-    }
-
-    async fn put(&mut self, grant: &Grant, bytes: &[u8]) -> Result<Digest> {
-        let header = format!("x-stride-grant: {}\r\n", serde_json::to_string(grant)?);
-        let answer = self.send(&format!("PUT /v1/blobs/{}", Digest::of(bytes)), &header, bytes).await?;
-        Ok(serde_json::from_slice::<coordinator::shell::BlobStored>(&answer)?.digest)
-    }
-}
-
-/// A worker that does not compute.
-struct Worker {
-    name: String,
-    incarnation: Incarnation,
-    connection: Connection,
-    uploaded: HashSet<Digest>,
-}
-
-impl Worker {
-    async fn join(address: SocketAddr, token: &str, i: usize) -> Result<Self> {
-        let mut connection = Connection::open(address, token).await?;
-        let name = format!("w{i}");
-        let join = Join {
-            protocol: PROTOCOL_VERSION,
-            worker: name.as_str().into(),
-            pid: 1,
-            backend: Backend::Flex,
-            instruction_set: "avx2".into(),
-            peer_address: "127.0.0.1:1".into(),
-        };
-        let joined: Joined = connection.post("/v1/workers", &join).await?;
-        Ok(Self { name, incarnation: joined.incarnation, connection, uploaded: HashSet::new() })
-    }
-
-    /// A heartbeat that is answered at once.
-    async fn poll(&mut self) -> Result<Option<Assignment>> {
-        let poll = Poll { incarnation: self.incarnation, doing: vec![], ready: vec![], version: 0 };
-        let desired: DesiredAssignments =
-            self.connection.post(&format!("/v1/workers/{}/poll", self.name), &poll).await?;
-        Ok(desired.assignments.into_iter().next())
-    }
-
-    /// Something of the right kind, uploaded once by each worker.
-    async fn output(&mut self, assignment: &Assignment) -> Result<Digest> {
-        let kind = match assignment.stage.name.as_str() {
-            "dataset" => ArtifactKind::Dataset,
-            "vae" => ArtifactKind::Vae,
-            _ => ArtifactKind::Latents,
-        };
-        let manifest = Manifest::new(kind, serde_json::json!({}));
-        if self.uploaded.insert(manifest.digest()) {
-            self.connection.put(&assignment.grant, &manifest.to_bytes()).await?;
-        }
-        Ok(manifest.digest())
-    }
-
-    async fn finish(&mut self, grant: Grant, output: Digest) -> Result {
-        let outcome = TaskOutcome::Finished { output, metrics: BTreeMap::new() };
-        self.connection.post("/v1/outcomes", &ReportOutcome { grant, outcome }).await
-    }
-}
 
 fn pipeline(seed: u64) -> Pipeline {
     let stage = |name: &str, settings: StageSettings| {
@@ -176,7 +57,7 @@ fn percentile(sorted: &[Duration], percent: usize) -> Duration {
     sorted[(sorted.len() * percent / 100).min(sorted.len() - 1)]
 }
 
-/// Every worker polls once a second for `seconds`; the time that each poll took.
+/// Sends a heartbeat per second from every worker for `seconds`; returns the sorted latencies.
 async fn heartbeats(workers: Vec<Worker>, seconds: u64) -> Result<(Vec<Worker>, Vec<Duration>)> {
     let tasks: Vec<_> = workers
         .into_iter()
@@ -211,7 +92,7 @@ async fn main() -> Result {
     let dir = tempfile::tempdir()?;
     let store = Store::open(dir.path(), Holder::this_process("a bench")).await?;
     coordinator::shell::raise_descriptor_limit();
-    // Workers that wait for their turn in this bench are silent for longer than any real one.
+    // Workers that wait for their turn in this bench are idle for longer than real ones.
     let connections = Connections { idle: Duration::from_secs(600), ..Connections::default() };
     let config = Config { alone: false, park: false, connections, ..Config::embedded() };
     let handle = Coordinator::start(store, config).await?;
@@ -237,30 +118,30 @@ async fn main() -> Result {
     let [p50, p99, max] = [50, 99, 100].map(|percent| percentile(&times, percent));
     writeln!(out, "{} heartbeats, 1,000 a second: median {p50:.1?}, p99 {p99:.1?}, longest {max:.1?}", times.len())?;
 
-    // The data sets of all runs, so that every worker has something to do; then their VAEs.
+    // First the datasets of all runs, so that every worker has work; then their VAEs.
     for _ in 0..2 {
         for worker in &mut workers {
             if let Some(assignment) = worker.poll().await?
                 && assignment.stage.name.as_str() != "latents"
             {
                 let output = worker.output(&assignment).await?;
-                worker.finish(assignment.grant, output).await?;
+                worker.finish(assignment, output).await?;
             }
         }
     }
 
-    // Metric rows, in batches as a worker sends them, under the grants that 16 workers hold.
+    // Metric rows in batches of a worker's size, under the grants of 16 workers.
     let rows = Arc::new(AtomicU64::new(0));
     let begun = Instant::now();
     let mut tasks = Vec::new();
     for mut worker in workers.drain(..16) {
         let rows = Arc::clone(&rows);
         tasks.push(tokio::spawn(async move {
-            let grant = worker.poll().await?.ok_or("every worker holds a shard")?.grant;
+            let Assignment { grant, secret, .. } = worker.poll().await?.ok_or("every worker holds a shard")?;
             for batch in 0..40u64 {
                 let row = |i: u64| MetricRow { step: batch * 1000 + i, key: "loss".into(), value: 0.5 };
                 let batch = MetricBatch { grant: grant.clone(), rows: (0..1000).map(row).collect() };
-                worker.connection.post::<()>("/v1/metrics", &batch).await?;
+                worker.connection.post::<()>("/v1/metrics", &secret, &batch).await?;
                 rows.fetch_add(1000, Ordering::Relaxed);
             }
             Ok::<_, Box<dyn std::error::Error + Send + Sync>>(worker)
@@ -274,7 +155,7 @@ async fn main() -> Result {
     writeln!(out, "metric rows in batches of 1,000: {rate:.0} a second")?;
     workers.append(&mut back);
 
-    // Claims by half of the workers while the other half sends heartbeats.
+    // Half of the workers make claims while the other half sends heartbeats.
     let claims = Arc::new(AtomicU64::new(0));
     let beating = workers.split_off(WORKERS / 2);
     let begun = Instant::now();
@@ -286,7 +167,7 @@ async fn main() -> Result {
                 for _ in 0..8 {
                     let Some(assignment) = worker.poll().await? else { break };
                     let output = worker.output(&assignment).await?;
-                    worker.finish(assignment.grant, output).await?;
+                    worker.finish(assignment, output).await?;
                     claims.fetch_add(1, Ordering::Relaxed);
                 }
                 Ok::<_, Box<dyn std::error::Error + Send + Sync>>(())
@@ -305,7 +186,7 @@ async fn main() -> Result {
     writeln!(out, "heartbeats of the other 500 meanwhile: median {p50:.1?}, p99 {p99:.1?}")?;
     handle.shutdown().await;
 
-    // The connections of the workers end when their tasks get to it; until then they hold the store.
+    // Connections hold the store until their tasks notice the stop.
     let store = loop {
         match Store::open(dir.path(), Holder::this_process("a bench")).await {
             Err(registry::OpenError::Busy { .. }) => tokio::time::sleep(Duration::from_millis(20)).await,

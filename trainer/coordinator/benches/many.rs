@@ -1,9 +1,9 @@
-//! A coordinator that has been running for long: 10,000 runs that ended and 1,000,000 facts. How long a restart takes and how much memory it
-//! needs, how many submissions a second become durable compared with an empty store, and how long heartbeats take while clients ask
-//! for much. `cargo bench -p coordinator --bench many`.
+//! A coordinator that has been running for long, with 10,000 ended runs and 1,000,000 facts. Measures time and memory
+//! of a restart, durable submissions per second compared with an empty store, and heartbeat latency while clients send
+//! expensive calls. `cargo bench -p coordinator --bench many`.
 //!
-//! The restarted coordinator is a process of its own, so that its memory is not that of the years before. What is compared is
-//! measured in turns within one run, medians by medians: the machine's other work is the same for both.
+//! The restarted coordinator is a separate process, so that its memory excludes the earlier work. Compared values are
+//! measured alternately within one run and by medians, so that other load on the machine affects both equally.
 
 use std::io::{Read as _, Write as _};
 use std::net::TcpStream;
@@ -14,25 +14,29 @@ use std::time::{Duration, Instant};
 
 use coordinator::{Config, Control, Coordinator, Handle};
 use protocol::limits;
-use protocol::message::{DesiredAssignments, Join, Joined, PROTOCOL_VERSION, Poll, Submit};
+use protocol::message::{
+    DesiredAssignments, Grant, Join, Joined, LogBatch, MetricBatch, MetricRow, PROTOCOL_VERSION, Poll, Submit,
+};
 use protocol::pipeline::Pipeline;
+use protocol::proof::SECRET_HEADER;
 use protocol::stage::Backend;
+use registry::cli::Command;
 use registry::{Holder, Store};
 
 type Result<T = ()> = std::result::Result<T, Box<dyn std::error::Error + Send + Sync>>;
 
 const RUNS: u64 = 10_000;
 const FACTS: u64 = 1_000_000;
-/// Clients at a time.
+/// Number of concurrent clients.
 const CLIENTS: u64 = 64;
-/// Times that each store is measured, and submissions of each time.
+/// Number of measurements per store, and of submissions per measurement.
 const ROUNDS: u64 = 7;
 const TIMED: u64 = 300;
-/// How long heartbeats are measured beside each thing that clients ask for.
+/// Duration of the heartbeat measurement beside each kind of call.
 const BESIDE: Duration = Duration::from_secs(8);
-/// Between two heartbeats.
+/// Pause between two heartbeats.
 const PAUSE: Duration = Duration::from_millis(3);
-/// Bytes that are exported.
+/// Size of the exported blob in bytes.
 const EXPORT: usize = 256 << 20;
 
 fn pipeline(seed: u64) -> Result<Pipeline> {
@@ -47,7 +51,7 @@ async fn start(dir: &Path) -> Result<Handle> {
     Ok(Coordinator::start(store, Config { alone: false, park: false, ..Config::embedded() }).await?)
 }
 
-/// Submits the pipelines of `seeds` and cancels each, `CLIENTS` at a time; submissions a second.
+/// Submits the pipelines of `seeds` and cancels each, with `CLIENTS` clients. Returns submissions per second.
 async fn submit_and_cancel(handle: &Arc<Handle>, seeds: std::ops::Range<u64>) -> Result<f64> {
     let (begun, count) = (Instant::now(), seeds.end - seeds.start);
     let clients: Vec<_> = (0..CLIENTS)
@@ -70,7 +74,7 @@ async fn submit_and_cancel(handle: &Arc<Handle>, seeds: std::ops::Range<u64>) ->
     Ok(count as f64 / begun.elapsed().as_secs_f64())
 }
 
-/// Pauses and resumes runs until so many facts were recorded.
+/// Pauses and resumes runs until `facts` facts are recorded.
 async fn record_facts(handle: &Arc<Handle>, facts: u64) -> Result {
     let clients: Vec<_> = (0..CLIENTS)
         .map(|client| {
@@ -102,12 +106,12 @@ fn resident_mb() -> Result<u64> {
 
 async fn shut(handle: Arc<Handle>) -> Result {
     Arc::into_inner(handle).ok_or("somebody still uses the coordinator")?.shutdown().await;
-    // What waits for it lets go of the store in its own time.
+    // Tasks that wait for the coordinator release the store with some delay.
     tokio::time::sleep(Duration::from_millis(200)).await;
     Ok(())
 }
 
-/// A connection that is kept.
+/// A persistent connection.
 struct Caller {
     stream: TcpStream,
     token: String,
@@ -120,9 +124,10 @@ impl Caller {
         Ok(Self { stream, token: handle.token().secret().to_owned() })
     }
 
-    /// The status and the answer.
+    /// Sends a call and returns its status and body.
     fn call(&mut self, method: &str, path: &str, body: &[u8]) -> Result<(u16, Vec<u8>)> {
         let head = format!("authorization: Bearer {}\r\ncontent-type: application/json\r\n", self.token);
+        let head = format!("{head}{SECRET_HEADER}: the-secret-of-a-worker-of-this-bench\r\n");
         let length = body.len();
         let head = format!("{method} {path} HTTP/1.1\r\nhost: localhost\r\n{head}content-length: {length}\r\n\r\n");
         self.stream.write_all(&[head.as_bytes(), body].concat())?;
@@ -155,7 +160,8 @@ impl Caller {
     }
 }
 
-/// How long heartbeats take until `stop`, each answered at once because it says another version than the newest. Sorted.
+/// Sends heartbeats until `stop` and returns the sorted latencies. Each is answered at once, because its version is
+/// never current.
 fn beat(handle: &Handle, stop: &AtomicBool) -> Result<Vec<Duration>> {
     let mut caller = Caller::connect(handle)?;
     let join = Join {
@@ -179,7 +185,7 @@ fn beat(handle: &Handle, stop: &AtomicBool) -> Result<Vec<Duration>> {
     Ok(times)
 }
 
-/// Heartbeats while `clients` threads each call `work` again and again, and how often all of them did.
+/// Measures heartbeats while `clients` threads call `work` repeatedly, and counts these calls.
 fn beside(handle: &Handle, what: &str, clients: usize, work: impl Fn(&mut Caller) -> Result + Sync) -> Result {
     let (stop, calls) = (AtomicBool::new(false), std::sync::atomic::AtomicU64::new(0));
     let times = std::thread::scope(|scope| {
@@ -217,7 +223,7 @@ fn beside(handle: &Handle, what: &str, clients: usize, work: impl Fn(&mut Caller
     Ok(())
 }
 
-/// A pipeline of `stages` stages, as JSON.
+/// A pipeline of `stages` stages as JSON.
 fn large(stages: usize, seed: u64) -> Result<serde_json::Value> {
     let mut text =
         format!("name: large\nseed: {seed}\ndataset: {{format: synthetic}}\nstages:\n  vae: {{kind: train.vae}}\n");
@@ -246,13 +252,116 @@ fn heartbeats(handle: &Handle) -> Result {
         (200, _) => Result::Ok(()),
         (status, answer) => Err(format!("{path}: {status} {}", String::from_utf8_lossy(&answer)).into()),
     };
-    beside(handle, "lists of all 10,000 runs, 4 clients", 4, |caller| ask(caller, "/v1/runs?limit=1000000"))?;
     let blob = format!("/v1/blobs/{}", std::env::var("MANY_EXPORT")?);
     beside(handle, "exports of 256 MiB, 4 clients", 4, |caller| ask(caller, &blob))?;
+    let command = |caller: &mut Caller, command: serde_json::Value| {
+        caller.post::<serde_json::Value>("/v1/registry", &command).map(drop)
+    };
+    let (grant, poll) = recorded(handle)?;
+    writeln!(out, "| (recorded {CURVES} curves of {STEPS} values; resident {} MB) |", resident_mb()?)?;
+    let run = grant.task.as_str().split('/').next().unwrap_or_default();
+    let curves = format!("/v1/metrics?run={run}&buckets=500");
+    beside(handle, "four curves of a million values, 4 clients", 4, |caller| ask(caller, &curves))?;
+    let line = std::sync::atomic::AtomicU64::new(0);
+    let log = |caller: &mut Caller| {
+        // Keeps the recorder's lease alive.
+        caller.post::<DesiredAssignments>("/v1/workers/recorder/poll", &poll)?;
+        let first = line.fetch_add(10_000, Ordering::Relaxed);
+        let batch = LogBatch { grant: grant.clone(), first, lines: vec!["x".to_owned(); 10_000] };
+        caller.post::<()>("/v1/logs", &batch)
+    };
+    beside(handle, "log lines of one byte, 2 clients", 2, log)?;
+    let lines = format!("/v1/runs/{run}/logs?limit=10000");
+    beside(handle, "10,000 log lines read, 4 clients", 4, |caller| ask(caller, &lines))?;
+    beside(handle, "gc, 1 client", 1, |caller| {
+        command(caller, serde_json::to_value(Command::Gc { dry_run: false, grace_minutes: None })?)
+    })?;
+    queue(handle)?;
+    writeln!(out, "| (10,000 runs wait; resident {} MB) |", resident_mb()?)?;
+    beside(handle, "10,000 queued runs", 0, |_| Ok(()))?;
+    beside(handle, "10,000 queued runs and submissions, 8 clients", 8, |caller| submit(caller, &small))?;
+    // A client that reads all runs, page by page.
+    let list = |caller: &mut Caller| {
+        let mut before = String::new();
+        loop {
+            let (status, answer) = caller.call("GET", &format!("/v1/runs?limit=500{before}"), b"")?;
+            let views: Vec<serde_json::Value> = serde_json::from_slice(&answer)?;
+            match views.first().and_then(|view| view["run"].as_str()) {
+                Some(first) if status == 200 => before = format!("&before={first}"),
+                _ => return Result::Ok(()),
+            }
+        }
+    };
+    beside(handle, "lists of all 20,000 runs, 4 clients", 4, list)?;
+    beside(handle, "four curves again, beside 10,000 queued runs, 4 clients", 4, |caller| ask(caller, &curves))?;
     Ok(())
 }
 
-/// The second life: a restart, timed; submissions, in turns with an empty store; heartbeats.
+/// Number of curves, and of values per curve.
+const CURVES: usize = 4;
+const STEPS: u64 = 1_000_000;
+
+/// Starts a worker that holds a task and records the curves. Returns its grant and its heartbeat.
+fn recorded(handle: &Handle) -> Result<(Grant, Poll)> {
+    let mut caller = Caller::connect(handle)?;
+    let submit = Submit {
+        pipeline: serde_json::to_value(pipeline(99)?)?,
+        source: String::new(),
+        idempotency_key: None,
+        until: None,
+    };
+    caller.post::<serde_json::Value>("/v1/runs", &submit)?;
+    let join = Join {
+        protocol: PROTOCOL_VERSION,
+        worker: "recorder".into(),
+        pid: 7,
+        backend: Backend::Flex,
+        instruction_set: "avx2".into(),
+        peer_address: "127.0.0.1:1".into(),
+    };
+    let joined: Joined = caller.post("/v1/workers", &join)?;
+    let poll = Poll { incarnation: joined.incarnation, doing: vec![], ready: vec![], version: 0 };
+    let grant = loop {
+        let desired: DesiredAssignments = caller.post("/v1/workers/recorder/poll", &poll)?;
+        if let Some(assignment) = desired.assignments.into_iter().next() {
+            break assignment.grant;
+        }
+    };
+    for first in (0..STEPS).step_by(10_000 / CURVES) {
+        let rows = (first..first + (10_000 / CURVES) as u64).flat_map(|step| {
+            (0..CURVES).map(move |curve| MetricRow { step, key: format!("curve-{curve}"), value: (step as f64).sin() })
+        });
+        let batch = MetricBatch { grant: grant.clone(), rows: rows.collect() };
+        caller.post::<()>("/v1/metrics", &batch)?;
+        caller.post::<DesiredAssignments>("/v1/workers/recorder/poll", &poll)?;
+    }
+    Ok((grant, poll))
+}
+
+/// Submits 10,000 runs that wait for a worker of their backend.
+fn queue(handle: &Handle) -> Result {
+    std::thread::scope(|scope| {
+        let clients: Vec<_> = (0..16)
+            .map(|client| {
+                scope.spawn(move || {
+                    let mut caller = Caller::connect(handle)?;
+                    for seed in (0..RUNS).filter(|seed| seed % 16 == client) {
+                        let pipeline = serde_json::to_value(pipeline(5_000_000 + seed)?)?;
+                        let submit = Submit { pipeline, source: String::new(), idempotency_key: None, until: None };
+                        caller.post::<serde_json::Value>("/v1/runs", &submit)?;
+                    }
+                    Result::Ok(())
+                })
+            })
+            .collect();
+        for client in clients {
+            client.join().map_err(|_| "a client panicked")??;
+        }
+        Ok(())
+    })
+}
+
+/// The restarted process: a timed restart, submissions alternating with an empty store, and heartbeats.
 async fn again(dir: &Path) -> Result {
     let mut out = std::io::stdout();
     let begun = Instant::now();

@@ -1,12 +1,12 @@
-//! What waits while the disk is busy, what is decided together, and who is answered when: all of the actor but its queue, its
-//! clock and its disk, which its driver brings along.
+//! Batching of requests while the disk is busy. This is the actor without its queue, clock and disk, which the driver
+//! supplies.
 //!
-//! What has gathered is decided together: one event after the other on one copy of the state, and all that they write in one
-//! transaction. Nobody is answered before it is stored. If the store refuses it, none of it has happened, and each is tried
-//! alone, so that only the one at fault is refused.
+//! Gathered requests are decided together: one event after the other on one copy of the state, with all writes in one
+//! transaction. Answers follow only after it is stored. If the store refuses the transaction, no event of it has
+//! happened. Each request is then tried alone, so that only the faulty one is refused.
 //!
-//! Polls from which nothing follows, nearly all, do not queue behind the disk: [`Front`] answers them from the newest stored
-//! state and notes them, and [`Batches`] takes the notes up before it decides anything.
+//! Nearly all polls have no consequences and do not queue behind the disk. [`Front`] answers them from the newest
+//! stored state and notes them; [`Batches`] applies the notes before the next decision.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::{Arc, Mutex, PoisonError, RwLock};
@@ -24,40 +24,40 @@ use crate::rejected::Rejected;
 use crate::state::State;
 use crate::time::{Millis, Moment};
 
-/// How many asks are decided together at most.
+/// Maximum number of requests in a batch.
 pub const TOGETHER: usize = 128;
 
-/// Why an ask was refused. Nothing has changed.
+/// The reason for refusing a request. The state is unchanged.
 #[derive(Debug, thiserror::Error)]
 pub enum Refused {
-    /// It does not fit what is.
+    /// The decision rejected it.
     #[error(transparent)]
     Rejected(#[from] Rejected),
-    /// The store did not take it.
+    /// The store refused it.
     #[error(transparent)]
     Write(#[from] WriteError),
     /// The coordinator is stopping.
     #[error("the coordinator is stopping")]
     Stopped,
-    /// A part of the coordinator has panicked, and nothing is decided any more.
+    /// A part of the coordinator panicked; it makes no more decisions.
     #[error("the coordinator has failed: {0}")]
     Failed(String),
 }
 
-/// What the decider is asked.
+/// A request for the decider.
 #[derive(Debug, Clone)]
 pub enum Ask {
-    /// To decide it.
+    /// An event to decide.
     Event(Box<Event>),
-    /// To take note of it, and to decide what follows; with the time when it was made, for it may wait long.
+    /// An observation to note and to decide its consequences, with its time, because it may wait long.
     Observation(Observation, Millis),
 }
 
-/// What is answered beside the queue: reads of the newest stored state, and quiet polls.
+/// Serves requests that bypass the queue: reads of the newest stored state, and quiet polls.
 #[derive(Debug)]
 pub struct Front {
     published: RwLock<Arc<State>>,
-    /// The newest quiet poll of each worker that was not taken up yet, and when it came.
+    /// The newest quiet poll of each worker that was not applied yet, with its time.
     polls: Mutex<BTreeMap<WorkerId, (Millis, Poll)>>,
 }
 
@@ -67,7 +67,7 @@ impl Front {
         Arc::clone(&self.published.read().unwrap_or_else(PoisonError::into_inner))
     }
 
-    /// Notes a poll that came at `at`, if nothing follows from it; else it is handed back as what is to be asked.
+    /// Notes a poll received at `at` if it has no consequences; otherwise returns it as a request to queue.
     pub fn poll(&self, at: Millis, worker: WorkerId, poll: Poll) -> Result<Option<Ask>, Rejected> {
         if is_quiet(&self.state(), &worker, &poll)? {
             self.polls.lock().unwrap_or_else(PoisonError::into_inner).insert(worker, (at, poll));
@@ -85,88 +85,86 @@ impl Front {
     }
 }
 
-/// What the driver of the batches does next.
+/// The next action of the driver.
 #[derive(Debug)]
 pub enum Turn<T> {
-    /// Nothing waits.
+    /// No request waits.
     Idle,
-    /// Store this as one transaction, and say what came of it with [`Batches::stored`].
+    /// Store this as one transaction and pass the result to [`Batches::stored`].
     Store(Vec<Write>),
-    /// A batch is over.
+    /// A batch is complete.
     Done(Done<T>),
 }
 
-/// What came of a batch. Nobody is answered, and nothing else done, before this.
+/// The result of a batch. All answers and effects follow from here.
 #[derive(Debug)]
 pub struct Done<T> {
-    /// Something was stored: those who wait for a change look again.
+    /// Set if something was stored; waiters for a change check again.
     pub durable: bool,
-    /// The answers, in the order in which they were asked for, each for its ticket. Empty after a batch of several that the store
-    /// refused: they are tried alone.
+    /// Answers in the order of the requests, each with its ticket. Empty if the store refused a batch of several, which
+    /// are then tried alone.
     pub answers: Vec<(T, Result<Vec<Effect>, Refused>)>,
-    /// What is to be done.
     pub effects: Vec<Effect>,
 }
 
-/// Asks in batches. `T` is the ticket by which an answer finds its asker.
+/// Batches of requests. `T` is the ticket that connects an answer with its request.
 #[derive(Debug)]
 pub struct Batches<T> {
     front: Arc<Front>,
-    /// The newest stored state, with what was heard since.
+    /// The newest stored state and all later observations.
     state: Arc<State>,
     waiting: VecDeque<(Ask, T)>,
-    /// What was refused together.
+    /// Requests of a refused batch.
     alone: VecDeque<(Ask, T)>,
     flight: Option<Flight<T>>,
 }
 
-/// What is decided and not stored yet.
+/// A batch that is decided but not stored yet.
 #[derive(Debug)]
 struct Flight<T> {
     next: State,
     decided: Vec<(Ask, T, Result<Vec<Effect>, Rejected>)>,
-    /// Why the store refused the event in whose place this one happens.
+    /// The store's error for the original event, if this event replaces it.
     instead: Option<WriteError>,
     durable: bool,
 }
 
 impl<T> Batches<T> {
-    /// Goes on from `state`, which is stored.
+    /// Continues from `state`, which is stored.
     pub fn new(state: State) -> Self {
         let state = Arc::new(state);
         let front = Front { published: RwLock::new(Arc::clone(&state)), polls: Mutex::default() };
         Self { front: Arc::new(front), state, waiting: VecDeque::new(), alone: VecDeque::new(), flight: None }
     }
 
-    /// What is answered beside the queue.
+    /// The part that serves requests without the queue.
     pub fn front(&self) -> &Arc<Front> {
         &self.front
     }
 
-    /// The newest stored state, with what was heard since.
+    /// The newest stored state and all later observations.
     pub fn state(&self) -> &Arc<State> {
         &self.state
     }
 
-    /// Whether another ask would be in the next batch.
+    /// Returns true if another request would fit into the next batch.
     pub fn has_room(&self) -> bool {
         self.waiting.len() < TOGETHER
     }
 
-    /// Whether nothing waits to be decided.
+    /// Returns true if no request waits.
     pub fn is_idle(&self) -> bool {
         self.waiting.is_empty() && self.alone.is_empty()
     }
 
-    /// Queues an ask.
     pub fn ask(&mut self, ask: Ask, ticket: T) {
         self.waiting.push_back((ask, ticket));
     }
 
-    /// Decides what waits. `moment` is asked once for each event.
+    /// Decides the next batch. `moment` is called once for each event.
     ///
     /// # Panics
-    /// While a batch is on its way to the store.
+    /// If a batch is being stored.
     pub fn decide(&mut self, moment: impl FnMut() -> Moment) -> Turn<T> {
         assert!(self.flight.is_none(), "one batch at a time");
         self.take_up_polls();
@@ -180,10 +178,10 @@ impl<T> Batches<T> {
         self.decide_all(asks, None, moment)
     }
 
-    /// Says what came of [`Turn::Store`].
+    /// Reports the result of [`Turn::Store`].
     ///
     /// # Panics
-    /// If nothing was on its way.
+    /// If no batch is being stored.
     pub fn stored(&mut self, written: Result<(), WriteError>, moment: impl FnMut() -> Moment) -> Turn<T> {
         let flight = self.flight.take().expect("a batch was on its way to the store");
         match written {
@@ -192,13 +190,13 @@ impl<T> Batches<T> {
         }
     }
 
-    /// Takes the noted polls for heard, each at its own time.
+    /// Applies the noted polls, each at its own time.
     fn take_up_polls(&mut self) {
         for (worker, (at, poll)) in self.front.take_polls() {
             let quiet = is_quiet(&self.state, &worker, &poll);
             let heard = observe(Arc::make_mut(&mut self.state), at, Observation::Poll { worker, poll });
-            // Where something follows by now, from what has changed since it was noted, the worker says it again within a second. If its
-            // process is over, there is nothing to hear.
+            // The state may have changed since the poll was noted, so that something now follows from it. The worker
+            // polls again within a second. If its process has ended, the poll is obsolete.
             debug_assert!(quiet != Ok(true) || heard.as_ref().is_ok_and(Vec::is_empty), "{heard:?}");
         }
     }
@@ -219,7 +217,7 @@ impl<T> Batches<T> {
                     for event in events {
                         match decide_on(&mut next, moment(), event, &mut writes) {
                             Ok(mut follow) => effects.append(&mut follow),
-                            // What one event did may make the next one moot.
+                            // An earlier event of this poll may have made this one obsolete.
                             Err(rejected) => tracing::debug!(%rejected, "moot"),
                         }
                     }
@@ -236,7 +234,7 @@ impl<T> Batches<T> {
         Turn::Store(writes)
     }
 
-    /// It is stored: now it has happened.
+    /// Publishes a batch after it is stored.
     fn conclude(&mut self, flight: Flight<T>) -> Done<T> {
         let Flight { next, decided, mut instead, durable } = flight;
         self.state = Arc::new(next);
@@ -253,7 +251,7 @@ impl<T> Batches<T> {
         done
     }
 
-    /// The store refused it: none of it has happened.
+    /// Discards a batch that the store refused.
     fn refused(&mut self, flight: Flight<T>, error: WriteError, moment: impl FnMut() -> Moment) -> Turn<T> {
         let Flight { next, mut decided, instead, .. } = flight;
         let nothing = Done { durable: false, answers: Vec::new(), effects: Vec::new() };
@@ -269,7 +267,7 @@ impl<T> Batches<T> {
                     return self.decide_all(vec![(Ask::Event(Box::new(event)), ticket)], Some(error), moment);
                 }
             }
-            // That nothing could be stored of what follows does not mean that nothing was heard.
+            // Keep the observation itself, even though its consequences could not be stored.
             Ask::Observation(..) => Arc::make_mut(&mut self.state).heard = next.heard,
             Ask::Event(_) => {}
         }
@@ -277,7 +275,7 @@ impl<T> Batches<T> {
     }
 }
 
-/// One event on `next`; what it writes is added to `writes`.
+/// Decides one event on `next` and appends its writes to `writes`.
 fn decide_on(next: &mut State, moment: Moment, event: Event, writes: &mut Vec<Write>) -> Result<Vec<Effect>, Rejected> {
     let before = cfg!(debug_assertions).then(|| next.clone());
     tracing::debug!(?event, "event");

@@ -1,27 +1,28 @@
-//! What happens to the coordinator, and what it wants done about it.
+//! Inputs and effects of decisions.
 //!
-//! An [`Event`] is decided once and never again: what is kept are the facts that came of it ([`Fact`](crate::Fact)). What a worker
-//! merely says (a poll, a tick of the clock) is an [`Observation`]; [`observe`](crate::observe) turns it into events when
-//! it means something, so that heartbeats cost no disk write.
+//! An [`Event`] is decided exactly once; only the resulting facts ([`Fact`](crate::Fact)) are stored. An
+//! [`Observation`] is a poll or a tick of the clock. [`observe`](crate::observe) turns it into events only where
+//! something follows from it, so that heartbeats cost no disk write.
 
-use protocol::message::{CommitCheckpoint, Grant, Join, Poll, ReportOutcome};
+use protocol::message::{CommitCheckpoint, Join, Poll, ReportOutcome, TaskOutcome};
 use protocol::pipeline::Pipeline;
 use protocol::stage::Keep;
-use protocol::{Digest, Fence, Incarnation, RunId, StageName, TaskId, WorkerId};
+use protocol::{Alias, Digest, Fence, Incarnation, Owner, RunId, StageName, TaskId, WorkerId};
 use registry::Write;
 
 use crate::state::execution::StageExecution;
 use crate::state::run::{Control, Run};
+use crate::state::worker::Identity;
 use crate::value::{Candidate, Known};
 
-/// Something that happened, or that somebody asks for.
+/// An occurrence or a request to decide.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Event {
     /// The coordinator started. Every lease gets one interval of grace.
     Started {
-        /// No worker of before can reach this coordinator: all are gone for certain.
+        /// No worker of an earlier coordinator can reach this one, so all of them are gone.
         alone: bool,
-        /// Runs that were under way are paused until somebody asks for them.
+        /// Pauses active runs until a client resumes them.
         park: bool,
     },
     /// A client submitted a pipeline.
@@ -29,160 +30,158 @@ pub enum Event {
         pipeline: Box<Pipeline>,
         /// The YAML as written.
         source: String,
-        /// Submitting twice with one key gives one run.
+        /// Submissions with the same key create only one run.
         idempotency_key: Option<String>,
-        /// Stop after this stage.
+        /// The last stage to run.
         until: Option<StageName>,
+        /// The owner of the submitting token.
+        owner: Owner,
     },
-    /// A worker process offered itself.
+    /// A worker process joined.
     Join {
-        /// What it said.
         join: Join,
+        /// The authenticated caller.
+        by: Identity,
     },
-    /// A worker that had lost its lease, or whose peers had lost it, was heard again.
-    WorkerBack {
-        /// Who.
-        worker: WorkerId,
-    },
-    /// A worker has what it needs for tasks that it may be given.
+    /// A worker polled again after its lease had expired or after it had been removed from a gang.
+    WorkerBack { worker: WorkerId },
+    /// A worker has fetched the inputs of tasks that it may be given.
     WorkerReady {
-        /// Who.
         worker: WorkerId,
-        /// Which process.
         incarnation: Incarnation,
-        /// Which tasks, all of them.
+        /// The complete list of these tasks.
         tasks: Vec<TaskId>,
     },
-    /// A worker was not heard of for the length of its lease.
-    LeaseExpired {
-        /// Who.
-        worker: WorkerId,
-        /// Which process.
-        incarnation: Incarnation,
-    },
-    /// The launcher of the process saw it exit: certain, unlike an expired lease.
+    /// A worker did not poll for the length of its lease.
+    LeaseExpired { worker: WorkerId, incarnation: Incarnation },
+    /// A worker process has ended for certain, unlike after an expired lease.
     WorkerGone {
-        /// Who.
         worker: WorkerId,
+        /// The process that reported its own end. `None` is a report of the launcher, which saw the newest process
+        /// exit.
+        incarnation: Option<Incarnation>,
     },
-    /// A gang member could not reach others.
-    PeersLost {
-        /// The reporter's grant.
-        grant: Grant,
-        /// Whom.
-        lost: Vec<WorkerId>,
-    },
-    /// A checkpoint was uploaded and shall count.
-    Checkpoint {
-        /// Which.
-        commit: CommitCheckpoint,
-    },
+    /// Members of a gang complain of each other; see [`Heard::words`](crate::state::Heard::words).
+    GangDivided { task: TaskId, fence: Fence },
+    /// No member of a gang has advanced by a step for too long.
+    GangStalled { task: TaskId, fence: Fence },
+    /// A checkpoint was uploaded and is to be committed.
+    Checkpoint { commit: CommitCheckpoint },
     /// An assignment ended.
-    Outcome {
-        /// How.
-        report: ReportOutcome,
-    },
-    /// A client asked something of a run.
+    Outcome { report: ReportOutcome },
+    /// A client controls a run.
     Control {
-        /// Which.
         run: RunId,
-        /// What.
         action: Control,
-        /// The run as it was archived when it ended, for one that is not in memory.
+        /// The archived run, if it has ended and is not in memory.
         archived: Option<Box<Run>>,
     },
-    /// A worker has not been heard of for so long that nothing is lost with its name.
-    WorkerForgotten {
-        /// Who.
-        worker: WorkerId,
-        /// Which process.
-        incarnation: Incarnation,
-    },
-    /// The coordinator is about to stop: workers save and leave.
+    /// A worker has been silent so long that its name can be forgotten.
+    WorkerForgotten { worker: WorkerId, incarnation: Incarnation },
+    /// The coordinator is about to stop: workers save their work and leave.
     Drain,
     /// A back-off ended.
-    BackoffOver {
-        /// Whose.
-        task: TaskId,
-    },
-    /// A worker that was asked to drain did not within the grace period.
+    BackoffOver { task: TaskId },
+    /// A worker did not drain within the grace period.
     GraceOver {
-        /// Of which task.
         task: TaskId,
-        /// Under which fence.
+        /// The fence of the draining grant.
         fence: Fence,
     },
     /// The answer to [`Effect::Lookup`].
     LookedUp {
-        /// The stage's key.
         key: Digest,
-        /// Its value, if the store has it.
+        /// The stage's value, if stored.
         known: Option<Known>,
-        /// Under whose names the value's logs and metrics are stored, if there is a value.
+        /// The run and stage under which the value's logs and metrics are stored.
         source: Option<(RunId, StageName)>,
-        /// What an earlier try has left, if there is no value.
+        /// State of an earlier try, if there is no value.
         archived: Option<Box<StageExecution>>,
     },
     /// The answer to [`Effect::Register`]: the model bundles are stored.
     Bundled {
-        /// The register stage's key.
         key: Digest,
-        /// One for each candidate, in order.
+        /// Bundles in the order of the candidates.
         bundles: Vec<Digest>,
     },
-    /// A register stage was refused: a bundle that cannot be made, or a gate that does not hold.
+    /// A register stage failed: a bundle cannot be made, or a gate does not hold.
     RegisterRefused {
         key: Digest,
-        /// Why, for the user.
+        /// The reason, as text for the user.
         message: String,
     },
 }
 
-/// What was merely heard.
+impl Event {
+    /// Artifacts that the resulting rows will name. Each is verified as complete before the decision.
+    pub(crate) fn artifacts(&self) -> Vec<Digest> {
+        match self {
+            Self::Checkpoint { commit } => vec![commit.manifest],
+            Self::Outcome { report } => match report.outcome {
+                TaskOutcome::Finished { output, .. } => vec![output],
+                TaskOutcome::Resolved { .. } | TaskOutcome::Yielded { .. } | TaskOutcome::Failed { .. } => Vec::new(),
+            },
+            Self::Bundled { bundles, .. } => bundles.clone(),
+            Self::Started { .. }
+            | Self::Submit { .. }
+            | Self::Join { .. }
+            | Self::WorkerBack { .. }
+            | Self::WorkerReady { .. }
+            | Self::LeaseExpired { .. }
+            | Self::WorkerGone { .. }
+            | Self::GangDivided { .. }
+            | Self::GangStalled { .. }
+            | Self::Control { .. }
+            | Self::WorkerForgotten { .. }
+            | Self::Drain
+            | Self::BackoffOver { .. }
+            | Self::GraceOver { .. }
+            | Self::LookedUp { .. }
+            | Self::RegisterRefused { .. } => Vec::new(),
+        }
+    }
+}
+
+/// Input that changes the state only if something follows from it.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Observation {
     /// A worker polled.
-    Poll {
-        /// Who.
-        worker: WorkerId,
-        /// What it said.
-        poll: Poll,
-    },
-    /// The clock was looked at.
+    Poll { worker: WorkerId, poll: Poll },
+    /// The timer fired.
     Tick {
-        /// How much later than it meant to, in milliseconds: then this whole process did not run and heard nobody. A wait
-        /// for the disk is not part of it, for polls are heard meanwhile.
+        /// The timer's delay in milliseconds, a period in which this process did not run and received nothing. A wait
+        /// for the disk does not count, because polls are received meanwhile.
         overslept: u64,
     },
 }
 
-/// What is to be done about an event.
+/// An action that follows from a decision.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Effect {
-    /// One transaction. It comes before all other effects, and if it is refused the event has not happened.
+    /// One transaction. It precedes all other effects; if the store refuses it, the event did not happen.
     Store(Vec<Write>),
-    /// Ask the store for a stage's value and answer with [`Event::LookedUp`].
-    Lookup {
-        /// The stage's key.
-        key: Digest,
-    },
-    /// Give each candidate its sampler and parts and answer with [`Event::Bundled`] or [`Event::RegisterRefused`].
+    /// Look up a stage's value in the store and answer with [`Event::LookedUp`].
+    Lookup { key: Digest },
+    /// Add sampler and parts to each candidate and answer with [`Event::Bundled`] or [`Event::RegisterRefused`].
     Register {
-        /// The register stage's key.
         key: Digest,
-        /// In the order of the stage's `from`.
+        /// Candidates in the order of the stage's `from`.
         candidates: Vec<Candidate>,
+        /// The alias to move to the best version.
+        promotes: Option<Alias>,
+        owner: Owner,
     },
-    /// Forget a task's checkpoints but those to keep. Never before the newer one is stored.
+    /// Delete a task's checkpoints except those to keep, after the newer checkpoint or the stage's value is stored.
     Prune {
         task: TaskId,
-        /// Which stay.
         keep: Keep,
+        /// The stage's value is stored.
+        at_end: bool,
     },
-    /// Which run a submission gave.
+    /// The run of a submission.
     Submitted(RunId),
-    /// Which process a joining worker is.
+    /// The incarnation of a joining worker.
     Joined(Incarnation),
-    /// Somebody's desired assignments or a run's state may have changed: waiting polls look again.
+    /// Assignments or the state of a run may have changed; waiting polls check again.
     Wake,
 }

@@ -1,11 +1,14 @@
-//! What became of an event: the only thing that is kept, and the only thing that changes the state.
+//! Outcomes of decisions. Facts are the only data stored and the only way to change the state.
 //!
-//! A fact says how something is from now on, never why and never by which rule. [`apply`](crate::state::State::apply) puts it into the
-//! state and reads neither policy nor clock, so what was once decided stands, whatever a later build would decide in its place.
+//! A fact describes the new condition of something, without a reason or a rule. [`apply`](crate::state::State::apply)
+//! puts it into the state and reads neither policy nor clock. A stored decision therefore holds, even if a later build
+//! would decide otherwise.
 //!
-//! Facts are stored as JSON, one row for all of one decision ([`Decision`](crate::journal::Decision)). A field may be added if it has a
-//! serde default that means "as before"; a kind may be added; both raise the minor version of [`FORMAT`](crate::journal::FORMAT).
-//! Anything else raises the major one, which older builds refuse.
+//! Facts are stored as JSON, one row for all facts of a decision ([`Decision`](crate::journal::Decision)). New kinds,
+//! and new fields with a serde default that means "unchanged", raise the minor version of
+//! [`FORMAT`](crate::journal::FORMAT). All other changes raise the major version, which older builds refuse.
+
+use std::collections::BTreeMap;
 
 use protocol::message::{ReportOutcome, RunState};
 use protocol::pipeline::PipelineStage;
@@ -20,161 +23,126 @@ use crate::state::task::{Lease, Saved, Task};
 use crate::state::worker::Worker;
 use crate::time::Millis;
 
-/// How something is from now on.
+/// A change of the state.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Fact {
-    /// A run is known: it was submitted, or it had ended and is taken up again.
-    Run {
-        /// All of it.
-        run: Box<Run>,
-    },
-    /// Where a run stands.
+    /// A run was submitted, or an ended run was resumed.
+    Run { run: Box<Run> },
+    /// The state of a run changed.
     RunState {
-        /// Its number.
         run: u64,
-        /// Where.
         state: RunState,
-        /// Whether a restart paused it.
+        /// Set if a restart paused the run.
         parked: bool,
     },
-    /// Where stages of a run stand.
+    /// The status of some stages of a run changed.
     Stages {
-        /// Its number.
         run: u64,
-        /// By place.
+        /// The new status by stage index.
         stages: Vec<(usize, Status)>,
     },
-    /// A sweep made stages, behind those that there are; they wait.
-    StagesAdded {
-        /// The run's number.
+    /// A worker digested the files that a stage reads outside the store.
+    Resolved {
         run: u64,
-        stages: Vec<PipelineStage>,
-    },
-    /// A sweep began.
-    SweepBegun {
-        /// The run's number.
-        run: u64,
-        /// All of it.
-        sweep: Box<Sweeping>,
-    },
-    /// A sweep went on.
-    SweepMoved {
-        /// The run's number.
-        run: u64,
-        /// The place of the swept stage.
+        /// The stage's index.
         stage: usize,
-        /// What became of its searcher.
+        /// Digests by field; empty if they must be computed again.
+        digests: BTreeMap<String, Digest>,
+    },
+    /// A sweep appended stages to the pipeline; they start as waiting.
+    StagesAdded { run: u64, stages: Vec<PipelineStage> },
+    /// A sweep started.
+    SweepBegun { run: u64, sweep: Box<Sweeping> },
+    /// A sweep advanced.
+    SweepMoved {
+        run: u64,
+        /// The index of the swept stage.
+        stage: usize,
+        /// The new progress of its searcher.
         progress: Progress,
-        /// Places of the stages of tickets, behind those that are known.
+        /// Stage indexes of new tickets, appended to the known ones.
         places: Vec<Option<usize>>,
-        /// Why trials failed, by trial; those that are new.
+        /// Reasons of newly failed trials, by trial.
         failures: Vec<(usize, String)>,
     },
-    /// A run ended and is in the tables; memory needs it no more.
-    RunForgotten {
-        /// Its number.
-        run: u64,
-    },
-    /// A stage's value is wanted for the first time since it was last forgotten.
-    Execution {
-        /// All of it.
-        execution: Box<StageExecution>,
-    },
-    /// How far an execution is.
-    ExecutionState {
-        key: Digest,
-        /// How far.
-        state: ExecutionState,
-    },
-    /// How many workers and how many checkpoints the run that wants it now asks for.
-    ExecutionPlacement {
-        key: Digest,
-        /// What is asked for.
-        placement: Placement,
-    },
-    /// Under whose names its logs and values are, and its tasks if there will be any.
+    /// A run that has ended and is in the tables leaves memory.
+    RunForgotten { run: u64 },
+    /// A stage's value is needed for the first time since its execution was last forgotten.
+    Execution { execution: Box<StageExecution> },
+    /// The state of an execution changed.
+    ExecutionState { key: Digest, state: ExecutionState },
+    /// The number of workers or of kept checkpoints changed, because another run needs the execution now.
+    ExecutionPlacement { key: Digest, placement: Placement },
+    /// The run and stage under which the execution's logs, metrics and tasks are stored.
     ExecutionSource { key: Digest, run: RunId, stage: StageName },
-    /// Its seconds of work.
+    /// The accounted working time of an execution changed.
     ExecutionTime {
         key: Digest,
-        /// Milliseconds up to `busy_since`.
+        /// Milliseconds of work before `busy_since`.
         wall_ms: u64,
-        /// Since when somebody works on it.
+        /// Start of the current period of work, if a worker is busy with it.
         busy_since: Option<Millis>,
     },
-    /// It goes on from something that an earlier try has saved.
+    /// The execution continues from data that an earlier try saved.
     ExecutionResumed { key: Digest },
-    /// The instruction set of all that work on it.
+    /// The instruction set that all workers of an execution share.
     ExecutionInstructions {
         key: Digest,
-        /// What their kernels dispatch to.
+        /// The instruction set that their kernels use.
         instruction_set: String,
     },
-    /// It has tasks: new ones, or those that an earlier try left.
+    /// An execution has tasks: new ones, or those of an earlier try.
     Tasks { key: Digest, tasks: Vec<Task> },
-    /// How a task is.
+    /// A task changed.
     Task {
         /// The key of its execution.
         key: Digest,
-        /// Its place there.
+        /// The task's index in the execution.
         task: usize,
-        /// What is new.
         change: Box<TaskChange>,
     },
-    /// Nobody waits for an execution or works on it; what there is of it is in the tables.
+    /// An execution that no run waits for and no worker holds leaves memory; its data is in the tables.
     ExecutionForgotten { key: Digest },
-    /// A worker process joined, or whether it can be given work is another matter now.
-    Worker {
-        /// Who.
-        worker: WorkerId,
-        /// How it is.
-        process: Worker,
-    },
-    /// A worker has been away for so long that its name is nothing to remember.
-    WorkerForgotten {
-        /// Who.
-        worker: WorkerId,
-    },
-    /// Whether the coordinator is about to stop.
-    Draining {
-        /// Whether.
-        draining: bool,
-    },
+    /// A worker process joined, or its availability for work changed.
+    Worker { worker: WorkerId, process: Worker },
+    /// A worker has been away so long that its name is forgotten.
+    WorkerForgotten { worker: WorkerId },
+    /// The coordinator starts or stops draining before a shutdown.
+    Draining { draining: bool },
 }
 
-/// What is new about a task; what is not mentioned is as before.
+/// Changed fields of a task; absent fields are unchanged.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct TaskChange {
-    /// Who has it.
+    /// The new lease.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub now: Option<Lease>,
-    /// The newest try.
+    /// The number of the newest attempt.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub attempt: Option<Attempt>,
-    /// The newest fence.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub fence: Option<Fence>,
-    /// Faults, losses, and failures in a row.
+    /// Number of faults, of losses, and of consecutive failures.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub counts: Option<(u32, u32, u32)>,
-    /// Workers without enough memory for it, all of them.
+    /// The complete list of workers without enough memory for the task.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub too_small: Option<Vec<WorkerId>>,
-    /// Steps whose checkpoints are not kept.
+    /// Steps whose checkpoints were deleted.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub dropped: Vec<u64>,
-    /// Checkpoints that came, behind those that stay.
+    /// New checkpoints, appended to the remaining ones.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub saved: Vec<Saved>,
-    /// The report that was last accepted.
+    /// The last accepted report.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub reported: Option<ReportOutcome>,
 }
 
 impl TaskChange {
-    /// What `after` has that `before` had not.
+    /// The difference from `before` to `after`.
     pub fn between(before: &Task, after: &Task) -> Self {
         fn new<T: PartialEq + Clone>(before: &T, after: &T) -> Option<T> {
             (before != after).then(|| after.clone())
@@ -194,12 +162,12 @@ impl TaskChange {
         }
     }
 
-    /// Whether nothing is new.
+    /// Returns true if no field changed.
     pub fn is_nothing(&self) -> bool {
         *self == Self::default()
     }
 
-    /// Makes `task` what it is from now on.
+    /// Applies the change to `task`.
     pub fn apply(&self, task: &mut Task) {
         if let Some(lease) = &self.now {
             task.lease = lease.clone();

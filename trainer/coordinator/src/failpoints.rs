@@ -1,12 +1,13 @@
-//! The point at which tests have the actor panic: `actor::decide`, before each batch.
+//! The fail point `actor::decide` before each batch, at which tests make the actor panic.
 //!
-//! Built only with the feature `failpoints`. `STRIDE_COORDINATOR_PANIC=3` has the third batch panic. The registry and the worker have
-//! points and variables of their own, at which the process is killed.
+//! Compiled only with the feature `failpoints`. `STRIDE_COORDINATOR_PANIC=3` makes the third batch panic. The registry
+//! and the worker have fail points and variables of their own, which kill the process.
 
-/// Arms what `STRIDE_COORDINATOR_PANIC` says; called once by a binary's `main`. Does nothing without the feature.
+/// Activates the fail point from `STRIDE_COORDINATOR_PANIC`. A binary's `main` calls it once. Without the feature it
+/// does nothing.
 ///
 /// # Panics
-/// If the variable is no number: a test would otherwise pass without having seen a panic.
+/// If the variable is not a number: the test would otherwise pass without a panic.
 pub fn arm_from_env() {
     #[cfg(feature = "failpoints")]
     {

@@ -1,38 +1,41 @@
-//! What must hold after every event, by number. Checked in debug builds of the server and after every step of the
-//! simulation; `ARCHITECTURE.md` refers to the numbers.
+//! Numbered invariants that hold after every event. Debug builds of the server check them after each event, the
+//! simulation after each step. `ARCHITECTURE.md` refers to the numbers.
 //!
-//! | | holds |
+//! | | invariant |
 //! |---|---|
 //! | C1 | A worker holds at most one task. |
-//! | C2 | The holder of a task is the newest process of its name, is here, and computes on the work's backend, with the others' instruction set. |
-//! | C3 | Only tasks of open works are held; a held task has an attempt and a fence. |
-//! | C4 | A gang has at least `min` and at most `max` members, each once; other tasks have one holder. |
-//! | C5 | Fences, attempts and incarnations never go down; a worker that gains or loses a task sees the fence go up. |
+//! | C2 | The holder of a task is the newest process of its name and has presence `Here`. It computes on the execution's backend, with the instruction set of the other holders. |
+//! | C3 | Only tasks of open executions are held; a held task has an attempt and a fence. |
+//! | C4 | A gang has at most `max` members, each once, and at least one; other tasks have one holder. |
+//! | C5 | Fences, attempts and incarnations never decrease; a change of a task's holders raises its fence. |
 //! | C6 | An accepted artifact of a task, and a done stage of a run, never change. |
-//! | C7 | A merge is held only once all shards are there. |
-//! | C8 | What no running run waits for is asked to drain. |
-//! | C9 | A stage is active or done only if everything it reads is done; an active stage has work that is not over. |
-//! | C10 | A run is finished exactly if all that was asked for is done, and failed only with a failed stage. |
-//! | C11 | While a small task is ready and not backing off, no worker of its backend is idle. |
-//! | C12 | A checkpoint's steps grow within a task. |
-//! | C13 | A stage that is swept has a searcher that is not over, and a place for each of its tickets. |
-//! | C14 | What is known twice agrees: which tasks are held or wait, where a task is, what a worker holds, who holds nothing, which stages are active, who uses an execution. |
-//! | C15 | Memory holds what may still matter: no ended run, and no execution that no run uses and nobody works on. |
-//! | C16 | What must survive a restart changes only together with a write. |
+//! | C7 | A merge is held only after all shards are done. |
+//! | C8 | Tasks that no running run waits for are asked to drain. |
+//! | C9 | A stage is active or done only if all of its inputs are done; an active stage has an execution that is not over. |
+//! | C10 | A run is finished exactly if all requested stages are done, and failed only with a failed stage. |
+//! | C11 | While a small task is ready and not in back-off, no worker of its backend is idle. |
+//! | C12 | The steps of a task's checkpoints increase. |
+//! | C13 | A stage in state `Sweeping` has a searcher that is not over, and an index for each of its tickets. |
+//! | C14 | Derived data agrees with its source: held and waiting tasks, indexes of tasks, tasks of workers, unused workers, active stages, users of executions, order of service. |
+//! | C15 | Memory has no ended run, and no execution that is both idle and unused by runs. |
+//! | C16 | Data that must survive a restart changes only together with a write. |
+//! | C17 | A gang with a polling member that holds the state keeps such a member, unless a member reports or the gang was asked to drain. |
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-use protocol::message::RunState;
+use protocol::message::{Member, RunState};
 
 use crate::schedule;
 use crate::state::State;
+use crate::state::evidence;
 use crate::state::execution::{ExecutionState, StageExecution};
 use crate::state::run::Status;
+use crate::state::shared::Map;
 use crate::state::task::{Lease, Part, Task};
-use crate::state::worker::Presence;
+use crate::state::worker::{Presence, Worker};
 
-/// Which invariants `state` breaks, each with its number; empty if all is well.
+/// Invariants that `state` violates, each with its number; empty if there are none.
 pub fn check(state: &State) -> Vec<String> {
     let mut broken = check_index(state);
     let mut busy = BTreeSet::new();
@@ -50,7 +53,7 @@ pub fn check(state: &State) -> Vec<String> {
                 Lease::Waiting { .. } | Lease::Done { .. } => true,
             };
             if !drain_by && (!wanted.contains(&execution.key) || state.draining) {
-                broken.push(format!("C8: nobody waits for `{}`, which is not drain_by down", task.id));
+                broken.push(format!("C8: no run waits for `{}`, which is not draining", task.id));
             }
             let small =
                 task.part != Part::Gang && execution.state == ExecutionState::Open && wanted.contains(&execution.key);
@@ -100,13 +103,13 @@ pub fn check(state: &State) -> Vec<String> {
     broken
 }
 
-/// C14.
+/// Checks C14.
 fn check_index(state: &State) -> Vec<String> {
     let mut broken = Vec::new();
     let (mut places, mut holds) = (BTreeMap::new(), BTreeMap::new());
     for (key, execution) in &state.executions {
         if execution.users.is_empty() && !execution.is_busy() {
-            broken.push(format!("C15: nobody uses execution {key}, nobody works on it, and it is still in memory"));
+            broken.push(format!("C15: execution {key} is unused and idle, and still in memory"));
         }
         if !execution.tasks.is_indexed() {
             broken.push(format!("C14: the index of execution {key} is not that of {:?}", execution.tasks));
@@ -120,30 +123,50 @@ fn check_index(state: &State) -> Vec<String> {
         if !run.is_indexed() {
             broken.push(format!("C14: the index of `{}` is wrong", run.id));
         }
-        for (_, key) in run.all_active() {
-            let uses = run.all_active().filter(|(_, other)| *other == key).count();
-            let known = state.executions.get(&key).and_then(|execution| execution.users.get(&run.number));
-            if known.is_none_or(|known| *known < uses) {
-                broken.push(format!("C14: `{}` waits {uses} times for {key}, which knows of {known:?}", run.id));
+        for (stage, key) in run.all_active() {
+            if state.executions.get(&key).is_none_or(|execution| !execution.users.contains(&(run.number, stage))) {
+                broken.push(format!("C14: stage {stage} of `{}` waits for {key}, which does not list it", run.id));
             }
         }
     }
     for (key, execution) in &state.executions {
-        for (number, known) in &execution.users {
-            let uses = state.runs.get(number).map(|run| run.stages.iter().filter(|s| s.key() == Some(*key)).count());
-            if uses.is_none_or(|uses| uses < *known) {
-                broken.push(format!("C14: execution {key} is used {uses:?} times by run {number}, known is {known}"));
+        for (number, stage) in &execution.users {
+            let status = state.runs.get(number).and_then(|run| run.stages.get(*stage));
+            if status.and_then(Status::key) != Some(*key) {
+                broken.push(format!(
+                    "C14: execution {key} is used by stage {stage} of run {number}, which is {status:?}"
+                ));
             }
         }
     }
     if !places.iter().map(|(task, place)| (*task, place)).eq(state.tasks.iter()) {
         broken.push("C14: tasks are not where the index says".to_owned());
     }
+    broken.extend(check_queue(state));
     for (name, worker) in state.workers.iter() {
         let found = holds.get(name).copied();
         if worker.holds != found || state.unused.contains(name) != found.is_none() {
             broken.push(format!("C14: worker `{name}` holds {found:?}, known is {:?}", worker.holds));
         }
+    }
+    broken
+}
+
+/// Checks C14 for the queue and its order of service.
+fn check_queue(state: &State) -> Vec<String> {
+    let mut broken = Vec::new();
+    let mut rebuilt = state.clone();
+    rebuilt.index();
+    let indices =
+        |state: &State| (state.queue.clone(), state.mends.clone(), state.idempotent.clone(), state.parked.clone());
+    if indices(state) != indices(&rebuilt) {
+        broken.push(format!("C14: the queue is {:?}, and should be {:?}", indices(state), indices(&rebuilt)));
+    }
+    let ranked = state.executions.keys().filter_map(|key| Some((state.queue.rank(key)?, *key)));
+    let in_order: BTreeSet<_> = ranked.collect();
+    let known = state.wanted().into_iter().filter(|key| state.executions.contains_key(key));
+    if !in_order.iter().map(|(_, key)| *key).eq(known) {
+        broken.push(format!("C14: the queue has {in_order:?}, and runs wait for {:?}", state.wanted()));
     }
     broken
 }
@@ -170,13 +193,13 @@ fn check_task(state: &State, execution: &StageExecution, task: &Task, broken: &m
     let names: BTreeSet<_> = holders.iter().map(|member| &member.worker).collect();
     let range = execution.range();
     let fits = match task.part {
-        // A gang that drains keeps its members, even if the run that asks has changed, and with it the bounds.
+        // A draining gang keeps its members, even if another run has changed the limits.
         Part::Gang => {
             let drain_by = matches!(task.lease, Lease::Held { drain_by: Some(_), .. });
             let fits = holders.len() <= range.max;
             !holders.is_empty() && (fits || drain_by || state.draining)
         }
-        Part::Alone | Part::Shard { .. } | Part::Merge => holders.len() == 1,
+        Part::Alone | Part::Resolve | Part::Shard { .. } | Part::Merge => holders.len() == 1,
     };
     if !fits || names.len() != holders.len() {
         broken.push(format!("C4: `{}` is held by {holders:?}, with room for {range:?}", task.id));
@@ -186,20 +209,20 @@ fn check_task(state: &State, execution: &StageExecution, task: &Task, broken: &m
     }
 }
 
-/// Which invariants the step from `before` to `after` breaks, or `after` itself.
+/// Invariants violated by the step from `before` to `after`, or by `after` itself.
 pub fn check_change(before: &State, after: &State) -> Vec<String> {
     let mut broken = check(after);
     for (name, worker) in before.workers.iter() {
         match after.workers.get(name) {
             Some(now) if now.incarnation >= worker.incarnation => {}
-            // Its next process has a number that was never used.
+            // A later process of this name gets a number that was never used.
             None if after.incarnation >= worker.incarnation => {}
             other => broken.push(format!("C5: worker `{name}` lost its incarnation {}: {other:?}", worker.incarnation)),
         }
     }
     for (key, execution) in &before.executions {
         let Some(now) = after.executions.get(key) else {
-            // Whatever comes in its place begins above every fence there was.
+            // A later execution of this key starts above all fences so far.
             if execution.tasks.iter().any(|task| task.fence > after.fence) {
                 broken.push(format!("C5: execution {key} is forgotten, with fences above {}", after.fence));
             }
@@ -217,6 +240,7 @@ pub fn check_change(before: &State, after: &State) -> Vec<String> {
             if changed_hands && now.fence == task.fence {
                 broken.push(format!("C5: `{}` changed hands under fence {}", task.id, task.fence));
             }
+            check_state_is_kept(before, after, task, now, &mut broken);
         }
         if let (ExecutionState::Open, ExecutionState::Open) = (&execution.state, &now.state) {
             for task in execution.tasks.iter().filter(|task| task.output().is_some()) {
@@ -239,8 +263,35 @@ pub fn check_change(before: &State, after: &State) -> Vec<String> {
     broken
 }
 
-/// What of `before` is not in `after` as it was, though it must survive a restart and no event has changed it: an event that is refused, or
-/// writes nothing, leaves all of it.
+/// Checks C17.
+fn check_state_is_kept(before: &State, after: &State, task: &Task, now: &Task, broken: &mut Vec<String>) {
+    let Lease::Held { holders, drain_by: None, .. } = &task.lease else { return };
+    let reporter = now.reported.as_ref().filter(|_| now.reported != task.reported).map(|report| &report.grant.worker);
+    let is_left = |member: &&Member| {
+        let is_here = |worker: &Worker| {
+            worker.presence == Presence::Here
+                || matches!(worker.presence, Presence::Suspect { since } if since == after.now)
+        };
+        let process = after.workers.get(&member.worker).filter(|worker| worker.incarnation == member.incarnation);
+        process.is_some_and(is_here) && reporter != Some(&member.worker)
+    };
+    let holds = |member: &&Member| evidence::holds(&before.heard.words, task, member).is_some();
+    if task.part != Part::Gang || now.output().is_some() || !holders.iter().filter(is_left).any(|member| holds(&member))
+    {
+        return;
+    }
+    let goes_on =
+        now.attempt == task.attempt && holders.iter().filter(holds).any(|member| now.holders().contains(member));
+    // The lead reported that it has yielded, or the failure is final.
+    let reported = reporter.is_some() && (now.attempt == task.attempt && !now.is_held());
+    let execution = after.task(&task.id).map(|(execution, _)| execution);
+    let is_over = execution.is_ok_and(|execution| execution.state != ExecutionState::Open);
+    if !goes_on && !reported && !is_over {
+        broken.push(format!("C17: `{}` goes from {holders:?} to {now:?} and loses its state", task.id));
+    }
+}
+
+/// Checks C16 for an event that was refused or writes nothing: all durable data of `before` is unchanged in `after`.
 pub fn check_unchanged(before: &State, after: &State) -> Vec<String> {
     let numbers =
         |state: &State| (state.draining, state.now, state.seq, state.submitted, state.incarnation, state.fence);
@@ -251,15 +302,15 @@ pub fn check_unchanged(before: &State, after: &State) -> Vec<String> {
         }
     };
     same("numbers", numbers(before) == numbers(after));
-    same("workers", Arc::ptr_eq(&before.workers, &after.workers) || before.workers == after.workers);
-    same("unused workers", Arc::ptr_eq(&before.unused, &after.unused) || before.unused == after.unused);
+    same("workers", before.workers.ptr_eq(&after.workers) || before.workers == after.workers);
+    same("unused workers", before.unused.ptr_eq(&after.unused) || before.unused == after.unused);
     same("runs", is_same_map(&before.runs, &after.runs));
     same("executions", is_same_map(&before.executions, &after.executions));
-    same("tasks", Arc::ptr_eq(&before.tasks, &after.tasks) || before.tasks == after.tasks);
+    same("tasks", before.tasks.ptr_eq(&after.tasks) || before.tasks == after.tasks);
     broken
 }
 
-fn is_same_map<K: Ord, V: PartialEq>(before: &BTreeMap<K, Arc<V>>, after: &BTreeMap<K, Arc<V>>) -> bool {
+fn is_same_map<K: Ord, V: PartialEq>(before: &Map<K, Arc<V>>, after: &Map<K, Arc<V>>) -> bool {
     let pairs = || before.iter().zip(after);
-    before.len() == after.len() && pairs().all(|(a, b)| a.0 == b.0 && (Arc::ptr_eq(a.1, b.1) || a.1 == b.1))
+    before.size() == after.size() && pairs().all(|(a, b)| a.0 == b.0 && (Arc::ptr_eq(a.1, b.1) || a.1 == b.1))
 }

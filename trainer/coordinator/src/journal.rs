@@ -1,6 +1,8 @@
-//! The coordinator's memory on disk: the facts of each decision, and a snapshot of the state every so many of them.
+//! The stored form of the state: the facts of each decision, and snapshots at intervals. A snapshot consists of parts,
+//! and the next one writes only changed parts.
 //!
-//! Recovery is the newest snapshot and the facts after it, applied in order; nothing is decided again. Both carry [`FORMAT`].
+//! Recovery loads the newest snapshot and applies the facts after it in order, without deciding again. Both carry
+//! [`FORMAT`].
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -14,29 +16,29 @@ use crate::policy::Policy;
 use crate::state::State;
 use crate::state::execution::StageExecution;
 use crate::state::run::Run;
+use crate::state::shared::Map;
 use crate::state::worker::Worker;
 use crate::time::Millis;
 
-/// The version of what is stored. Another major version is refused. A later minor one has kinds or fields that this build does not know:
-/// it is read for as long as none of them occurs.
-pub const FORMAT: (u32, u32) = (1, 1);
+/// The version of stored data. Other major versions are refused. A later minor version may have unknown kinds or
+/// fields; it is readable as long as none of them occurs.
+pub const FORMAT: (u32, u32) = (2, 0);
 
-/// What cannot be recovered.
+/// An error in recovered data.
 #[derive(Debug, thiserror::Error)]
 #[error("{what} {problem}")]
 pub struct RecoverError {
-    /// The snapshot or the decision, by number.
+    /// The snapshot or the decision, with its number.
     pub what: String,
-    /// What is wrong with it.
     pub problem: String,
 }
 
-/// What one event came to.
+/// The facts of one event.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Decision {
-    /// When.
+    /// The time of the decision.
     pub now: Millis,
-    /// What is so from then on, in this order.
+    /// Facts in the order of application.
     pub facts: Vec<Fact>,
 }
 
@@ -51,7 +53,7 @@ struct Versioned<T> {
 struct Nothing {}
 
 impl Decision {
-    /// As it is stored.
+    /// Serialises the decision for storage.
     pub fn to_json(&self) -> String {
         #[derive(Serialize)]
         struct Stored<'a> {
@@ -63,10 +65,10 @@ impl Decision {
         serde_json::to_string(&stored).expect("facts serialise")
     }
 
-    /// Reads what [`to_json`](Self::to_json) wrote.
+    /// Reads the output of [`to_json`](Self::to_json).
     ///
     /// # Errors
-    /// Why it does not read, with the version that wrote it.
+    /// The reason, with the version that wrote the text.
     pub fn from_json(text: &str) -> Result<Self, String> {
         #[derive(Deserialize)]
         struct Stored {
@@ -82,12 +84,12 @@ impl Decision {
 
 fn read<'a, T: Deserialize<'a>>(text: &'a str) -> Result<T, String> {
     serde_json::from_str(text).map_err(|error| {
-        // The version says more than whatever it was that did not read.
+        // A version mismatch explains more than the parse error that it causes.
         let version: Result<Versioned<Nothing>, _> = serde_json::from_str(text);
         match version.map(|version| (version.format, check_format(version.format))) {
             Ok((_, Err(problem))) => problem,
             Ok((found, Ok(()))) if found > FORMAT => {
-                format!("cannot be read: {error}; it is of format {}.{}, use the build that wrote it", found.0, found.1)
+                format!("cannot be read: {error}; it has format {}.{}; use the build that wrote it", found.0, found.1)
             }
             _ => format!("cannot be read: {error}"),
         }
@@ -98,11 +100,12 @@ fn check_format((major, minor): (u32, u32)) -> Result<(), String> {
     if major == FORMAT.0 {
         return Ok(());
     }
-    Err(format!("is of format {major}.{minor}, this build reads {}.x; use the build that wrote it", FORMAT.0))
+    Err(format!("has format {major}.{minor}, this build reads {}.x; use the build that wrote it", FORMAT.0))
 }
 
-#[derive(Serialize)]
-struct SnapshotOf<'a> {
+/// The counters of a state. All other data is in parts.
+#[derive(Serialize, Deserialize)]
+struct Numbers {
     format: (u32, u32),
     seq: u64,
     now: Millis,
@@ -110,28 +113,11 @@ struct SnapshotOf<'a> {
     incarnation: Incarnation,
     fence: Fence,
     draining: bool,
-    workers: &'a BTreeMap<WorkerId, Worker>,
-    runs: Vec<&'a Run>,
-    executions: Vec<&'a StageExecution>,
 }
 
-#[derive(Deserialize)]
-struct Snapshot {
-    format: (u32, u32),
-    seq: u64,
-    now: Millis,
-    submitted: u64,
-    incarnation: Incarnation,
-    fence: Fence,
-    draining: bool,
-    workers: BTreeMap<WorkerId, Worker>,
-    runs: Vec<Run>,
-    executions: Vec<StageExecution>,
-}
-
-/// The state as it is stored, after decision [`State::seq`].
+/// The state after decision [`State::seq`] as stored, without its parts.
 pub fn snapshot(state: &State) -> String {
-    let snapshot = SnapshotOf {
+    let numbers = Numbers {
         format: FORMAT,
         seq: state.seq,
         now: state.now,
@@ -139,50 +125,149 @@ pub fn snapshot(state: &State) -> String {
         incarnation: state.incarnation,
         fence: state.fence,
         draining: state.draining,
-        workers: &state.workers,
-        runs: state.runs.values().map(|run| &**run).collect(),
-        executions: state.executions.values().map(|execution| &**execution).collect(),
     };
-    serde_json::to_string(&snapshot).expect("a state serialises")
+    serde_json::to_string(&numbers).expect("numbers serialise")
 }
 
-/// The state of a snapshot.
-fn restore(policy: Policy, text: &str) -> Result<State, String> {
-    let snapshot: Snapshot = read(text)?;
-    check_format(snapshot.format)?;
+/// A part of a state.
+#[derive(Debug, Clone)]
+enum Part {
+    Run(Arc<Run>),
+    Execution(Arc<StageExecution>),
+    Worker(Box<Worker>),
+}
+
+/// A part that was changed, added or removed.
+#[derive(Debug, Clone)]
+pub struct ChangedPart {
+    name: String,
+    content: Option<Part>,
+}
+
+impl ChangedPart {
+    /// The part's name and its text as stored; `None` if removed.
+    pub fn stored(&self) -> (String, Option<String>) {
+        let text = self.content.as_ref().map(|part| match part {
+            Part::Run(run) => serde_json::to_string(&**run),
+            Part::Execution(execution) => serde_json::to_string(&**execution),
+            Part::Worker(worker) => serde_json::to_string(worker),
+        });
+        (self.name.clone(), text.map(|text| text.expect("a part of a state serialises")))
+    }
+}
+
+const RUN: &str = "run/";
+const EXECUTION: &str = "execution/";
+const WORKER: &str = "worker/";
+
+/// The parts that differ between `before` and `after`. Shared data is not inspected.
+pub fn changed_parts(before: &State, after: &State) -> Vec<ChangedPart> {
+    let mut parts = Vec::new();
+    for (number, run) in changed(&before.runs, &after.runs, is_same) {
+        parts.push(ChangedPart { name: format!("{RUN}{number}"), content: run.cloned().map(Part::Run) });
+    }
+    for (key, execution) in changed(&before.executions, &after.executions, is_same) {
+        let content = execution.cloned().map(Part::Execution);
+        parts.push(ChangedPart { name: format!("{EXECUTION}{key}"), content });
+    }
+    for (name, worker) in changed(&before.workers, &after.workers, PartialEq::eq) {
+        let content = worker.cloned().map(|worker| Part::Worker(Box::new(worker)));
+        parts.push(ChangedPart { name: format!("{WORKER}{name}"), content });
+    }
+    parts
+}
+
+fn is_same<T: PartialEq>(before: &Arc<T>, after: &Arc<T>) -> bool {
+    Arc::ptr_eq(before, after) || before == after
+}
+
+/// Entries of `after` that are new or changed, and keys that only `before` has.
+fn changed<'a, K: Ord, V>(
+    before: &'a Map<K, V>,
+    after: &'a Map<K, V>,
+    is_same: impl Fn(&V, &V) -> bool,
+) -> Vec<(&'a K, Option<&'a V>)> {
+    let mut changed = Vec::new();
+    let mut old = before.iter().peekable();
+    for (key, value) in after {
+        while let Some((gone, _)) = old.next_if(|(old, _)| *old < key) {
+            changed.push((gone, None));
+        }
+        match old.next_if(|(old, _)| *old == key) {
+            Some((_, known)) if is_same(known, value) => {}
+            Some(_) | None => changed.push((key, Some(value))),
+        }
+    }
+    changed.extend(old.map(|(gone, _)| (gone, None)));
+    changed
+}
+
+/// Restores the state of a snapshot.
+fn restore(policy: Policy, text: &str, parts: &BTreeMap<String, String>) -> Result<State, String> {
+    let numbers: Numbers = read(text)?;
+    check_format(numbers.format)?;
     let mut state = State {
-        seq: snapshot.seq,
-        now: snapshot.now,
-        submitted: snapshot.submitted,
-        incarnation: snapshot.incarnation,
-        fence: snapshot.fence,
-        draining: snapshot.draining,
-        workers: Arc::new(snapshot.workers),
-        runs: snapshot.runs.into_iter().map(|run| (run.number, Arc::new(run))).collect(),
-        executions: snapshot.executions.into_iter().map(|execution| (execution.key, Arc::new(execution))).collect(),
+        seq: numbers.seq,
+        now: numbers.now,
+        submitted: numbers.submitted,
+        incarnation: numbers.incarnation,
+        fence: numbers.fence,
+        draining: numbers.draining,
         ..State::new(policy)
     };
+    for (name, text) in parts {
+        let at = |error| format!("has the part `{name}`, which cannot be read: {error}");
+        if name.starts_with(RUN) {
+            let run: Run = serde_json::from_str(text).map_err(at)?;
+            state.runs.insert_mut(run.number, Arc::new(run));
+        } else if name.starts_with(EXECUTION) {
+            let execution: StageExecution = serde_json::from_str(text).map_err(at)?;
+            state.executions.insert_mut(execution.key, Arc::new(execution));
+        } else if let Some(worker) = name.strip_prefix(WORKER) {
+            state.workers.insert_mut(WorkerId::new(worker), serde_json::from_str(text).map_err(at)?);
+        } else {
+            return Err(format!("has the part `{name}`, which this build does not know; use the build that wrote it"));
+        }
+    }
     state.index();
     Ok(state)
 }
 
-/// The state after all that is stored.
+/// The states recovered from a store.
+#[derive(Debug)]
+pub struct Recovered {
+    /// The state of the newest snapshot.
+    pub snapshot: State,
+    /// The state after all stored facts.
+    pub state: State,
+}
+
+/// Recovers the state after all stored facts.
 ///
 /// # Errors
-/// What does not read, does not follow on what is before it, or was written in another format.
+/// Stored data that cannot be parsed, has a gap, or was written in another format.
 pub fn recover(policy: Policy, stored: &Recovery) -> Result<State, RecoverError> {
-    let mut state = match &stored.snapshot {
+    recover_both(policy, stored).map(|recovered| recovered.state)
+}
+
+/// Like [`recover`], and also returns the snapshot, on which later ones build.
+///
+/// # Errors
+/// Those of [`recover`].
+pub fn recover_both(policy: Policy, stored: &Recovery) -> Result<Recovered, RecoverError> {
+    let snapshot = match &stored.snapshot {
         Some((seq, text)) => {
             let at = |problem| RecoverError { what: format!("the snapshot of decision {seq}"), problem };
-            restore(policy, text).map_err(at)?
+            restore(policy, text, &stored.parts).map_err(at)?
         }
         None => State::new(policy),
     };
+    let mut state = snapshot.clone();
     for (seq, text) in stored.facts.iter().filter(|(seq, _)| *seq > stored.snapshot.as_ref().map_or(0, |(seq, _)| *seq))
     {
         let at = |problem| RecoverError { what: format!("decision {seq}"), problem };
         if *seq != state.seq + 1 {
-            return Err(at(format!("follows on decision {}: what is between is missing", state.seq)));
+            return Err(at(format!("follows decision {}; the decisions between them are missing", state.seq)));
         }
         let decision = Decision::from_json(text).map_err(at)?;
         for fact in &decision.facts {
@@ -190,5 +275,5 @@ pub fn recover(policy: Policy, stored: &Recovery) -> Result<State, RecoverError>
         }
         (state.seq, state.now) = (*seq, decision.now);
     }
-    Ok(state)
+    Ok(Recovered { snapshot, state })
 }

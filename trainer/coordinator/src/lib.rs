@@ -1,17 +1,18 @@
-//! Who works on what, and whose results count.
+//! Assigns work to workers and decides which results count.
 //!
-//! The crate has two halves. The pure one ([`decide`], [`observe`], [`batch`], [`state`], [`fact`], [`journal`]) is a function of state, time
-//! and event, whose result are facts; it is tested under virtual time in microseconds. The thin one (the shell) is the HTTP server, the clock and the
-//! runner of effects. The store is the fence: nothing here is trusted to notice in time that a worker lost its lease,
-//! because every write carries a fence that the transaction checks.
+//! The crate has two halves. The pure half ([`decide`], [`observe`], [`batch`], [`state`], [`fact`], [`journal`]) maps
+//! state, time and event to facts; tests run it under virtual time in microseconds. The shell is the thin half: HTTP
+//! server, clock and execution of effects. The store is the fence: every write carries a fence that its transaction
+//! checks. Correctness therefore never depends on noticing a lost lease in time.
 //!
-//! Not its job: what a stage computes, what a blob holds, how gang members talk to each other.
+//! Computation of stages, contents of blobs and communication within gangs are elsewhere.
 
 pub mod batch;
 pub mod decide;
 pub mod event;
 pub mod fact;
 pub mod failpoints;
+mod history;
 pub mod invariants;
 pub mod journal;
 pub mod observe;
@@ -38,7 +39,8 @@ pub use outcome::refused_for_good;
 pub use policy::{GrantOrder, Policy};
 pub use rejected::Rejected;
 pub use shell::{
-    Config, Connections, Coordinator, Door, Handle, Records, RecordsError, StartError, Trouble, resolve_versions,
+    Allowances, Config, Connections, Coordinator, Handle, Records, RecordsError, RouteServer, StartError, Trouble,
+    resolve_versions,
 };
 pub use state::State;
 pub use state::run::Control;

@@ -1,19 +1,21 @@
-//! What is heard, and what it means. Heartbeats change only [`Heard`](crate::state::Heard); what follows from them
-//! is returned as events, to be decided one by one.
+//! Processing of observations. Heartbeats change only [`Heard`](crate::state::Heard); their consequences are returned
+//! as events, to be decided one by one.
 
+use std::collections::BTreeSet;
 use std::sync::Arc;
 
-use protocol::WorkerId;
-use protocol::message::Poll;
+use protocol::message::{Doing, Poll};
+use protocol::{TaskId, WorkerId};
 
 use crate::event::{Event, Observation};
 use crate::rejected::Rejected;
 use crate::state::State;
-use crate::state::task::Lease;
+use crate::state::evidence::{self, Word};
+use crate::state::task::{Lease, Part, Task};
 use crate::state::worker::{Presence, Worker};
 use crate::time::Millis;
 
-/// Takes note of `observation`, which was made at `at`, and says which events follow from it.
+/// Notes `observation`, made at `at`, and returns the resulting events.
 pub fn observe(state: &mut State, at: Millis, observation: Observation) -> Result<Vec<Event>, Rejected> {
     match observation {
         Observation::Poll { worker, poll } => heard(state, at, worker, poll),
@@ -21,14 +23,22 @@ pub fn observe(state: &mut State, at: Millis, observation: Observation) -> Resul
     }
 }
 
-/// Whether `poll` says no more than that its worker lives and how far it is: nothing follows from it.
+/// Returns true if `poll` reports only liveness and progress, so that nothing follows from it.
 pub fn is_quiet(state: &State, worker: &WorkerId, poll: &Poll) -> Result<bool, Rejected> {
     let known = state.process(worker, poll.incarnation)?;
-    let lost_nobody = poll.doing.iter().all(|doing| doing.lost.is_empty());
-    Ok(known.presence == Presence::Here && lost_nobody && !is_ready_for_more(state, known, poll))
+    let complains = poll.doing.iter().any(|doing| !doing.lost.is_empty());
+    let divided = || poll.doing.iter().any(|doing| is_of_a_divided_gang(state, doing));
+    let may_join = known.presence == Presence::Here && known.shunned.is_none();
+    Ok(may_join && !complains && !is_ready_for_more(state, known, poll) && !divided())
 }
 
-/// Whether the worker has what it needs for a task of which that was not known.
+/// Returns true if the gang of a reporting member is being heard about a complaint.
+fn is_of_a_divided_gang(state: &State, doing: &Doing) -> bool {
+    let Ok((_, task)) = state.task(&doing.grant.task) else { return false };
+    task.part == Part::Gang && task.check(&doing.grant).is_ok() && evidence::is_divided(&state.heard.words, task)
+}
+
+/// Returns true if the worker newly has the inputs of a known task.
 fn is_ready_for_more(state: &State, known: &Worker, poll: &Poll) -> bool {
     poll.ready.iter().any(|task| !known.ready.contains(task) && state.tasks.contains_key(task))
 }
@@ -37,11 +47,13 @@ fn heard(state: &mut State, now: Millis, worker: WorkerId, poll: Poll) -> Result
     let known = state.process(&worker, poll.incarnation)?;
     let mut events = Vec::new();
     match known.presence {
+        Presence::Here if known.shunned.is_some_and(|until| until <= now) => {
+            events.push(Event::WorkerBack { worker: worker.clone() });
+        }
         Presence::Here => {}
         Presence::Silent => events.push(Event::WorkerBack { worker: worker.clone() }),
         Presence::Suspect { since } => {
-            let penalty = state.policy.penalty_ms << known.suspicions.saturating_sub(1).min(6);
-            if now.since(since) >= penalty {
+            if now.since(since) >= state.policy.penalty_ms {
                 events.push(Event::WorkerBack { worker: worker.clone() });
             }
         }
@@ -56,39 +68,52 @@ fn heard(state: &mut State, now: Millis, worker: WorkerId, poll: Poll) -> Result
         let (worker, incarnation) = (worker.clone(), poll.incarnation);
         events.push(Event::WorkerReady { worker, incarnation, tasks: poll.ready });
     }
-    let heard = Arc::make_mut(&mut state.heard.workers).entry(worker).or_default();
-    *heard = now.max(*heard);
-    for doing in poll.doing {
-        let Ok((execution, task)) = state.task(&doing.grant.task) else { continue };
-        let Ok(rank) = task.check(&doing.grant) else { continue };
-        // Shards are counted, not looked into.
-        if rank == 0 && execution.tasks.len() == 1 {
-            let progress = Arc::new(doing.progress);
-            Arc::make_mut(&mut state.heard.progress).insert(doing.grant.task.clone(), progress);
+    let before = state.heard.workers.get(&worker).copied().unwrap_or_default();
+    state.heard.workers.insert_mut(worker.clone(), now.max(before));
+    for mut said in poll.doing {
+        if (&said.grant.worker, said.grant.incarnation) != (&worker, poll.incarnation) {
+            // A worker may report only on its own grants.
+            continue;
         }
-        if !doing.lost.is_empty() {
-            events.push(Event::PeersLost { grant: doing.grant, lost: doing.lost });
+        let Ok((execution, task)) = state.task(&said.grant.task) else { continue };
+        let Ok(rank) = task.check(&said.grant) else { continue };
+        let is_gang = task.part == Part::Gang;
+        // Progress of shards is only counted, not shown one by one.
+        if rank == 0 && execution.tasks.len() == 1 {
+            let progress = Arc::new(std::mem::take(&mut said.progress));
+            state.heard.progress.insert_mut(said.grant.task.clone(), progress);
+        }
+        if is_gang {
+            let word = Word::after(state.heard.words.get(&worker), &said, now);
+            Arc::make_mut(&mut state.heard.words).insert(worker.clone(), word);
+            if is_of_a_divided_gang(state, &said) {
+                events.push(Event::GangDivided { task: said.grant.task, fence: said.grant.fence });
+            }
         }
     }
     Ok(events)
 }
 
-/// What the clock means, looked at `at`. It may be taken up later than that, when the disk is slow: a lease is measured by when it was
-/// looked at, for until then polls were heard.
+/// Handles a tick of the timer, which fired at `at`. A slow disk may delay the handling. Leases are measured at `at`,
+/// because polls were received until then.
 fn tick(state: &mut State, at: Millis, overslept: u64) -> Vec<Event> {
     let now = at.max(state.now);
-    // Who sleeps through his own alarm was not listening either: that is not the workers' fault. Who was heard meanwhile all the same
-    // gets no more than a lease from now.
+    // If this process overslept, it could not receive polls, which is not the workers' fault: their deadlines move by
+    // the same time. Workers that polled meanwhile get at most one full lease from `at`. Polls received after `at`,
+    // while this tick waited for the disk, stay unchanged.
+    let later = |then: Millis| then.after(overslept).min(at).max(then);
     if overslept > state.policy.lease_ms / 3 {
-        for heard in Arc::make_mut(&mut state.heard.workers).values_mut() {
-            *heard = heard.after(overslept).min(at);
+        state.heard.workers = state.heard.workers.iter().map(|(name, heard)| (name.clone(), later(*heard))).collect();
+        for word in Arc::make_mut(&mut state.heard.words).values_mut() {
+            word.complained = word.complained.map(later);
+            word.moved = later(word.moved);
         }
     }
     let mut events = Vec::new();
     let unheard: Vec<WorkerId> =
         state.workers.keys().filter(|name| !state.heard.workers.contains_key(*name)).cloned().collect();
-    if !unheard.is_empty() {
-        Arc::make_mut(&mut state.heard.workers).extend(unheard.into_iter().map(|name| (name, at)));
+    for name in unheard {
+        state.heard.workers.insert_mut(name, at);
     }
     for (name, worker) in state.workers.iter() {
         let (worker, incarnation, silent) = (name.clone(), worker.incarnation, at.since(state.heard.workers[name]));
@@ -102,11 +127,9 @@ fn tick(state: &mut State, at: Millis, overslept: u64) -> Vec<Event> {
             Presence::Here | Presence::Suspect { .. } | Presence::Silent | Presence::Gone => {}
         }
     }
-    let open = state
-        .executions
-        .values()
-        .flat_map(|execution| execution.tasks.held().chain(execution.tasks.waiting()).map(|i| &execution.tasks[i]));
-    for task in open {
+    let due = state.queue.due(now).filter_map(|key| state.executions.get(&key));
+    let due = due.flat_map(|execution| execution.tasks.due(now).map(|i| &execution.tasks[i]));
+    for task in due {
         match task.lease {
             Lease::Waiting { not_before: Some(time) } if time <= now => {
                 events.push(Event::BackoffOver { task: task.id.clone() });
@@ -117,5 +140,23 @@ fn tick(state: &mut State, at: Millis, overslept: u64) -> Vec<Event> {
             Lease::Waiting { .. } | Lease::Held { .. } | Lease::Done { .. } => {}
         }
     }
+    // Gangs come from the reports of their members, so that waiting runs cost nothing here.
+    let reported: BTreeSet<&TaskId> = state.heard.words.values().map(|word| &word.grant.task).collect();
+    for id in reported {
+        let Ok((_, task)) = state.task(id) else { continue };
+        let is_over = |drain_by: Option<Millis>| drain_by.is_some_and(|deadline| deadline <= now);
+        if task.part == Part::Gang && matches!(task.lease, Lease::Held { drain_by, .. } if !is_over(drain_by)) {
+            events.extend(gang_event(state, task, now));
+        }
+    }
     events
+}
+
+/// The event due for a gang: a hearing may be over, or a member may be hung.
+fn gang_event(state: &State, task: &Task, now: Millis) -> Option<Event> {
+    let (id, fence, words): (TaskId, _, _) = (task.id.clone(), task.fence, &state.heard.words);
+    if evidence::is_divided(words, task) {
+        return Some(Event::GangDivided { task: id, fence });
+    }
+    evidence::hung(words, task, now, state.policy.stall_ms).map(|_| Event::GangStalled { task: id, fence })
 }

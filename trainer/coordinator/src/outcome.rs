@@ -1,23 +1,28 @@
-//! What holders of a task report: checkpoints and ends. The part of `decide` that checks whose word counts.
+//! Reports of task holders: checkpoints and ends of attempts. This part of `decide` checks which reports are accepted.
 //!
 //! | report \ from | rank 0 (or alone) | another member | an old grant |
 //! |---|---|---|---|
 //! | checkpoint | committed | refused | refused: stale fence |
-//! | finished | done | refused | refused, unless it is the accepted report sent again |
+//! | resolved | done, for a task that resolves | refused | as for finished |
+//! | finished | done | refused | refused, unless it repeats the accepted report |
 //! | yielded | waits | refused | as above |
+//! | failed: infrastructure, fault, damaged; another member holds the state | the member leaves the gang | the same | as above |
 //! | failed: infrastructure | tried again | the member leaves the gang | as above |
 //! | failed: fault | tried again | tried again | as above |
-//! | failed: memory, others in the gang | tried without the member | tried without the member | as above |
-//! | failed: an input is damaged | waits until that is made again | the same | as above |
-//! | failed: input, diverged, memory and alone, storage | final | final | as above |
+//! | failed: memory; others in the gang | tried without the member | tried without the member | as above |
+//! | failed: an input is damaged | waits until the input is recomputed | the same | as above |
+//! | failed: input, diverged, refused, storage; only another member holds the state | the member leaves the gang | the same | as above |
+//! | failed: input, diverged, memory and alone, refused, storage | final | final | as above |
+//!
+//! A failing member therefore costs its gang no step while another member holds the state.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-use protocol::message::{CommitCheckpoint, FailureClass, Grant, ReportOutcome, TaskOutcome};
-use protocol::stage::{Keep, StageSettings};
+use protocol::message::{CommitCheckpoint, FailureClass, Grant, LossCause, ReportOutcome, TaskOutcome};
+use protocol::stage::StageSettings;
 use protocol::sweep::STATE_OUTPUT;
-use protocol::{Digest, WorkerId};
+use protocol::{Digest, WorkerId, canonical};
 use registry::{Write, WriteError};
 
 use crate::decide::attempts::Loss;
@@ -47,7 +52,7 @@ impl Deciding<'_> {
             }
             Some(newest) if newest.step > step => {
                 return Err(Rejected::Conflict(format!(
-                    "task `{}` has a checkpoint at step {} already; one at step {step} would go back",
+                    "task `{}` already has a checkpoint at step {}; expected a later step than {step}",
                     task.id, newest.step
                 )));
             }
@@ -58,7 +63,7 @@ impl Deciding<'_> {
         let saved = Saved { step, manifest, metrics: metrics.clone() };
         let dropped = self.change(key, i, |task| task.save(saved, &keep));
         if !dropped.is_empty() {
-            self.effects.push(Effect::Prune { task: grant.task.clone(), keep });
+            self.effects.push(Effect::Prune { task: grant.task.clone(), keep, at_end: false });
         }
         self.writes.push(Write::Checkpoint { grant, step, manifest, metrics });
         Ok(true)
@@ -73,7 +78,13 @@ impl Deciding<'_> {
         let rank = task.check(grant)?;
         let (key, i) = self.place(&grant.task)?;
         let worker = grant.worker.clone();
+        let resolves = self.state.executions[&key].resolves;
         match &report.outcome {
+            TaskOutcome::Resolved { digests } => self.resolved(key, i, digests)?,
+            TaskOutcome::Finished { .. } if resolves => {
+                let task = &grant.task;
+                return Err(Rejected::Conflict(format!("task `{task}` digests files; it has no artifact")));
+            }
             TaskOutcome::Finished { output, metrics } => {
                 if rank != 0 {
                     return Err(only_rank_0(&worker, "reports the end"));
@@ -92,10 +103,19 @@ impl Deciding<'_> {
                 });
             }
             TaskOutcome::Failed { class, message } => {
+                let task = &self.state.executions[&key].tasks[i];
+                if *class != FailureClass::OutOfMemory
+                    && self.goes_on_without(task, &worker)
+                    && !(class.is_final() && self.has_state(task, &worker))
+                {
+                    self.leave(key, i, &worker, LossCause::Unreachable);
+                    self.accepted(key, i, &report);
+                    return Ok(true);
+                }
                 let fault = match class {
                     FailureClass::Fault => true,
                     FailureClass::Infrastructure => false,
-                    // The others hold the same weights, but may hold them in more memory: they go on without this one.
+                    // The others have the same weights but perhaps more memory, so they continue without this member.
                     FailureClass::OutOfMemory if self.state.executions[&key].tasks[i].holders().len() > 1 => {
                         self.change(key, i, |task| task.too_small.push(worker.clone()));
                         self.take_from(key, i, std::slice::from_ref(&worker), Loss::Lost);
@@ -110,6 +130,7 @@ impl Deciding<'_> {
                     FailureClass::Input
                     | FailureClass::Diverged
                     | FailureClass::OutOfMemory
+                    | FailureClass::Refused
                     | FailureClass::Storage => {
                         let own = *class != FailureClass::Storage;
                         self.fail_execution(key, message.clone(), own);
@@ -118,7 +139,7 @@ impl Deciding<'_> {
                     }
                 };
                 if rank != 0 && !fault {
-                    self.suspect(&grant.task.clone(), &[worker])?;
+                    self.leave(key, i, &worker, LossCause::Unreachable);
                 } else {
                     self.try_again(key, i, message, fault);
                 }
@@ -130,6 +151,23 @@ impl Deciding<'_> {
 
     fn accepted(&mut self, key: Digest, i: usize, report: &ReportOutcome) {
         self.change(key, i, |task| task.reported = Some(report.clone()));
+    }
+
+    /// Accepts the digests of a stage's files outside the store, from which the stage gets a key.
+    fn resolved(&mut self, key: Digest, i: usize, digests: &BTreeMap<String, Digest>) -> Result<(), Rejected> {
+        let execution = Arc::clone(&self.state.executions[&key]);
+        let named: BTreeSet<String> = execution.settings.folders().into_iter().map(|folder| folder.field).collect();
+        if !execution.resolves || named.iter().ne(digests.keys()) {
+            let stage = &execution.stage;
+            return Err(Rejected::Conflict(format!("stage `{stage}` needs no digests, or names other files")));
+        }
+        self.change(key, i, |task| task.finish(canonical::digest(digests)));
+        for (run, stage) in execution.users.iter().copied() {
+            self.record(Fact::Resolved { run, stage, digests: digests.clone() });
+        }
+        let known = Arc::new(Known { outputs: BTreeMap::new(), metrics: BTreeMap::new() });
+        self.record(Fact::ExecutionState { key, state: ExecutionState::Done { known, cached: false } });
+        Ok(())
     }
 
     fn finished(
@@ -161,24 +199,23 @@ impl Deciding<'_> {
             state: ExecutionState::Done { known: Arc::new(known), cached: false },
         });
         self.writes.push(write);
-        // The value is there: what an interrupted try would have gone on from is of no use any more, but for the last way
-        // from one checkpoint to the next, which `trainer run --verify` walks again, and the best, if they were asked for.
+        // The value is stored, so no attempt resumes from these checkpoints. Those stay that the pipeline asks for.
         if !self.change(key, i, |task| std::mem::take(&mut task.checkpoints)).is_empty() {
-            let keep = Keep { latest: 2, ..keep };
-            self.effects.push(Effect::Prune { task: report.grant.task.clone(), keep });
+            self.effects.push(Effect::Prune { task: report.grant.task.clone(), keep, at_end: true });
         }
         Ok(())
     }
 }
 
-/// The state that a stage leaves which stops before its schedule's end: the checkpoint of its last step, which every training saves.
+/// The checkpoint that a stage with an early stop leaves for its successor: that of its last step, which every training
+/// saves.
 fn left_state(settings: &StageSettings, task: &Task) -> Result<Option<Digest>, Rejected> {
     let Some(training) = settings.training().filter(|training| training.stop.is_some()) else { return Ok(None) };
     let end = training.end().0;
     match task.newest() {
         Some(saved) if saved.step == end => Ok(Some(saved.manifest)),
         other => Err(Rejected::Conflict(format!(
-            "task `{}` stops at step {end} for another stage to go on from, but its newest checkpoint is of step {:?}",
+            "task `{}` stops at step {end} for another stage to continue, but its newest checkpoint is of step {:?}",
             task.id,
             other.map(|saved| saved.step)
         ))),
@@ -186,10 +223,10 @@ fn left_state(settings: &StageSettings, task: &Task) -> Result<Option<Digest>, R
 }
 
 fn only_rank_0(worker: &WorkerId, what: &str) -> Rejected {
-    Rejected::Conflict(format!("worker `{worker}` is not rank 0 of its gang, which alone {what}"))
+    Rejected::Conflict(format!("worker `{worker}` is not rank 0 of its gang; only rank 0 {what}"))
 }
 
-/// What happens instead of an event that the store refuses and always will.
+/// The event that replaces one that the store refuses permanently.
 pub fn refused_for_good(event: &Event, error: &WriteError) -> Option<Event> {
     let (message, is_missing) = match error {
         WriteError::Conflict(message) | WriteError::Gate(message) => (message.clone(), false),
@@ -197,11 +234,14 @@ pub fn refused_for_good(event: &Event, error: &WriteError) -> Option<Event> {
         WriteError::StaleFence { .. }
         | WriteError::Superseded { .. }
         | WriteError::Storage(_)
+        | WriteError::Unproven { .. }
+        | WriteError::Unreachable(_)
         | WriteError::Internal(_) => return None,
     };
     let failed = |grant: &Grant| {
-        // What is missing was collected between its upload and its report, or never came: another try brings it, within the budget.
-        // Two values for one thing: the first promise is broken, and computing again would not mend it.
+        // A missing artifact was collected between its upload and its report, or never arrived; another attempt within
+        // the budget uploads it again. A conflict is a second value for the same key, which another computation would
+        // not repair.
         let class = if is_missing { FailureClass::Fault } else { FailureClass::Storage };
         let outcome = TaskOutcome::Failed { class, message: message.clone() };
         Some(Event::Outcome { report: ReportOutcome { grant: grant.clone(), outcome } })

@@ -1,40 +1,56 @@
-//! The numbers of coordination. Configuration, so that tests can vary them; the defaults are the promises.
+//! Parameters of coordination. They are configurable so that tests can vary them; the documented promises assume the
+//! defaults.
 
-/// Which of several idle workers is served first. What comes of the work does not depend on it.
+use protocol::message::LossCause;
+
+/// Order in which idle workers receive work. Results do not depend on it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum GrantOrder {
-    /// The first by name.
+    /// Ascending by name.
     ByName,
-    /// The last by name.
+    /// Descending by name.
     ByNameBackwards,
 }
 
-/// Times, budgets and periods.
+/// Periods, limits and budgets of coordination.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Policy {
-    /// A worker that was not heard of for so long loses its assignments. Milliseconds.
+    /// A worker that is silent for longer loses its assignments. Milliseconds.
     pub lease_ms: u64,
-    /// How often the clock is looked at; a dead worker's task is free after at most a lease and a tick. Milliseconds.
+    /// Period of the timer; a dead worker's task is free after at most one lease and one tick. Milliseconds.
     pub tick_ms: u64,
-    /// How long a poll waits for news. Milliseconds.
+    /// Longest wait of a poll for changes. Milliseconds.
     pub poll_ms: u64,
-    /// How long work that was asked to drain may take before it is released. Milliseconds.
+    /// Time for a draining worker to finish before its task is released. Milliseconds.
     pub grace_ms: u64,
-    /// How long a worker whose peers could not reach it stays out. Milliseconds.
+    /// Time for members of a gang to answer a complaint. Longer than the interval between two polls. Milliseconds.
+    pub hearing_ms: u64,
+    /// Time without work for a worker that was removed from a gang. Milliseconds.
     pub penalty_ms: u64,
-    /// First back-off; it doubles with each failure in a row. Milliseconds.
+    /// Time in which such a worker joins no gang with other members; it doubles with each suspicion. Milliseconds.
+    pub shun_ms: u64,
+    /// Like `shun_ms`, for a worker that slowed its gang down, which takes the gang some time to detect. Milliseconds.
+    pub shun_slow_ms: u64,
+    /// Upper limit of the time in which a worker joins no others. Milliseconds.
+    pub shun_max_ms: u64,
+    /// Time without another suspicion after which a suspicion is dropped. Milliseconds.
+    pub fade_ms: u64,
+    /// Time without a step after which a gang loses the member that the others wait for. Milliseconds.
+    pub stall_ms: u64,
+    /// First back-off; it doubles with each consecutive failure. Milliseconds.
     pub backoff_ms: u64,
     /// Longest back-off. Milliseconds.
     pub backoff_max_ms: u64,
-    /// How long a worker's name is kept that is gone or silent. Milliseconds.
+    /// Time after which the name of an absent worker is forgotten. Milliseconds.
     pub forget_ms: u64,
-    /// After how many decisions the state is stored as a whole and the facts before it go.
+    /// Number of decisions between snapshots of the state. A snapshot deletes the facts before it.
     pub snapshot_every: u64,
-    /// Who is served first.
+    /// Maximum number of active runs; further submissions are refused.
+    pub live_runs: usize,
     pub grants: GrantOrder,
-    /// Faults of ours that a task survives.
+    /// Number of our own faults that a task survives.
     pub fault_budget: u32,
-    /// Losses of workers and networks that a task survives.
+    /// Number of losses of workers and networks that a task survives.
     pub infrastructure_budget: u32,
 }
 
@@ -45,11 +61,18 @@ impl Default for Policy {
             tick_ms: 1_000,
             poll_ms: 2_000,
             grace_ms: 30_000,
+            hearing_ms: 2_500,
             penalty_ms: 3_000,
+            shun_ms: 6_000,
+            shun_slow_ms: 120_000,
+            shun_max_ms: 3_600_000,
+            fade_ms: 600_000,
+            stall_ms: 3_600_000,
             backoff_ms: 500,
             backoff_max_ms: 30_000,
             forget_ms: 3_600_000,
             snapshot_every: 4_000,
+            live_runs: 20_000,
             grants: GrantOrder::ByName,
             fault_budget: 5,
             infrastructure_budget: 100,
@@ -58,6 +81,16 @@ impl Default for Policy {
 }
 
 impl Policy {
+    /// Time in which a worker joins no others after `suspicions` suspicions.
+    pub fn shunned_ms(&self, cause: LossCause, suspicions: u32) -> u64 {
+        let first = match cause {
+            LossCause::Unreachable => self.shun_ms,
+            LossCause::Slow => self.shun_slow_ms,
+            LossCause::Disagrees => self.shun_max_ms,
+        };
+        first.saturating_mul(1 << suspicions.saturating_sub(1).min(16)).min(self.shun_max_ms)
+    }
+
     /// The wait after `failures` failures in a row.
     pub fn backoff(&self, failures: u32) -> u64 {
         let doublings = failures.saturating_sub(1).min(16);

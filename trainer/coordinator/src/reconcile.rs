@@ -1,12 +1,12 @@
-//! The part of `decide` that follows every event, for what the event touched: stages take over what their work gave, stages whose inputs are there
-//! begin, and work that nobody waits for is asked to drain.
+//! The part of `decide` that follows every event, for the objects that the event touched. Stages take over results of
+//! their executions, ready stages start, and unwanted work is asked to drain.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use protocol::message::{RunState, StageState};
 use protocol::stage::{Register, Shape};
-use protocol::{Digest, StageName};
+use protocol::{Digest, StageName, canonical};
 
 use crate::decide::deciding::Deciding;
 use crate::event::Effect;
@@ -14,11 +14,12 @@ use crate::fact::Fact;
 use crate::register::Registration;
 use crate::state::execution::{ExecutionState, StageExecution};
 use crate::state::run::{Run, Status};
+use crate::state::shared::Set;
 use crate::state::tasks::Tasks;
 use crate::time::Millis;
 
 impl Deciding<'_> {
-    /// Brings every run that was touched up to date with its executions, until nothing moves.
+    /// Updates every touched run from its executions, until nothing changes.
     pub(crate) fn reconcile(&mut self) {
         while let Some(number) = self.unreconciled.pop_first() {
             if !self.state.runs.contains_key(&number) {
@@ -38,7 +39,7 @@ impl Deciding<'_> {
                 self.set_run_state(number, state, parked);
             }
             self.attach_ready(number);
-            // Whatever moved has touched the run, so it is looked at again.
+            // A change marks the run as unreconciled, so the loop visits it again.
         }
     }
 
@@ -55,6 +56,7 @@ impl Deciding<'_> {
                 | ExecutionState::Mending { .. }
                 | ExecutionState::Bundling => continue,
                 ExecutionState::Failed { message, .. } => Status::Failed { key, message: message.clone() },
+                ExecutionState::Done { .. } if execution.resolves => Status::Waiting,
                 ExecutionState::Done { known, cached } => {
                     let how = match (cached, execution.resumed) {
                         (true, _) => StageState::Cached,
@@ -72,7 +74,7 @@ impl Deciding<'_> {
         }
     }
 
-    /// Starts the stages of a running run whose inputs are there.
+    /// Starts the stages of a running run whose inputs are available.
     fn attach_ready(&mut self, number: u64) {
         let run = Arc::clone(&self.state.runs[&number]);
         if run.state != RunState::Running {
@@ -85,8 +87,12 @@ impl Deciding<'_> {
             {
                 let status = if run.pipeline.stages[j].sweep.is_some() {
                     self.begin_sweep(number, j)
+                } else if run.is_resolved(j, &inputs) {
+                    let key = run.pipeline.identity(&run.pipeline.stages[j], &inputs).key();
+                    self.attach(&run, j, inputs, key, false)
                 } else {
-                    self.attach(&run, j, inputs)
+                    let key = canonical::digest(&("files of a stage", &run.id, &run.pipeline.stages[j].name));
+                    self.attach(&run, j, inputs, key, true)
                 };
                 stages.push((j, status));
             }
@@ -96,9 +102,10 @@ impl Deciding<'_> {
         }
     }
 
-    fn attach(&mut self, run: &Run, j: usize, inputs: BTreeMap<String, Digest>) -> Status {
+    /// Requests the value of a stage under `key`. With `resolves`, the execution computes only the digests that the
+    /// stage's key needs.
+    fn attach(&mut self, run: &Run, j: usize, inputs: BTreeMap<String, Digest>, key: Digest, resolves: bool) -> Status {
         let stage = &run.pipeline.stages[j];
-        let key = run.pipeline.identity(stage, &inputs).key();
         let registration = match stage.settings.get::<Register>().map(|settings| Registration::gather(run, settings)) {
             Some(Ok(registration)) => Some(registration),
             Some(Err(message)) => return Status::Failed { key, message },
@@ -109,7 +116,7 @@ impl Deciding<'_> {
         };
         match self.state.executions.get(&key).cloned() {
             Some(execution) => {
-                if execution.placement != stage.placement {
+                if execution.placement != stage.placement && self.may_place(run, &execution) {
                     self.record(Fact::ExecutionPlacement { key, placement: stage.placement.clone() });
                 }
                 let lost = match execution.state {
@@ -135,6 +142,7 @@ impl Deciding<'_> {
                     keyed_as: protocol::pipeline::keyed_as(stage).clone(),
                     settings: stage.settings.clone(),
                     inputs,
+                    resolves,
                     seed: run.pipeline.seed,
                     backend: run.pipeline.backend,
                     placement: stage.placement.clone(),
@@ -145,7 +153,7 @@ impl Deciding<'_> {
                     busy_since: None,
                     resumed: false,
                     instruction_set: None,
-                    users: BTreeMap::new(),
+                    users: Set::default(),
                 };
                 self.record(Fact::Execution { execution: Box::new(execution) });
             }
@@ -154,11 +162,18 @@ impl Deciding<'_> {
         Status::Active { key }
     }
 
-    /// Wanted again after it was over: the store is asked first, and budgets are whole again.
+    /// Returns true if `run` may set the number of workers of an execution: no running run of another owner waits for
+    /// it.
+    fn may_place(&self, run: &Run, execution: &StageExecution) -> bool {
+        let others = execution.users.iter().filter_map(|(number, _)| self.state.runs.get(number));
+        others.filter(|other| other.state == RunState::Running).all(|other| run.owner.controls(&other.owner.group()))
+    }
+
+    /// Reopens an execution that was over, with full budgets. The store is queried for the value first.
     pub(crate) fn want_again(&mut self, execution: &StageExecution, run: &Run, stage: &StageName, lost_value: bool) {
         let key = execution.key;
         if execution.tasks.is_empty() {
-            // Nothing was done here; what will be bears the name of who asks.
+            // No task exists yet; future ones get the ids of this run.
             self.record(Fact::ExecutionSource { key, run: run.id.clone(), stage: stage.clone() });
         }
         for i in 0..execution.tasks.len() {
@@ -167,7 +182,7 @@ impl Deciding<'_> {
         self.record(Fact::ExecutionState { key, state: ExecutionState::Looking });
     }
 
-    /// What no running run waits for is asked to drain; what one waits for again carries on.
+    /// Asks holders of unwanted tasks to drain, and those of wanted ones to continue.
     pub(crate) fn drain(&mut self) {
         let deadline = self.now().after(self.state.policy.grace_ms);
         for key in self.touched.clone() {
@@ -176,7 +191,8 @@ impl Deciding<'_> {
                 continue;
             }
             self.state.visits += 1;
-            let carry_on = !self.state.draining && self.state.is_wanted(&execution);
+            let enough = execution.is_enough();
+            let carry_on = !self.state.draining && enough && self.state.is_wanted(&execution);
             if !execution.tasks.all_draining(!carry_on) {
                 for i in execution.tasks.held() {
                     self.change(key, i, |task| task.drain((!carry_on).then_some(deadline)));
@@ -185,7 +201,7 @@ impl Deciding<'_> {
         }
     }
 
-    /// Starts or stops the count of seconds of what was touched.
+    /// Starts or stops the working time of touched executions.
     pub(crate) fn count_time(&mut self) {
         let now = self.now();
         for key in self.touched.clone() {

@@ -1,14 +1,14 @@
-//! What a `register` stage registers: which models, drawn from how, with which metrics, and which of them is best.
+//! Collection of the models that a `register` stage registers, with samplers and metrics, and choice of the best.
 //!
-//! The coordinator does it itself, because it changes the registry: versions, the move of the alias and the stage's value
-//! are one transaction, so that a gate that does not hold leaves nothing behind.
+//! The coordinator registers models itself, because this changes the registry. Versions, the move of the alias and the
+//! stage's value are one transaction, so that a failed gate leaves no trace.
 
 use std::collections::BTreeMap;
 
 use checkpoint::model::Parts;
 use protocol::pipeline::PipelineStage;
 use protocol::stage::{Mode, Register, Sampler};
-use protocol::{Alias, Digest, ModelName, RunId, StageName};
+use protocol::{Alias, Digest, ModelName, StageName};
 use registry::Write;
 use serde::{Deserialize, Serialize};
 use serde_json::json;
@@ -16,35 +16,38 @@ use serde_json::json;
 use crate::state::run::{Run, Status, value};
 use crate::value::{Candidate, Known};
 
-/// All that a register stage needs to know, once its inputs are there.
+/// The data of a register stage, complete once its inputs are available.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Registration {
-    /// In the order of `from`.
+    /// The models in the order of `from`.
     pub candidates: Vec<Candidate>,
-    /// Metrics of each.
+    /// Metrics of each candidate.
     pub metrics: Vec<BTreeMap<String, f64>>,
-    /// Keys of the stages that made them.
+    /// Keys of the stages that produced the candidates.
     pub keys: Vec<Digest>,
-    /// Which of them is best.
+    /// Index of the best candidate.
     pub best: usize,
     pub model: ModelName,
-    /// The metric that decides which version is best, and its direction.
+    /// The metric that ranks versions, and its direction.
     pub by: (String, Mode),
-    /// The alias that moves, and its gates.
+    /// The alias to move, and its gates.
     pub promote: Option<(Alias, Vec<String>)>,
 }
 
 impl Registration {
-    /// Gathers candidates and their metrics from the stages of `run`, which are all done.
+    /// Collects candidates and their metrics from the stages of `run`, which are all done.
     ///
     /// # Errors
-    /// What is wrong, without the stage's name, which its reader has.
+    /// The reason as text for the user, without the stage's name, which is shown beside it.
     pub fn gather(run: &Run, settings: &Register) -> Result<Self, String> {
         let model = settings.model.parse::<ModelName>().map_err(|e| format!("`model`: {e}"))?;
         let promote = match settings.promote.to.as_str() {
             "" => None,
             alias => {
                 let alias = alias.parse::<Alias>().map_err(|e| format!("`promote.to`: {e}"))?;
+                if !run.owner.promotes {
+                    return Err(format!("`promote.to`: the token of `{}` may not promote", run.owner));
+                }
                 Some((alias, settings.promote.require.clone()))
             }
         };
@@ -69,9 +72,9 @@ impl Registration {
         Ok(Self { candidates, metrics, keys, best, model, by, promote })
     }
 
-    /// The stage's value and the writes that make it so, given the stored bundle of each candidate.
-    pub fn writes(&self, run: &RunId, stage: &StageName, bundles: &[Digest]) -> (Known, Vec<Write>) {
-        let mut writes = Vec::new();
+    /// The stage's value and the writes that register it for `run`, given the stored bundle of each candidate.
+    pub fn writes(&self, run: &Run, stage: &StageName, bundles: &[Digest]) -> (Known, Vec<Write>) {
+        let mut writes = vec![Write::ModelOwner { model: self.model.clone(), owner: run.owner.clone() }];
         let (metric, mode) = &self.by;
         for (i, artifact) in bundles.iter().enumerate() {
             writes.push(Write::Version {
@@ -79,7 +82,7 @@ impl Registration {
                 artifact: *artifact,
                 metrics: self.metrics[i].clone(),
                 source: json!({
-                    "run": run, "stage": self.candidates[i].stage, "key": self.keys[i], "metric": metric, "mode": mode,
+                    "run": run.id, "stage": self.candidates[i].stage, "key": self.keys[i], "metric": metric, "mode": mode,
                 }),
             });
         }
@@ -90,7 +93,7 @@ impl Registration {
                 artifact: bundles[self.best],
                 require: require.clone(),
                 reason: format!("best of stage `{stage}`"),
-                actor: format!("run {run}"),
+                actor: format!("{}, run {}", run.owner, run.id),
             });
         }
         let outputs = BTreeMap::from([("model".to_owned(), bundles[self.best])]);
@@ -102,15 +105,15 @@ fn output(run: &Run, stage: &StageName) -> Option<Digest> {
     value(run.status(stage)?.known()?).copied()
 }
 
-/// The evaluations that look at `model`.
+/// The evaluations of `model`.
 fn evaluations_of<'a>(run: &'a Run, model: &'a str) -> impl Iterator<Item = (&'a PipelineStage, &'a Status)> {
     let stages = run.pipeline.stages.iter().zip(&run.stages);
     stages.filter(move |(stage, _)| stage.settings.evaluated_model().as_deref() == Some(model))
 }
 
-/// The metrics of every evaluation that looks at `model`. Of several evaluations (a student at one and at four steps, in latents and
-/// by an evaluator) each keeps its own as `stage.metric`; the plain name, with its interval, is the first one's that gives it, and those that
-/// drew as the version is drawn from come before others.
+/// The metrics of all evaluations of `model`. If there are several (such as a student at one and at four steps), each
+/// also has its own metrics as `stage.metric`. The plain name, with its interval, belongs to the first evaluation that
+/// has the metric. Evaluations with the version's own sampler precede others.
 fn metrics_of(run: &Run, model: &str, sampler: Option<&Sampler>) -> BTreeMap<String, f64> {
     let mut looking: Vec<_> = evaluations_of(run, model).collect();
     looking.sort_by_key(|(stage, _)| stage.settings.sampler() != sampler);
@@ -135,7 +138,7 @@ fn together(known: &[(&StageName, &BTreeMap<String, f64>)]) -> BTreeMap<String, 
     all
 }
 
-/// The candidate with the best value; the first of equals. One that nobody evaluates is registered as it is, if it is the only one.
+/// The candidate with the best value; the first one in a tie. A single candidate needs no evaluation.
 fn best(from: &[String], metrics: &[BTreeMap<String, f64>], settings: &Register) -> Result<usize, String> {
     if from.len() == 1 && metrics[0].is_empty() {
         return Ok(0);
@@ -146,17 +149,17 @@ fn best(from: &[String], metrics: &[BTreeMap<String, f64>], settings: &Register)
         let value = match metrics[i].get(metric) {
             Some(value) if value.is_finite() => *value,
             Some(value) => {
-                return Err(format!("`metric`: `{metric}` of `{stage}` is {value}, by which nothing is best"));
+                return Err(format!("`metric`: `{metric}` of `{stage}` is {value}, which cannot be ranked"));
             }
             None if metrics[i].is_empty() => {
                 return Err(format!(
-                    "`metric`: no evaluation looks at `{stage}`; add an `evaluate.latent_fid` stage with `model: {stage}`"
+                    "`metric`: no stage evaluates `{stage}`; add an `evaluate.latent_fid` stage with `model: {stage}`"
                 ));
             }
             None => {
                 let known: Vec<&str> = metrics[i].keys().map(String::as_str).collect();
                 return Err(format!(
-                    "`metric`: no evaluation of `{stage}` gives `{metric}`; name one of those that there are: {}",
+                    "`metric`: no evaluation of `{stage}` has `{metric}`; expected one of: {}",
                     known.join(", ")
                 ));
             }
@@ -174,7 +177,54 @@ fn best(from: &[String], metrics: &[BTreeMap<String, f64>], settings: &Register)
 
 #[cfg(test)]
 mod tests {
+    use std::sync::Arc;
+
+    use protocol::Owner;
+    use protocol::pipeline::Pipeline;
+
     use super::*;
+
+    fn pipeline() -> Pipeline {
+        let text = "name: p\nseed: 1\ndataset: {format: synthetic}\nstages:\n  vae: {kind: train.vae}\n  latents: {kind: encode.latents}\n  \
+                    mld: {kind: train.mld}\n  fid: {kind: evaluate.latent_fid, model: mld}\n  release: {kind: register, model: m, from: mld, promote: {to: prod}}\n";
+        protocol::pipeline::read("p.yaml", text, &[]).unwrap_or_else(|mistakes| panic!("{mistakes}"))
+    }
+
+    #[test]
+    fn a_promotion_is_its_submitters_and_bears_token_and_run() {
+        let run = |promotes| {
+            let owner = Owner { name: "alice".into(), project: Some("motion".into()), promotes, admin: false };
+            Run::new(3, owner, Arc::new(pipeline()), None, None)
+        };
+        let release = pipeline().stages.into_iter().next_back().expect("a stage");
+        let settings = release.settings.get::<Register>().expect("`register`").clone();
+        let refused = Registration::gather(&run(false), &settings).unwrap_err();
+        assert_eq!(refused, "`promote.to`: the token of `alice (motion)` may not promote");
+        let without = Register { promote: Default::default(), ..settings.clone() };
+        let other = Registration::gather(&run(false), &without).unwrap_err();
+        assert!(!other.contains("promote"), "without an alias it needs no scope: {other}");
+
+        let candidate = Candidate { stage: "mld".into(), model: Digest::of(b"m"), sampler: None, parts: Parts::new() };
+        let registration = Registration {
+            candidates: vec![candidate],
+            metrics: vec![BTreeMap::new()],
+            keys: vec![Digest::of(b"key")],
+            best: 0,
+            model: "m".into(),
+            by: ("fid".into(), Mode::Min),
+            promote: Some(("prod".into(), Vec::new())),
+        };
+        let run = run(true);
+        let (_, writes) = registration.writes(&run, &"release".into(), &[Digest::of(b"bundle")]);
+        let [Write::ModelOwner { owner, .. }, Write::Version { source, .. }, Write::Promote { actor, .. }] =
+            &writes[..]
+        else {
+            panic!("{writes:?}");
+        };
+        assert_eq!(*owner, run.owner);
+        assert_eq!(source["run"], run.id.as_str());
+        assert_eq!(*actor, format!("alice (motion), run {}", run.id));
+    }
 
     #[test]
     fn a_plain_name_and_its_interval_are_of_one_evaluation() {
@@ -209,7 +259,7 @@ mod tests {
         assert_eq!(pick(&by("fid", Mode::Max), &three), Ok(0));
         assert_eq!(pick(&by("r", Mode::Max), &three), Ok(1));
         assert_eq!(pick(&by("fid", Mode::Min), &[&[]]), Ok(0), "the only one needs no judge");
-        // A metric that nobody reported, of several candidates and of one alone.
+        // An unknown metric, with several candidates and with one.
         for candidates in [&three[..], &three[..1]] {
             let refused = pick(&by("fdi", Mode::Min), candidates).unwrap_err();
             assert!(refused.contains("`fdi`") && refused.contains("fid, r") && refused.contains("`s0`"), "{refused}");
@@ -217,6 +267,6 @@ mod tests {
         let refused = pick(&by("fid", Mode::Min), &[&[("fid", 1.0)], &[("fid", f64::NAN)]]).unwrap_err();
         assert!(refused.contains("`s1` is NaN"), "{refused}");
         let refused = pick(&by("fid", Mode::Min), &[&[("fid", 1.0)], &[]]).unwrap_err();
-        assert!(refused.contains("no evaluation looks at `s1`"), "{refused}");
+        assert!(refused.contains("no stage evaluates `s1`"), "{refused}");
     }
 }

@@ -1,26 +1,40 @@
-//! What is refused.
+//! Refusals of events.
 
-use protocol::{Fence, TaskId};
+use protocol::{Fence, RunId, TaskId};
 
-/// Why an event did not happen. Nothing has changed.
+/// The reason for refusing an event. The state is unchanged.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum Rejected {
     /// The grant has been superseded.
-    #[error("stale fence: task `{task}` is at fence {current}, the call carries {carried}")]
+    #[error("stale fence: the grant of task `{task}` with fence {carried} has been superseded")]
     StaleFence {
         task: TaskId,
-        /// Its fence now.
-        current: Fence,
-        /// The fence of the call.
+        /// The fence of the call. The task's current fence is not disclosed.
         carried: Fence,
     },
-    /// No such thing.
+    /// Another process with an unexpired lease uses the worker's name.
+    #[error("{0}")]
+    NameHeld(String),
+    /// The caller has no permission: the worker, run or alias belongs to another token.
+    #[error("{0}")]
+    Forbidden(String),
+    /// The named object does not exist.
     #[error("{0}")]
     NotFound(String),
-    /// It contradicts what is.
+    /// The request conflicts with the current state.
     #[error("{0}")]
     Conflict(String),
-    /// It cannot be.
+    /// A limit is reached; the same request may be accepted later.
+    #[error("{0}")]
+    Full(String),
+    /// The request is invalid.
     #[error("{0}")]
     Invalid(String),
+}
+
+impl Rejected {
+    /// The run does not exist or is invisible to the caller.
+    pub fn unknown_run(run: &RunId) -> Self {
+        Self::NotFound(format!("run `{run}` is not known; `trainer status --all` lists runs"))
+    }
 }

@@ -1,33 +1,44 @@
-//! Who gets what. Deterministic in state and moment; what was given stays given, whatever this file says in a later build.
+//! Assignment of work to workers. Deterministic in state and moment. A later build with other rules does not change
+//! existing assignments.
 //!
-//! Executions are served in the order of [`State::wanted`](crate::state::State::wanted). Gangs that have become
-//! too large give up members. Then plain tasks, shards and merges
-//! that are ready, one worker each: they are short, and much waits for them. Then gangs that are under way take in those who
-//! is left, up to their `max`; then gangs that wait start with everybody who is left. A gang takes only workers that have said that they
-//! have its inputs: [`State::open_gangs`] says to those who are left for what they should fetch them, and nobody waits for who is slow
-//! at that. All who work on an execution have the same instruction set. A gang does not start while a map
-//! stage that its workers could merge is almost done (its last shards are out), or the merge would wait for the whole
-//! training; one that takes a single worker leaves the others to it.
+//! Executions are served in the order of [`State::wanted`](crate::state::State::wanted), as
+//! [`Queue`](crate::state::queue::Queue) stores them. Work that no idle worker can take is skipped. The order within
+//! one decision:
+//! 1. Gangs that have become too large release members.
+//! 2. Plain tasks, shards and merges that are ready get one worker each: they are short, and much waits for them.
+//! 3. Running gangs admit idle workers, up to their `max`.
+//! 4. Waiting gangs start with all remaining workers.
+//!
+//! A gang admits only workers that have reported its inputs as fetched and its members as reachable.
+//! [`State::open_gangs`] tells idle workers which inputs to fetch; the gang does not wait for slow ones. All workers of
+//! an execution have the same instruction set.
+//!
+//! A gang does not start while a map stage that its workers could merge is almost done (its last shards are out).
+//! Otherwise the merge would wait for the whole training. A gang of at most one worker may start, because it leaves the
+//! other workers to the merge.
 
+use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use protocol::Digest;
 use protocol::message::Member;
-use protocol::stage::Backend;
 
 use crate::decide::deciding::Deciding;
 use crate::fact::Fact;
 use crate::policy::GrantOrder;
 use crate::state::State;
+use crate::state::evidence;
 use crate::state::execution::{ExecutionState, StageExecution};
 use crate::state::gang::{self, Change};
-use crate::state::task::{Lease, Part, Task};
-use crate::state::worker::Presence;
+use crate::state::queue::{Need, open_member};
+use crate::state::task::{Lease, Task};
+use crate::state::worker::{Presence, Worker};
 
-/// So many gangs idle workers may be asked to prepare for. With more than that, which is sweeps, the others' turn comes later.
+/// Maximum number of gangs that idle workers prepare for. More than that occur in sweeps, where the remaining gangs get
+/// their turn later.
 const OPEN_GANGS: usize = 64;
 
-/// Gives idle workers what is ready.
+/// Assigns ready work to idle workers.
 pub(crate) fn schedule(cx: &mut Deciding<'_>) {
     if cx.state.draining {
         return;
@@ -35,107 +46,133 @@ pub(crate) fn schedule(cx: &mut Deciding<'_>) {
     let is_open = |state: &State, key: &Digest| {
         state.executions.get(key).is_some_and(|execution| execution.state == ExecutionState::Open)
     };
-    // A gang is too large only once another run asks for fewer, which touches it.
+    // A gang becomes too large only if another run asks for fewer workers, which touches its execution.
     for key in cx.touched.clone() {
         if is_open(cx.state, &key) {
             change_gangs(cx, key, |_, _, _| Vec::new());
         }
     }
-    // Mostly everybody is at work, and nothing else is looked at.
+    end_backoffs(cx);
+    // Usually all workers are busy, and nothing else needs checking.
     cx.state.open_gangs = Arc::default();
     if !cx.state.unused.iter().any(|name| cx.state.workers.get(name).is_some_and(|w| w.presence == Presence::Here)) {
         return;
     }
-    let wanted: Vec<Digest> = cx.state.wanted().into_iter().filter(|key| is_open(cx.state, key)).collect();
-    cx.state.visits += wanted.len() as u64;
-    for key in &wanted {
-        small_tasks(cx, *key);
+    while let Some(key) = next_small(cx.state) {
+        cx.state.visits += 1;
+        small_tasks(cx, key);
     }
-    // With a thousand workers at work one does not look for an idle one again for each gang.
-    let some_idle = |key: &Digest| idle(cx.state, &cx.state.executions[key]).next().is_some();
-    let left: Vec<Digest> = wanted.into_iter().filter(some_idle).collect();
-    for key in &left {
+    let prepared = prepared_gangs(cx.state);
+    cx.state.visits += prepared.len() as u64;
+    for key in &prepared {
         change_gangs(cx, *key, fit);
     }
-    for key in &left {
+    for key in &prepared {
         start_gangs(cx, *key);
     }
-    let open = left.iter().filter_map(|key| open_gang(cx.state, *key));
-    cx.state.open_gangs = Arc::new(open.take(OPEN_GANGS).collect());
+    cx.state.open_gangs = Arc::new(open_gangs(cx.state));
+    cx.state.visits += cx.state.open_gangs.len() as u64;
 }
 
-/// A gang task that could take in a worker, and waits for one that is ready.
-fn open_gang(state: &State, key: Digest) -> Option<(Digest, usize)> {
-    let execution = &state.executions[&key];
-    let has_room = |task: &Task| match &task.lease {
-        Lease::Waiting { .. } => true,
-        Lease::Held { holders, drain_by: None, .. } => gang::has_room(holders.len(), execution.range()),
-        Lease::Held { drain_by: Some(_), .. } | Lease::Done { .. } => false,
-    };
-    let place = execution.tasks.iter().position(|task| task.part == Part::Gang && has_room(task))?;
-    Some((key, place))
+/// Makes tasks ready whose back-off has ended.
+fn end_backoffs(cx: &mut Deciding<'_>) {
+    let now = cx.now();
+    let due: Vec<Digest> = cx.state.queue.due(now).collect();
+    for key in due {
+        cx.state.visits += 1;
+        for i in cx.state.executions[&key].tasks.due(now).collect::<Vec<_>>() {
+            cx.change(key, i, |task| task.end_backoff(now));
+        }
+    }
 }
 
-/// Workers that can be given work of an execution and have none, in the order in which they are served.
+/// The first execution with a ready task that an idle worker can take.
+fn next_small(state: &State) -> Option<Digest> {
+    let needs = state.queue.needs().filter(|need| !need.gang && is_met(state, need));
+    let first = needs.filter_map(|need| state.queue.with(need).next()).min();
+    first.map(|(_, key)| key)
+}
+
+fn is_met(state: &State, need: &Need) -> bool {
+    idle_that(state, |worker| need.takes(worker)).next().is_some()
+}
+
+/// Executions that need members and whose inputs an idle worker has.
+fn prepared_gangs(state: &State) -> Vec<Digest> {
+    let tasks = idle_that(state, |_| true).flat_map(|member| &state.workers[&member.worker].ready);
+    let keys = tasks.filter_map(|task| state.place(task).ok()).map(|(key, _)| key);
+    let in_order: BTreeSet<_> = keys.filter_map(|key| Some((state.queue.rank_of_gang(&key)?, key))).collect();
+    in_order.into_iter().map(|(_, key)| key).collect()
+}
+
+/// The first gang tasks that an idle worker could join.
+fn open_gangs(state: &State) -> Vec<(Digest, usize)> {
+    let needs = state.queue.needs().filter(|need| need.gang && is_met(state, need));
+    let mut first: Vec<_> = needs.flat_map(|need| state.queue.with(need).take(OPEN_GANGS)).collect();
+    first.sort_unstable();
+    let keys = first.into_iter().take(OPEN_GANGS).map(|(_, key)| key);
+    keys.filter_map(|key| Some((key, open_member(&state.executions[&key])?))).collect()
+}
+
+/// Idle workers that can take work of an execution, in the order of assignment.
 pub(crate) fn idle<'a>(state: &'a State, execution: &'a StageExecution) -> impl Iterator<Item = Member> + 'a {
+    idle_that(state, move |worker| execution.takes(worker))
+}
+
+fn idle_that<'a>(state: &'a State, takes: impl Fn(&Worker) -> bool + 'a) -> impl Iterator<Item = Member> + 'a {
     let mut names = state.unused.iter();
     let in_order = std::iter::from_fn(move || match state.policy.grants {
         GrantOrder::ByName => names.next(),
         GrantOrder::ByNameBackwards => names.next_back(),
     });
     let known = in_order.filter_map(|name| Some((name, state.workers.get(name)?)));
-    let fit = known.filter(move |(_, worker)| worker.presence == Presence::Here && execution.takes(worker));
+    let fit = known.filter(move |(_, worker)| worker.presence == Presence::Here && takes(worker));
     fit.map(|(name, worker)| worker.member(name))
 }
 
-/// Those of them that have the inputs of a task, and as far as is known the memory for it. All of one instruction set: where nothing
-/// is done yet that binds them to one, that of the most.
+/// Idle workers that have the inputs of a task and, as far as known, enough memory for it. All have the same
+/// instruction set: that of the execution's earlier work, or else the most common one. A shunned worker never joins
+/// others. If only shunned workers are left, one of them starts alone, or as many as the minimum requires.
 fn fit(state: &State, execution: &StageExecution, task: &Task) -> Vec<Member> {
     let fits = |member: &Member| {
         state.workers[&member.worker].ready.contains(&task.id) && !task.too_small.contains(&member.worker)
     };
+    let is_shunned = |member: &Member| state.workers[&member.worker].shunned.is_some();
     let mut by_set: Vec<(&str, Vec<Member>)> = Vec::new();
-    for member in idle(state, execution).filter(fits) {
+    for member in idle(state, execution).filter(fits).filter(|member| !task.is_held() || !is_shunned(member)) {
         let set = state.workers[&member.worker].instruction_set.as_str();
         match by_set.iter_mut().find(|(known, _)| *known == set) {
             Some((_, members)) => members.push(member),
             None => by_set.push((set, vec![member])),
         }
     }
-    // Of equals the first, which has the worker that is served first.
-    by_set.into_iter().rev().max_by_key(|(_, members)| members.len()).map(|(_, members)| members).unwrap_or_default()
+    // In a tie, the first set wins, which has the first worker in the order of assignment.
+    let of_most = by_set.into_iter().rev().max_by_key(|(_, members)| members.len());
+    let (shunned, mut welcome): (Vec<Member>, Vec<Member>) =
+        of_most.map(|(_, members)| members).unwrap_or_default().into_iter().partition(is_shunned);
+    let missing = execution.range().min.max(1).saturating_sub(welcome.len());
+    welcome.extend(shunned.into_iter().take(missing));
+    welcome
 }
 
 fn small_tasks(cx: &mut Deciding<'_>, key: Digest) {
-    let now = cx.now();
-    if is_gang(&cx.state.executions[&key]) || idle(cx.state, &cx.state.executions[&key]).next().is_none() {
-        return;
-    }
-    let waiting: Vec<usize> = cx.state.executions[&key].tasks.waiting().collect();
-    for i in waiting {
-        let execution = &cx.state.executions[&key];
-        let task = &execution.tasks[i];
-        if !task.is_free(now) || !execution.is_ready(task) {
-            continue;
-        }
-        let Some(worker) = idle(cx.state, execution).next() else { return };
+    while let Some(i) = cx.state.executions[&key].tasks.first_ready() {
+        let worker = idle(cx.state, &cx.state.executions[&key]).next();
+        let Some(worker) = worker else { return };
         grant(cx, key, i, vec![worker]);
     }
 }
 
-fn is_gang(execution: &StageExecution) -> bool {
-    execution.tasks.first().is_some_and(|task| task.part == Part::Gang)
-}
-
 fn change_gangs(cx: &mut Deciding<'_>, key: Digest, joiners: impl Fn(&State, &StageExecution, &Task) -> Vec<Member>) {
-    if !is_gang(&cx.state.executions[&key]) {
+    if !cx.state.executions[&key].is_gang() {
         return;
     }
     for i in 0..cx.state.executions[&key].tasks.len() {
         let execution = &cx.state.executions[&key];
         let task = &execution.tasks[i];
         if matches!(task.lease, Lease::Held { drain_by: None, .. }) {
-            match gang::with(task.holders(), &joiners(cx.state, execution, task), execution.range()) {
+            let holds = |member: &Member| evidence::holds(&cx.state.heard.words, task, member).is_some();
+            match gang::with(task.holders(), &joiners(cx.state, execution, task), execution.range(), holds) {
                 Change::Keep | Change::Disband => {}
                 Change::Regroup(members) => cx.regroup(key, i, members),
             }
@@ -145,28 +182,19 @@ fn change_gangs(cx: &mut Deciding<'_>, key: Digest, joiners: impl Fn(&State, &St
 
 fn start_gangs(cx: &mut Deciding<'_>, key: Digest) {
     let now = cx.now();
-    if !is_gang(&cx.state.executions[&key]) {
+    if !cx.state.executions[&key].is_gang() {
         return;
     }
     for i in 0..cx.state.executions[&key].tasks.len() {
         let execution = &cx.state.executions[&key];
         let task = &execution.tasks[i];
         if task.is_free(now)
-            && (execution.range().max == 1 || !merge_is_near(cx.state, execution.backend))
+            && (execution.range().max == 1 || !cx.state.queue.is_sharding(execution.backend))
             && let Some(members) = gang::start(&fit(cx.state, execution, task), execution.range())
         {
             grant(cx, key, i, members);
         }
     }
-}
-
-/// Whether some map stage has only shards out that are being done.
-fn merge_is_near(state: &State, backend: Backend) -> bool {
-    let executions =
-        state.wanted().into_iter().map(|key| &state.executions[&key]).filter(|execution| execution.backend == backend);
-    executions
-        .flat_map(|execution| execution.tasks.held().map(|i| &execution.tasks[i]))
-        .any(|task| matches!(task.part, Part::Shard { .. }))
 }
 
 fn grant(cx: &mut Deciding<'_>, key: Digest, i: usize, holders: Vec<Member>) {

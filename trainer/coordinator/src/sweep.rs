@@ -1,15 +1,15 @@
-//! Swept stages: the tickets of a searcher become stages of the run, and their results go back to the searcher.
+//! Swept stages. Tickets of a searcher become stages of the run, and their results return to the searcher.
 //!
-//! A rung of a trial is two ordinary stages behind those of the pipeline: one that trains, and one that evaluates what it gave. They have
-//! keys like every stage, so whatever was computed before is found, by this run or another. When the searcher has nothing left to ask, the
-//! swept stage is done with the value of its best trial, and the stages that read it go on.
+//! A rung of a trial is two ordinary stages, appended to the pipeline: a training, and an evaluation of its output.
+//! They have keys like every stage, so that values computed earlier by this run or another are found. When the searcher
+//! is complete, the swept stage takes the value of its best trial, and its readers can start.
 //!
-//! | a trial's stage ends with | becomes |
+//! | result of a trial's stage | consequence |
 //! |---|---|
 //! | a finite metric | a result |
-//! | a metric that is not finite, or a failure of its own (diverged, settings, memory, faults) | the worst result: it is stopped |
-//! | a failure of machines or the store | the end of the run, until it is resumed |
-//! | an evaluation without the metric | the end of the run: no other trial will have it either |
+//! | a non-finite metric, or its own failure (diverged, settings, memory, faults) | the worst result: the trial is stopped |
+//! | a failure of machines or the store | the run ends until it is resumed |
+//! | an evaluation without the metric | the run ends: no other trial would have the metric |
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -24,10 +24,10 @@ use crate::state::execution::ExecutionState;
 use crate::state::run::{Run, Status, Sweeping, value};
 use crate::value::Known;
 
-/// What became of a ticket.
+/// The outcome of a ticket.
 enum Found {
     Score(Score, Option<String>),
-    /// The sweep cannot go on.
+    /// The sweep cannot continue.
     End {
         key: Digest,
         message: String,
@@ -35,7 +35,7 @@ enum Found {
 }
 
 impl Deciding<'_> {
-    /// Begins a sweep, or takes it up again.
+    /// Starts or resumes a sweep.
     pub(crate) fn begin_sweep(&mut self, number: u64, j: usize) -> Status {
         if self.state.runs[&number].sweep(j).is_none() {
             self.change_run(number, |run| {
@@ -50,7 +50,7 @@ impl Deciding<'_> {
         Status::Sweeping
     }
 
-    /// Hands results to the searchers of a run, makes the stages that they ask for, and ends sweeps that are over.
+    /// Passes results to the searchers of a run, creates the stages that they request, and concludes complete sweeps.
     pub(crate) fn sweep(&mut self, number: u64) {
         for k in 0..self.state.runs[&number].sweeps.len() {
             let run = &self.state.runs[&number];
@@ -71,7 +71,7 @@ impl Deciding<'_> {
     }
 }
 
-/// Hands what was found to the searcher and makes what it asks for next.
+/// Passes outcomes to the searcher and creates the stages that it requests next.
 fn take_note(run: &mut Run, k: usize, found: Vec<(usize, usize, Found)>) {
     for (ticket, place, found) in found {
         match found {
@@ -96,7 +96,7 @@ fn take_note(run: &mut Run, k: usize, found: Vec<(usize, usize, Found)>) {
     }
 }
 
-/// Makes the stages of tickets that have none yet.
+/// Creates the stages of tickets that have none yet.
 fn unfold(run: &mut Run, k: usize) {
     let first = run.pipeline.stages.len();
     let mut new = Vec::new();
@@ -124,7 +124,7 @@ fn unfold(run: &mut Run, k: usize) {
     }
 }
 
-/// What became of the ticket whose stages are at `place`; `None` while they are under way.
+/// The outcome of the ticket with stages at `place`; `None` while they are in progress.
 fn found(state: &State, run: &Run, sweep: &Sweeping, place: usize) -> Option<Found> {
     let (train, eval) = (&run.stages[place], &run.stages[place + 1]);
     let stage = &run.pipeline.stages[sweep.stage];
@@ -137,10 +137,7 @@ fn found(state: &State, run: &Run, sweep: &Sweeping, place: usize) -> Option<Fou
             Some(ExecutionState::Failed { own: false, .. })
         );
         return Some(if others {
-            Found::End {
-                key,
-                message: format!("a trial was cut short, which says nothing about its settings: {message}"),
-            }
+            Found::End { key, message: format!("a trial was interrupted, but not because of its settings: {message}") }
         } else {
             Found::Score(Score::Failed, Some(message))
         });
@@ -150,7 +147,7 @@ fn found(state: &State, run: &Run, sweep: &Sweeping, place: usize) -> Option<Fou
     let Some(value) = known.metrics.get(metric) else {
         let names: Vec<&str> = known.metrics.keys().map(String::as_str).collect();
         let message = format!(
-            "`metric` of the sweep is `{metric}`, which its evaluation does not give; there is: {}",
+            "`metric` of the sweep is `{metric}`, which its evaluation does not have; there is: {}",
             if names.is_empty() { "nothing".to_owned() } else { names.join(", ") }
         );
         return Some(Found::End { key: *key, message });
@@ -159,7 +156,7 @@ fn found(state: &State, run: &Run, sweep: &Sweeping, place: usize) -> Option<Fou
     Some(Found::Score(score, (score == Score::Failed).then(|| format!("`{metric}` is {value}"))))
 }
 
-/// What the swept stage gives: its best trial.
+/// The final status of the swept stage, with the value of its best trial.
 fn concluded(run: &Run, sweep: &Sweeping) -> Status {
     let made = || sweep.places.iter().flatten().flat_map(|place| [&run.stages[*place], &run.stages[place + 1]]);
     let last = sweep.search.rungs().len() - 1;
@@ -171,7 +168,7 @@ fn concluded(run: &Run, sweep: &Sweeping) -> Status {
         let first = sweep.failures.iter().next();
         let why = first.map(|(trial, why)| format!("; trial {trial}: {why}")).unwrap_or_default();
         let key = made().find_map(Status::key).unwrap_or_else(|| Digest::of(b"no trial began"));
-        let message = format!("none of the {} trials of the sweep got to the end{why}", sweep.search.trials().len());
+        let message = format!("none of the {} trials of the sweep was completed{why}", sweep.search.trials().len());
         return Status::Failed { key, message };
     };
     let (Status::Done { key, known, attempt, .. }, Status::Done { known: evaluated, .. }) =
@@ -259,7 +256,7 @@ impl State {
     }
 }
 
-/// `14 of 24 trials begun, 5 at rung 1, 1 failed`.
+/// Summarises a sweep, such as `14 of 24 trials begun, 5 at rung 1, 1 failed`.
 pub(crate) fn in_words(sweep: &SweepView) -> String {
     let begun = sweep.trials.iter().filter(|trial| trial.state != TrialState::Waiting).count();
     let mut words = format!("{begun} of {} trials begun", sweep.trials.len());

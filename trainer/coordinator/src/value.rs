@@ -1,4 +1,4 @@
-//! What a stage gives.
+//! Values of stages.
 
 use std::collections::BTreeMap;
 
@@ -7,24 +7,24 @@ use protocol::stage::Sampler;
 use protocol::{Digest, StageName};
 use serde::{Deserialize, Serialize};
 
-/// A stage's value as the store knows it.
+/// A stage's value as stored.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Known {
     /// Outputs by name.
     pub outputs: BTreeMap<String, Digest>,
-    /// Final values.
+    /// Final values of metrics, by name.
     pub metrics: BTreeMap<String, f64>,
 }
 
-/// A model that a register stage makes a version of.
+/// A model from which a register stage makes a version.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Candidate {
     /// The stage that made it.
     pub stage: StageName,
-    /// The model as that stage gave it.
+    /// The model's manifest as that stage returned it.
     pub model: Digest,
-    /// How it is drawn from when nobody says otherwise; `None` if nobody measured it.
+    /// Default sampler for generation; `None` if no evaluation measured one.
     pub sampler: Option<Sampler>,
-    /// Parts that are added to it.
+    /// Parts to add to the model.
     pub parts: Parts,
 }

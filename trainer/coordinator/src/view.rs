@@ -1,10 +1,14 @@
-//! What workers and clients are told. Read-only.
+//! Read-only views of the state for workers and clients.
+
+use std::collections::BTreeSet;
 
 use protocol::message::{
     Assignment, DesiredAssignments, Prepare, Progress, Role, RunState, RunView, StageState, StageTask, StageView,
 };
-use protocol::stage::Backend;
-use protocol::{Generation, Incarnation, TaskId, WorkerId, canonical};
+use protocol::pipeline::PipelineStage;
+use protocol::stage::{Backend, Shape};
+use protocol::units::grouped;
+use protocol::{Digest, Generation, Incarnation, StageName, TaskId, WorkerId, canonical};
 use serde::{Deserialize, Serialize};
 
 use crate::rejected::Rejected;
@@ -18,24 +22,23 @@ use crate::time::Millis;
 /// A worker as clients see it: `GET /v1/workers`.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct WorkerView {
-    /// Who.
     pub worker: WorkerId,
-    /// Which process of that name.
+    /// The number of its newest process.
     pub incarnation: Incarnation,
-    /// Its process id.
+    /// The operating system's process id.
     pub pid: u32,
-    /// Where it computes.
+    /// The backend that it computes on.
     pub backend: Backend,
-    /// What its kernels dispatch to, such as `avx512`.
+    /// The instruction set that its kernels use, such as `avx512`.
     pub instruction_set: String,
     /// `idle`, `working`, `unreachable`, `silent` or `gone`.
     pub state: String,
-    /// What it works on.
+    /// The task that it holds.
     pub task: Option<TaskId>,
 }
 
 impl State {
-    /// All workers.
+    /// Views of all workers.
     pub fn worker_views(&self) -> Vec<WorkerView> {
         let view = |(name, worker): (&WorkerId, &Worker)| {
             let task = self.held_by(name).map(|(_, task)| task.id.clone());
@@ -59,50 +62,82 @@ impl State {
         self.workers.iter().map(view).collect()
     }
 
-    /// All that a worker process should be doing.
+    /// The complete set of assignments of a worker process.
     pub fn desired(&self, worker: &WorkerId, incarnation: Incarnation) -> Result<DesiredAssignments, Rejected> {
         let known = self.process(worker, incarnation)?;
         let held = self.held_by(worker).and_then(|(execution, task)| assignment(execution, task, worker, incarnation));
         let assignments: Vec<Assignment> = held.into_iter().collect();
         let held_nothing = assignments.is_empty();
         let leave = self.draining && assignments.is_empty();
-        // A new checkpoint is not news for the worker that made it, so it does not end a wait.
+        // The worker made the new checkpoint itself, so a checkpoint must not end its wait.
         let news: Vec<Assignment> =
             assignments.iter().map(|assignment| Assignment { resume: None, ..assignment.clone() }).collect();
         let prepare = if held_nothing && !self.draining { self.to_prepare(known) } else { Vec::new() };
         let digest = canonical::digest(&(&news, &prepare, leave));
-        // 53 bits, so that no JSON reader rounds it.
+        // 53 bits, which JSON readers with double-precision numbers preserve.
         let version = digest.as_bytes()[..8].iter().fold(0, |number, byte| number << 8 | u64::from(*byte)) >> 11;
         Ok(DesiredAssignments { version, assignments, prepare, leave })
     }
 
-    /// What a worker that has nothing to do should fetch.
+    /// The tasks whose inputs an idle worker should fetch.
     fn to_prepare(&self, worker: &Worker) -> Vec<Prepare> {
-        /// A worker takes one of them in the end.
+        /// Limit, because a worker takes only one of them in the end.
         const AT_ONCE: usize = 8;
         if worker.presence != Presence::Here {
             return Vec::new();
         }
         let open = self.open_gangs.iter().filter_map(|(key, i)| {
             let execution = self.executions.get(key).filter(|execution| execution.takes(worker))?;
-            let task = execution.tasks.get(*i)?;
-            // A member that joins others is handed their state.
+            let task = execution.tasks.get(*i).filter(|task| !task.is_held() || worker.shunned.is_none())?;
+            // A member that joins a running gang gets the state from its peers.
             let resume = if task.is_held() { None } else { task.newest().map(|saved| saved.manifest) };
-            Some(Prepare { task: task.id.clone(), inputs: execution.inputs.clone(), resume })
+            let (inputs, peers) = (execution.artifacts(), task.holders().to_vec());
+            Some(Prepare { task: task.id.clone(), inputs, resume, peers })
         });
         open.take(AT_ONCE).collect()
+    }
+
+    /// The artifacts and checkpoints that a task reads.
+    pub fn read_by(&self, task: &TaskId) -> Result<BTreeSet<Digest>, Rejected> {
+        let (execution, task) = self.task(task)?;
+        let mut read: BTreeSet<Digest> = execution.inputs.values().copied().collect();
+        read.extend(task.checkpoints.iter().map(|saved| saved.manifest));
+        if task.part == Part::Merge {
+            read.extend(execution.shards().unwrap_or_default());
+        }
+        Ok(read)
+    }
+
+    /// The artifacts and checkpoints that a worker may read: those of the task that it holds, or of the tasks that it prepares for.
+    pub fn readable_by(&self, worker: &WorkerId) -> BTreeSet<Digest> {
+        if let Some((_, task)) = self.held_by(worker) {
+            return self.read_by(&task.id).unwrap_or_default();
+        }
+        let prepare = self.workers.get(worker).map(|known| self.to_prepare(known)).unwrap_or_default();
+        prepare.iter().flat_map(|task| task.inputs.values().copied().chain(task.resume)).collect()
     }
 
     /// A run as clients see it at `now`.
     pub fn view(&self, run: &Run, now: Millis) -> RunView {
         let stages = (0..run.stages.len()).map(|i| self.stage_view(run, i, now)).collect();
         let sweeps = run.sweeps.iter().map(|sweep| self.sweep_view(run, sweep)).collect();
-        RunView { run: run.id.clone(), pipeline: run.pipeline.name.clone(), state: run.state, stages, sweeps }
+        RunView {
+            run: run.id.clone(),
+            pipeline: run.pipeline.name.clone(),
+            owner: run.owner.clone(),
+            state: run.state,
+            interrupted: run.is_interrupted(),
+            stages,
+            sweeps,
+            storage: None,
+            times: Default::default(),
+        }
     }
 
     fn stage_view(&self, run: &Run, i: usize, now: Millis) -> StageView {
         let (stage, status) = (&run.pipeline.stages[i], &run.stages[i]);
         let execution = self.execution_of(run, &stage.name).map(|execution| &**execution);
+        let needs: BTreeSet<&StageName> = stage.inputs.iter().map(|input| &input.stage).collect();
         let mut view = StageView {
             name: stage.name.clone(),
             kind: stage.settings.kind().to_owned(),
@@ -116,7 +151,10 @@ impl State {
             workers: Vec::new(),
             instruction_set: execution.and_then(|execution| execution.instruction_set.clone()),
             message: None,
+            wants_workers: None,
             of: stage.derived.as_ref().map(|derived| derived.of.clone()),
+            times: Default::default(),
+            needs: needs.into_iter().cloned().collect(),
         };
         match status {
             Status::Waiting => {}
@@ -139,6 +177,9 @@ impl State {
                     view.progress = self.progress(execution);
                     view.metrics = view.progress.metrics.clone();
                     (view.state, view.message) = self.active(run, execution);
+                    if view.state == StageState::Ready && self.wants_workers(run, execution) {
+                        view.wants_workers = Some(execution.placement.workers.min.max(1));
+                    }
                 }
             }
             Status::Done { how, known, wall_s, attempt, .. } => {
@@ -146,7 +187,7 @@ impl State {
                 view.outputs = known.outputs.clone();
                 view.metrics = known.metrics.clone();
                 (view.wall_s, view.attempt) = (*wall_s, *attempt);
-                view.progress = execution.map(|execution| self.progress(execution)).unwrap_or_default();
+                view.progress = whole(stage, execution.map(|execution| self.progress(execution)).unwrap_or_default());
             }
             Status::Failed { message, .. } => {
                 view.state = StageState::Failed;
@@ -165,37 +206,47 @@ impl State {
         match execution.state {
             ExecutionState::Looking => (StageState::Ready, None),
             ExecutionState::Mending { .. } => {
-                (StageState::Ready, Some("waits for a damaged input to be made again".to_owned()))
+                (StageState::Ready, Some("waits for the recomputation of a damaged input".to_owned()))
             }
             ExecutionState::Bundling => (StageState::Running, None),
             ExecutionState::Open if held => (StageState::Running, None),
+            ExecutionState::Open if run.is_interrupted() || self.draining => {
+                (StageState::Ready, interrupted_at(execution))
+            }
             ExecutionState::Open if run.state == RunState::Paused => (StageState::Ready, Some("paused".to_owned())),
+            ExecutionState::Open if backs_off(execution) => {
+                (StageState::Ready, Some(format!("retries soon (attempt {} failed)", execution.attempt())))
+            }
             ExecutionState::Open => {
-                let backing_off =
-                    execution.tasks.iter().any(|task| matches!(task.lease, Lease::Waiting { not_before: Some(_) }));
-                let waits_for = if backing_off {
-                    format!("tries again soon (attempt {} failed)", execution.attempt())
-                } else {
-                    let min = execution.placement.workers.min.max(1);
-                    let set =
-                        execution.bound_to().map(|set| format!(" with {set}, as those before")).unwrap_or_default();
-                    format!("waits for {min} idle `{}` worker(s){set}", execution.backend.name())
-                };
-                (StageState::Ready, Some(waits_for))
+                let min = execution.placement.workers.min.max(1);
+                let workers = if min == 1 { "worker" } else { "workers" };
+                let set =
+                    execution.bound_to().map(|set| format!(" with {set}, like the earlier ones")).unwrap_or_default();
+                let backend = execution.backend.name();
+                (StageState::Ready, Some(format!("waits for {min} idle `{backend}` {workers}{set}")))
             }
             ExecutionState::Done { .. } | ExecutionState::Failed { .. } => (StageState::Running, None),
         }
     }
 
-    /// How far a work is: its one task, or the sum over its shards while they are done.
+    /// Returns true if a stage could begin and lacks only workers.
+    fn wants_workers(&self, run: &Run, execution: &StageExecution) -> bool {
+        execution.state == ExecutionState::Open
+            && run.state == RunState::Running
+            && !execution.is_busy()
+            && !self.draining
+    }
+
+    /// The progress of an execution. A single task has its newest report, or else its newest checkpoint. Several tasks
+    /// have the number of completed shards.
     pub fn progress(&self, execution: &StageExecution) -> Progress {
         let of = |task: &Task| self.heard.progress.get(&task.id).map(|progress| Progress::clone(progress));
         let shards = execution.tasks.iter().filter(|task| matches!(task.part, Part::Shard { .. })).count();
         let done =
             execution.tasks.iter().filter(|task| matches!(task.part, Part::Shard { .. }) && task.output().is_some());
-        match &*execution.tasks {
-            [] => Progress::default(),
-            [task] => of(task).unwrap_or_default(),
+        match (execution.tasks.len(), execution.tasks.first()) {
+            (_, None) => Progress::default(),
+            (1, Some(task)) => of(task).unwrap_or_else(|| saved(task, execution)),
             _ => Progress {
                 done: done.count() as u64,
                 total: shards as u64,
@@ -204,6 +255,52 @@ impl State {
             },
         }
     }
+}
+
+fn backs_off(execution: &StageExecution) -> bool {
+    execution.tasks.iter().any(|task| matches!(task.lease, Lease::Waiting { not_before: Some(_) }))
+}
+
+/// The progress of a training according to its newest checkpoint.
+fn saved(task: &Task, execution: &StageExecution) -> Progress {
+    match (task.newest(), execution.settings.training()) {
+        (Some(saved), Some(training)) => {
+            Progress { done: saved.step, total: training.end().0, unit: "steps".to_owned(), ..Progress::default() }
+        }
+        (None, _) | (_, None) => Progress::default(),
+    }
+}
+
+/// Describes the point at which interrupted work continues; `None` if it had not started.
+fn interrupted_at(execution: &StageExecution) -> Option<String> {
+    let shards = execution.tasks.iter().filter(|task| matches!(task.part, Part::Shard { .. }));
+    let (total, done) =
+        shards.fold((0, 0), |(total, done), task| (total + 1, done + u64::from(task.output().is_some())));
+    if total > 0 && done > 0 {
+        return Some(format!("interrupted at {done} of {total} shards"));
+    }
+    let saved = execution.tasks.iter().find_map(Task::newest).map(|saved| grouped(saved.step));
+    match (saved, execution.settings.training()) {
+        (Some(step), Some(training)) => Some(format!("interrupted at {step} of {} steps", grouped(training.end().0))),
+        (Some(step), None) => Some(format!("interrupted at step {step}")),
+        (None, _) if execution.attempt().0 > 0 => Some("interrupted before anything was saved".to_owned()),
+        (None, _) => None,
+    }
+}
+
+/// The progress of a finished stage. The newest report is older than the stage's end, and a short stage may have none.
+fn whole(stage: &PipelineStage, reported: Progress) -> Progress {
+    let mut progress = reported;
+    if progress.total == 0 {
+        let (total, unit) = match (stage.settings.training(), stage.settings.shape()) {
+            (Some(training), _) => (training.end().0, "steps"),
+            (None, Shape::Map) => (u64::from(stage.settings.shards()), "shards"),
+            (None, Shape::Gang | Shape::Plain | Shape::Registry) => (0, ""),
+        };
+        (progress.total, progress.unit) = (total, unit.to_owned());
+    }
+    progress.done = progress.total;
+    progress
 }
 
 fn workers(execution: &StageExecution) -> Vec<WorkerId> {
@@ -222,6 +319,7 @@ fn assignment(
     }
     let role = match task.part {
         Part::Alone => Role::Alone,
+        Part::Resolve => Role::Resolve,
         Part::Shard { index, of } => Role::Shard { index, of },
         Part::Merge => Role::Merge { shards: execution.shards().unwrap_or_default() },
         Part::Gang => {
@@ -230,6 +328,7 @@ fn assignment(
     };
     Some(Assignment {
         grant: task.grant_of(worker, incarnation),
+        secret: String::new(),
         stage: StageTask {
             run: execution.run.clone(),
             name: execution.keyed_as.clone(),

@@ -1,4 +1,4 @@
-//! Who is let in, and what those who are not can cost: tokens, scopes, names, TLS, and crowds of strangers.
+//! Access control, and the cost of unauthorised callers: tokens, scopes, host names, TLS, and anonymous connections.
 #![allow(clippy::unwrap_used, clippy::print_stdout, reason = "a test may panic, and prints what it measured")]
 
 use std::io::{Read, Write};
@@ -32,13 +32,13 @@ fn token(scope: Scope) -> String {
     format!("token-of-one-who-may-{scope}")
 }
 
-/// One request as it is written; the status and the body of its answer.
+/// Sends a raw request; returns the status and body of its answer.
 fn exchange(address: SocketAddr, request: &str) -> (u16, Vec<u8>) {
     let mut stream = TcpStream::connect(address).unwrap();
     stream.set_read_timeout(Some(Duration::from_secs(20))).unwrap();
     stream.write_all(request.as_bytes()).unwrap();
     let mut answer = Vec::new();
-    // Refused requests end with a reset where the server left a body unread.
+    // A refused request ends with a reset if the server left its body unread.
     let _ = stream.read_to_end(&mut answer);
     let text = String::from_utf8_lossy(&answer);
     let status = text.get(9..12).unwrap_or_else(|| panic!("no answer to {request}")).parse().unwrap();
@@ -56,20 +56,20 @@ fn bearer(token: &str) -> String {
     format!("authorization: Bearer {token}\r\n{JSON}")
 }
 
-/// The whole table, written once more: who changes a route's scopes changes them here, and knows.
+/// The expected scopes of all routes. A change of a route's scopes must be repeated here, so that it cannot be
+/// accidental.
 fn expected(method: &str, path: &str) -> &'static [Scope] {
     use Scope::{Admin, Promote, Read, Submit, Worker};
     match (method, path) {
-        ("GET", "/v1/runs" | "/v1/runs/{run}" | "/v1/runs/{run}/logs" | "/v1/runs/{run}/metrics" | "/v1/workers") => {
-            &[Read]
-        }
-        ("POST", "/v1/runs" | "/v1/runs/{run}/{action}") => &[Submit],
+        ("GET", "/v1/runs" | "/v1/runs/{run}" | "/v1/runs/{run}/logs" | "/v1/runs/{run}/metrics") => &[Read],
+        ("GET", "/metrics" | "/v1/metrics" | "/v1/history" | "/v1/workers") => &[Read],
+        ("GET" | "POST" | "DELETE", "/v1/session") => &[Read],
+        ("POST", "/v1/runs" | "/v1/runs/{run}/{action}" | "/v1/bundles") => &[Submit],
         ("POST", "/v1/workers" | "/v1/workers/{worker}/poll" | "/v1/workers/{worker}/gone") => &[Worker],
         ("POST", "/v1/metrics" | "/v1/logs" | "/v1/checkpoints" | "/v1/outcomes") => &[Worker],
         ("GET", "/v1/blobs/{digest}") => &[Read, Worker],
         ("PUT", "/v1/blobs/{digest}") | ("GET", "/v1/blobs/{digest}/staged") => &[Worker],
         ("POST", "/v1/registry") => &[Read, Promote, Admin],
-        ("POST", "/v1/bundles") => &[Promote],
         other => panic!("{other:?} is not in this table: say who may call it"),
     }
 }
@@ -90,7 +90,7 @@ async fn every_route_is_open_to_its_scopes_and_to_nobody_else() {
             assert_eq!(call(address, route.method, &path, headers, "").0, 401, "{} {path} {headers}", route.method);
         }
         for scope in Scope::ALL {
-            // Nothing that parses: a caller who is let in is told so.
+            // The body does not parse, so that an admitted caller gets an error about it.
             let (status, body) = call(address, route.method, &path, &bearer(&token(scope)), "?");
             let may = needed.iter().any(|needed| Scopes::of(&[scope]).allow(*needed));
             let shown = format!("{} {path} as {scope}: {status} {}", route.method, String::from_utf8_lossy(&body));
@@ -142,7 +142,7 @@ async fn each_command_of_the_registry_asks_for_its_scope_and_moves_bear_the_toke
             }
         }
     }
-    // Fields of another build, such as a name that the client would like to have, change nothing.
+    // Fields of another build, such as a name that the client would like to use, have no effect.
     let body = r#"{"command": "list", "actor": "root"}"#;
     assert_eq!(call(handle.address(), "POST", "/v1/registry", &bearer(&token(Scope::Read)), body).0, 200);
     handle.shutdown().await;
@@ -166,7 +166,7 @@ async fn what_a_browser_was_made_to_send_is_refused() {
         assert_eq!(ask(&format!("host: {fine}\r\n")), 200, "{fine}");
         assert_eq!(ask(&format!("host: {fine}\r\norigin: http://{fine}\r\n")), 200, "{fine}");
     }
-    // A name that was rebound to our address, and no name at all.
+    // A name rebound to our address, and no name at all.
     for other in ["evil.example", "evil.example:7700", "localhost.evil.example", ""] {
         assert_eq!(ask(&format!("host: {other}\r\n")), 421, "{other}");
     }
@@ -205,7 +205,7 @@ async fn bodies_beyond_their_limit_are_refused_before_they_are_read() {
         let answer = exchange(handle.address(), &format!("{head}content-length: {}\r\n\r\n", bytes + 1));
         assert_eq!(answer.0, 413, "{path}");
     }
-    // One that does not say how long it is.
+    // A body of unknown length.
     let part = "8000\r\n".to_owned() + &" ".repeat(0x8000) + "\r\n";
     let head = format!("POST /v1/workers HTTP/1.1\r\nhost: localhost\r\nconnection: close\r\n{headers}");
     let answer = exchange(handle.address(), &format!("{head}transfer-encoding: chunked\r\n\r\n{}", part.repeat(34)));

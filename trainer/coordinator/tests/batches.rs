@@ -1,7 +1,7 @@
-//! What is decided together, what the store refuses, and who is answered when, without a disk.
+//! Batches without a disk: common decisions, refusals of the store, and the order of answers.
 
 use coordinator::batch::{Ask, Batches, Done, Turn};
-use coordinator::state::worker::Presence;
+use coordinator::state::worker::{Identity, Presence};
 use coordinator::{Effect, Event, Millis, Moment, Observation, Policy, Refused, State};
 use protocol::message::{Join, PROTOCOL_VERSION, Poll};
 use protocol::stage::Backend;
@@ -17,7 +17,13 @@ fn at(now: u64) -> impl FnMut() -> Moment {
 fn submit() -> Ask {
     let pipeline = protocol::pipeline::read("p.yaml", TEXT, &[]).expect("a pipeline");
     let (pipeline, source) = (Box::new(pipeline), TEXT.to_owned());
-    Ask::Event(Box::new(Event::Submit { pipeline, source, idempotency_key: None, until: None }))
+    Ask::Event(Box::new(Event::Submit {
+        pipeline,
+        source,
+        idempotency_key: None,
+        until: None,
+        owner: protocol::Owner::local("me"),
+    }))
 }
 
 fn join(name: &str) -> Ask {
@@ -29,7 +35,8 @@ fn join(name: &str) -> Ask {
         instruction_set: "avx2".into(),
         peer_address: format!("{name}:1"),
     };
-    Ask::Event(Box::new(Event::Join { join }))
+    let by = Identity { caller: "t".into(), secret: Digest::of(name.as_bytes()) };
+    Ask::Event(Box::new(Event::Join { join, by }))
 }
 
 fn poll(incarnation: Incarnation) -> Poll {
@@ -54,14 +61,14 @@ fn over(turn: Turn<&'static str>) -> Done<&'static str> {
     }
 }
 
-/// One ask, decided and stored.
+/// Decides and stores a single request.
 fn taken(batches: &mut Batches<&'static str>, now: u64, ask: Ask) -> Vec<Effect> {
     batches.ask(ask, "alone");
     to_store(batches.decide(at(now)));
     over(batches.stored(Ok(()), at(now))).answers.remove(0).1.expect("taken")
 }
 
-/// A worker that has joined at time 0.
+/// A worker that joined at time 0.
 fn with_a_worker() -> (Batches<&'static str>, Incarnation) {
     let mut batches = Batches::new(State::new(Policy::default()));
     let joined = taken(&mut batches, 0, join("a")).into_iter().find_map(|effect| match effect {
@@ -86,7 +93,7 @@ fn what_is_refused_together_is_tried_alone_and_only_one_is_at_fault() {
     to_store(batches.decide(at(1)));
     let second = over(batches.stored(Ok(()), at(1)));
     assert!(matches!(&second.answers[..], [("second", Ok(_))]) && second.durable, "{second:?}");
-    assert_eq!(batches.front().state().runs.len(), 1);
+    assert_eq!(batches.front().state().runs.size(), 1);
     assert!(matches!(batches.decide(at(1)), Turn::Idle));
 }
 
@@ -100,8 +107,9 @@ fn nobody_sees_what_is_not_stored_and_quiet_polls_do_not_wait_for_it() {
     let asked = batches.front().poll(Millis(9_000), worker.clone(), poll(incarnation)).expect("known");
     assert!(asked.is_none(), "answered beside the queue");
     assert_eq!(over(batches.stored(Ok(()), at(9_500))).answers.len(), 1);
-    assert_eq!(batches.front().state().runs.len(), 1);
-    // What was noted counts before the clock does: 15 s after it began, but 7 s after the poll, the lease is good.
+    assert_eq!(batches.front().state().runs.size(), 1);
+    // Noted polls are applied before the tick. 15 s have passed since the join, but only 7 s since the poll, so the
+    // lease is valid.
     batches.ask(Ask::Observation(Observation::Tick { overslept: 0 }, Millis(16_000)), "tick");
     over(batches.decide(at(16_000)));
     assert_eq!(batches.state().workers[&worker].presence, Presence::Here);

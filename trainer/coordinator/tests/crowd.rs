@@ -1,4 +1,5 @@
-//! What strangers cost those who work: a thousand connections that say nothing, heads that come byte by byte, and large bodies.
+//! Effects of anonymous connections on workers: a thousand idle connections, requests sent byte by byte, and large
+//! bodies.
 #![allow(clippy::unwrap_used, clippy::print_stdout, reason = "a test may panic, and prints what it measured")]
 
 use std::io::{Read, Write};
@@ -10,6 +11,7 @@ use std::time::{Duration, Instant};
 
 use coordinator::{Config, Connections, Coordinator, Handle, Policy};
 use protocol::message::{DesiredAssignments, Join, Joined, PROTOCOL_VERSION, Poll};
+use protocol::proof::SECRET_HEADER;
 use protocol::stage::Backend;
 use registry::{Holder, Store};
 
@@ -20,7 +22,10 @@ async fn start(dir: &std::path::Path, connections: Connections) -> Handle {
     Coordinator::start(store, Config { policy, connections, ..Config::embedded() }).await.unwrap()
 }
 
-/// A connection that is kept, of somebody with a token.
+/// The worker's secret.
+const SECRET: &str = "the-secret-of-a-worker-of-this-test";
+
+/// A persistent connection with a token.
 struct Known {
     stream: TcpStream,
     token: String,
@@ -37,6 +42,7 @@ impl Known {
     fn post<T: serde::de::DeserializeOwned>(&mut self, path: &str, body: &impl serde::Serialize) -> T {
         let body = serde_json::to_string(body).unwrap();
         let head = format!("authorization: Bearer {}\r\ncontent-type: application/json\r\n", self.token);
+        let head = format!("{head}{SECRET_HEADER}: {SECRET}\r\n");
         let head = format!("POST {path} HTTP/1.1\r\nhost: localhost\r\n{head}content-length: {}\r\n\r\n", body.len());
         self.stream.write_all((head + &body).as_bytes()).unwrap();
         let mut answer = Vec::new();
@@ -70,15 +76,15 @@ fn join(handle: &Handle) -> (Known, Joined) {
     (known, joined)
 }
 
-/// How long heartbeats took on a connection that is kept, those of workers that come, and as many bytes to a thread that only
-/// sends them back: what the machine itself makes of it. Sorted.
+/// Sorted latencies of heartbeats on a persistent connection, of heartbeats on new connections, and of an echo thread.
+/// The echo measures the load of the machine itself.
 struct Times {
     kept: Vec<Duration>,
     new: Vec<Duration>,
     echo: Vec<Duration>,
 }
 
-/// A connection to a thread that sends back what it gets.
+/// A connection to a thread that returns its input.
 fn echo() -> TcpStream {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let stream = TcpStream::connect(listener.local_addr().unwrap()).unwrap();
@@ -92,7 +98,7 @@ fn echo() -> TcpStream {
     stream
 }
 
-/// Heartbeats until `until`, each answered at once because it says another version than the newest.
+/// Sends heartbeats until `until`. Each is answered at once, because its version is never current.
 fn beat(handle: &Handle, until: Instant) -> Times {
     let (mut known, joined) = join(handle);
     let poll = Poll { incarnation: joined.incarnation, doing: vec![], ready: vec![], version: u64::MAX };
@@ -128,7 +134,7 @@ fn check(what: &str, times: &Times) {
         "{what}: {} heartbeats, median {p50:.1?}, p99 {p99:.1?}, over new connections {new:.1?}; an echo's p99 is {echo:.1?}",
         times.kept.len()
     );
-    // A machine with more to do than it can delays everybody.
+    // An overloaded machine delays all connections.
     assert!(p99 < Duration::from_millis(100) + 4 * echo, "{what}: {p99:?}");
     assert!(new < Duration::from_secs(2), "{what}, over new connections: {new:?}");
 }
@@ -139,7 +145,7 @@ fn resident_mib() -> usize {
     line.trim().trim_end_matches(" kB").parse::<usize>().unwrap() / 1024
 }
 
-/// Does `work` again and again in so many threads until the stop.
+/// Repeats `work` in `size` threads until `stop`.
 fn crowd(size: usize, stop: &Arc<AtomicBool>, work: impl Fn() + Send + Sync + 'static) -> Vec<thread::JoinHandle<()>> {
     let work = Arc::new(work);
     let one = |_| {
@@ -156,8 +162,8 @@ fn crowd(size: usize, stop: &Arc<AtomicBool>, work: impl Fn() + Send + Sync + 's
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_crowd_of_strangers_delays_no_heartbeat() {
     let dir = tempfile::tempdir().unwrap();
-    // As with a limit of two hundred descriptors or so.
-    let few = Connections { most: 100, strangers: 50, idle: Duration::from_secs(20) };
+    // Roughly the limits for 200 file descriptors.
+    let few = Connections { most: 100, anonymous: 50, ..Connections::default() };
     let handle = Arc::new(start(dir.path(), few).await);
     let address = handle.address();
     let before = resident_mib();
@@ -179,7 +185,7 @@ async fn a_crowd_of_strangers_delays_no_heartbeat() {
     let times = beat(&handle, Instant::now() + Duration::from_secs(2));
     check("and 64 slow strangers", &times);
 
-    // Nobody's bodies: refused unread. Those of somebody with a token and no grant: read within bounds.
+    // Bodies of anonymous callers are refused unread. Bodies with a token but without a grant are read within limits.
     let sent = Arc::new(AtomicUsize::new(0));
     let body = Arc::new(vec![b' '; 8 << 20]);
     let token = handle.token().secret().to_owned();
@@ -190,7 +196,7 @@ async fn a_crowd_of_strangers_delays_no_heartbeat() {
             let head =
                 format!("POST /v1/metrics HTTP/1.1\r\nhost: localhost\r\n{headers}content-type: application/json\r\n");
             let head = format!("{head}content-length: {}\r\n\r\n", body.len());
-            // Refused at the first bytes, or read to the end and then found to be nothing.
+            // The body is refused at its first bytes, or read to the end and then refused.
             let _ = stream.write_all(head.as_bytes());
             for part in body.chunks(64 << 10) {
                 if stream.write_all(part).is_err() {
@@ -217,25 +223,25 @@ async fn a_crowd_of_strangers_delays_no_heartbeat() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn silent_connections_end_and_known_ones_are_not_evicted() {
     let dir = tempfile::tempdir().unwrap();
-    let limits = Connections { most: 20, strangers: 4, idle: Duration::from_secs(4) };
+    let limits = Connections { most: 20, anonymous: 4, idle: Duration::from_secs(4), ..Connections::default() };
     let handle = start(dir.path(), limits).await;
     let (mut known, joined) = join(&handle);
     let poll = Poll { incarnation: joined.incarnation, doing: vec![], ready: vec![], version: u64::MAX };
 
-    // The fifth stranger takes the place of the first.
-    let mut strangers: Vec<TcpStream> = (0..5).map(|_| TcpStream::connect(handle.address()).unwrap()).collect();
+    // The fifth anonymous connection replaces the first.
+    let mut anonymous: Vec<TcpStream> = (0..5).map(|_| TcpStream::connect(handle.address()).unwrap()).collect();
     let ended = |stream: &mut TcpStream, within: Duration| {
         stream.set_read_timeout(Some(within)).unwrap();
-        // The end, or a reset.
+        // Either the end of the stream or a reset.
         !stream
             .read(&mut [0; 64])
             .is_err_and(|e| matches!(e.kind(), std::io::ErrorKind::WouldBlock | std::io::ErrorKind::TimedOut))
     };
-    assert!(ended(&mut strangers[0], Duration::from_secs(3)), "the oldest goes at once");
+    assert!(ended(&mut anonymous[0], Duration::from_secs(3)), "the oldest goes at once");
     known.post::<DesiredAssignments>("/v1/workers/w/poll", &poll);
-    assert!(ended(&mut strangers[4], Duration::from_secs(20)), "silence ends");
+    assert!(ended(&mut anonymous[4], Duration::from_secs(20)), "silence ends");
 
-    // All connections are of people who are known: one more is told so, and they keep theirs.
+    // All connections are authenticated: another one is refused, and the existing ones stay open.
     drop(known);
     let come = |_| {
         let mut one = Known::connect(&handle);
@@ -244,7 +250,7 @@ async fn silent_connections_end_and_known_ones_are_not_evicted() {
     };
     let mut all: Vec<Known> = (0..20).map(come).collect();
     let answer = one_more(handle.address());
-    assert!(answer.starts_with("HTTP/1.1 503") && answer.contains("as many connections"), "{answer}");
+    assert!(answer.starts_with("HTTP/1.1 503") && answer.contains("limit of connections"), "{answer}");
     all[0].post::<DesiredAssignments>("/v1/workers/w/poll", &poll);
     handle.shutdown().await;
 }

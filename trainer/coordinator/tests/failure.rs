@@ -1,4 +1,5 @@
-//! A panic in the actor: those who wait and those who come are told at once, and the next coordinator goes on from what was acknowledged.
+//! A panic in the actor: waiting and new callers get an error at once, and the next coordinator continues acknowledged
+//! work.
 
 #[path = "common/shell.rs"]
 mod shell;
@@ -7,13 +8,14 @@ use std::time::Duration;
 
 use coordinator::{Refused, Trouble};
 use protocol::message::{Joined, Poll};
-use reqwest::{Method, Response};
+use protocol::proof::SECRET_HEADER;
+use reqwest::{Method, RequestBuilder, Response};
 
-use self::shell::{TestResult, offer, start, submission};
+use self::shell::{SECRET, TestResult, offer, start, submission};
 
-/// Much shorter than any wait of the coordinator's own: a poll's is 2 s by default, here a minute.
+/// Much shorter than any wait of the coordinator: a poll waits 2 s by default, and a minute here.
 const AT_ONCE: Duration = Duration::from_secs(10);
-/// A poll waits for so many milliseconds.
+/// Longest wait of a poll in milliseconds.
 const POLL_MS: u64 = 60_000;
 
 async fn is_refused(answer: Result<Response, reqwest::Error>, what: &str) -> TestResult {
@@ -25,18 +27,23 @@ async fn is_refused(answer: Result<Response, reqwest::Error>, what: &str) -> Tes
     Ok(())
 }
 
+fn as_worker(request: RequestBuilder) -> RequestBuilder {
+    request.header(SECRET_HEADER, SECRET)
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn a_panic_of_the_actor_is_told_to_everybody_at_once() -> TestResult {
     let dir = tempfile::tempdir()?;
     let (handle, server) = start(dir.path(), POLL_MS).await?;
     let run = handle.submit(submission()?).await?;
-    let joined: Joined = server.request(Method::POST, "/v1/workers").json(&offer()).send().await?.json().await?;
-    // The first poll knows of nothing and is answered; the next one has nothing new to hear and waits.
+    let joined: Joined =
+        as_worker(server.request(Method::POST, "/v1/workers")).json(&offer()).send().await?.json().await?;
+    // The first poll has no version and is answered at once; the next one has the current version and waits.
     let poll = |version| Poll { incarnation: joined.incarnation, doing: Vec::new(), ready: Vec::new(), version };
     let path = "/v1/workers/a/poll";
     let mut version = 0;
     let waiting = loop {
-        let answer = server.request(Method::POST, path).json(&poll(version)).send();
+        let answer = as_worker(server.request(Method::POST, path)).json(&poll(version)).send();
         let mut answer = tokio::spawn(answer);
         match tokio::time::timeout(Duration::from_millis(500), &mut answer).await {
             Ok(answer) => {
@@ -53,7 +60,8 @@ async fn a_panic_of_the_actor_is_told_to_everybody_at_once() -> TestResult {
         let refused = handle.submit(submission()?).await;
         assert!(matches!(&refused, Err(Refused::Failed(why)) if why.contains("made up")), "{refused:?}");
         is_refused(waiting.await?, "the poll that waited").await?;
-        is_refused(server.request(Method::POST, path).json(&poll(version)).send().await, "the next poll").await?;
+        is_refused(as_worker(server.request(Method::POST, path)).json(&poll(version)).send().await, "the next poll")
+            .await?;
         is_refused(server.request(Method::POST, "/v1/runs").json(&submission()?).send().await, "a submission").await?;
         is_refused(server.request(Method::GET, "/v1/runs").send().await, "a look").await?;
         is_refused(server.request(Method::GET, "/v1/health").send().await, "a question how it is").await?;

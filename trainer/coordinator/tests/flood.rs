@@ -1,4 +1,5 @@
-//! Too much at once: what does not fit into the queues is told to come again, heartbeats pass by, and what was taken is done.
+//! Overload: calls that exceed a queue are refused temporarily, heartbeats are not delayed, and accepted calls are
+//! completed.
 
 #[path = "common/shell.rs"]
 mod shell;
@@ -8,31 +9,34 @@ use std::time::{Duration, Instant};
 use access::Server;
 use coordinator::Handle;
 use fail::FailScenario;
-use protocol::message::{Grant, Join, Joined, MetricBatch, MetricRow, Poll};
-use protocol::{Attempt, Fence, Incarnation, limits};
+use protocol::limits;
+use protocol::message::{DesiredAssignments, Join, Joined, MetricBatch, MetricRow, Poll};
+use protocol::proof::SECRET_HEADER;
 use reqwest::{Method, StatusCode};
 use tokio::task::JoinSet;
 
-use self::shell::{TestResult, offer, start, submission};
+use self::shell::{SECRET, TestResult, offer, start, submission};
 
 /// A client of a coordinator.
 struct Caller {
     handle: Handle,
     server: Server,
+    /// The secret that its calls show.
+    secret: String,
 }
 
 impl Caller {
     async fn start(dir: &std::path::Path) -> TestResult<Self> {
         let (handle, server) = start(dir, 1).await?;
-        Ok(Self { handle, server })
+        Ok(Self { handle, server, secret: SECRET.to_owned() })
     }
 
     fn post(&self, path: &str, body: &impl serde::Serialize) -> reqwest::RequestBuilder {
-        self.server.request(Method::POST, path).json(body)
+        self.server.request(Method::POST, path).header(SECRET_HEADER, &self.secret).json(body)
     }
 
-    /// Sends more of a call at once than `wait`, of which the server can do none as long as `point` stands still, and lets it go once
-    /// all that are too many were told to come again.
+    /// Sends 40 calls more than the `wait` that fit into the queue, while the server is paused at `point`. Resumes the
+    /// server after the excess calls are refused.
     async fn flood(&self, path: &str, body: &impl serde::Serialize, wait: usize, point: &str) -> TestResult {
         const TOO_MANY: usize = 40;
         let mut calls = JoinSet::new();
@@ -80,7 +84,7 @@ async fn a_flood_of_submissions_fills_a_short_queue_and_delays_no_heartbeat() ->
     let (flood, beats) = tokio::join!(flood, beats);
     beats?;
     flood?;
-    // The worker's place in the queue is its own.
+    // Workers do not use the clients' queue.
     assert!(caller.post("/v1/workers", &Join { worker: "b".into(), ..join }).send().await?.status().is_success());
     caller.handle.shutdown().await;
     scenario.teardown();
@@ -91,15 +95,18 @@ async fn a_flood_of_submissions_fills_a_short_queue_and_delays_no_heartbeat() ->
 async fn a_flood_of_values_is_told_to_come_again() -> TestResult {
     let scenario = FailScenario::setup();
     let dir = tempfile::tempdir()?;
-    let caller = Caller::start(dir.path()).await?;
-    // Of a task that left memory long ago: the store alone can say that it is none.
-    let grant = Grant {
-        task: "r-1/gone".into(),
-        attempt: Attempt(1),
-        fence: Fence(1),
-        worker: "a".into(),
-        incarnation: Incarnation(1),
+    let mut caller = Caller::start(dir.path()).await?;
+    caller.handle.submit(submission()?).await?;
+    let joined: Joined = caller.post("/v1/workers", &offer()).send().await?.json().await?;
+    let poll = Poll { incarnation: joined.incarnation, doing: Vec::new(), ready: Vec::new(), version: 0 };
+    let assignment = loop {
+        let desired: DesiredAssignments = caller.post("/v1/workers/a/poll", &poll).send().await?.json().await?;
+        if let Some(assignment) = desired.assignments.into_iter().next() {
+            break assignment;
+        }
     };
+    caller.secret = assignment.secret;
+    let grant = assignment.grant;
     let batch = MetricBatch { grant, rows: vec![MetricRow { step: 1, key: "loss".into(), value: 1.0 }] };
     fail::cfg("db::before_commit", "pause")?;
     caller.flood("/v1/metrics", &batch, limits::BATCHES_WAITING, "db::before_commit").await?;

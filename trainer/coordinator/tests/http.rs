@@ -1,4 +1,4 @@
-//! The server over a real socket and a real store, with a worker that does not compute.
+//! The server over a real socket with a real store, and a worker that does not compute.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -7,10 +7,11 @@ use axum::body::Body;
 use axum::http::{Request, StatusCode};
 use coordinator::{Config, Control, Coordinator, Handle, Policy};
 use protocol::message::{
-    ApiError, CommitCheckpoint, DesiredAssignments, Doing, Grant, Join, Joined, LogBatch, MetricBatch, MetricRow,
-    PROTOCOL_VERSION, Poll, Progress, ReportOutcome, RunState, StageState, Submit, TaskOutcome,
+    ApiError, Assignment, CommitCheckpoint, DesiredAssignments, Doing, Grant, Join, Joined, LogBatch, MetricBatch,
+    MetricRow, PROTOCOL_VERSION, Poll, Progress, ReportOutcome, RunState, StageState, Submit, TaskOutcome,
 };
 use protocol::pipeline::{Pipeline, PipelineStage, StageInput};
+use protocol::proof::{BlobStored, GRANT_HEADER, RECEIPT_HEADER, SECRET_HEADER, Vouched};
 use protocol::stage::{Backend, DataSynthetic, Placement, StageSettings, TrainVae};
 use protocol::{ArtifactKind, Digest, Manifest, RunId, Seed};
 use registry::{Holder, Store};
@@ -21,13 +22,28 @@ use tokio::net::TcpStream;
 
 type TestResult<T = ()> = Result<T, Box<dyn std::error::Error>>;
 
-/// The smallest HTTP client that will do: one request, one connection.
+/// A minimal HTTP client with one connection per request.
 struct Client {
     address: std::net::SocketAddr,
     token: Option<String>,
+    /// The secret of a process or of a grant, which its calls show.
+    secret: String,
 }
 
+/// The secret of every process in these tests.
+const SECRET: &str = "the-secret-of-each-process-of-these-tests";
+
 impl Client {
+    fn of(handle: &Handle) -> Self {
+        let token = Some(handle.token().secret().to_owned());
+        Self { address: handle.address(), token, secret: SECRET.to_owned() }
+    }
+
+    /// The same client, using the secret of a grant.
+    fn under(&self, assignment: &Assignment) -> Self {
+        Self { secret: assignment.secret.clone(), token: self.token.clone(), ..*self }
+    }
+
     async fn send(&self, request: Request<Body>) -> TestResult<(StatusCode, Vec<u8>)> {
         let (parts, body) = request.into_parts();
         let body = axum::body::to_bytes(body, usize::MAX).await?;
@@ -36,6 +52,7 @@ impl Client {
         if let Some(token) = &self.token {
             head += &format!("authorization: Bearer {token}\r\n");
         }
+        head += &format!("{SECRET_HEADER}: {}\r\n", self.secret);
         for (name, value) in &parts.headers {
             head += &format!("{name}: {}\r\n", value.to_str()?);
         }
@@ -66,19 +83,27 @@ impl Client {
         Ok((status.as_u16(), serde_json::from_slice(&bytes)?))
     }
 
-    async fn put_blob(&self, grant: &Grant, bytes: &[u8]) -> TestResult<Digest> {
+    /// Uploads a blob and returns its receipt.
+    async fn put_blob(&self, grant: &Grant, bytes: &[u8]) -> TestResult<Receipt> {
         let request = Request::builder().method("PUT").uri(format!("/v1/blobs/{}", Digest::of(bytes)));
-        let request = request.header("x-stride-grant", serde_json::to_string(grant)?);
+        let request = request.header(GRANT_HEADER, serde_json::to_string(grant)?);
         let request = request.header("x-stride-bytes", bytes.len());
         let (status, answer) = self.send(request.body(Body::from(bytes.to_vec()))?).await?;
         assert!(status.is_success(), "{status} {}", String::from_utf8_lossy(&answer));
-        let stored: coordinator::shell::BlobStored = serde_json::from_slice(&answer)?;
-        Ok(stored.digest)
+        let stored: BlobStored = serde_json::from_slice(&answer)?;
+        Ok((stored.digest, stored.receipt.ok_or("a stored blob has a receipt")?))
     }
 
-    async fn put_manifest(&self, grant: &Grant, kind: ArtifactKind, name: &str) -> TestResult<Digest> {
+    async fn put_manifest(&self, grant: &Grant, kind: ArtifactKind, name: &str) -> TestResult<Receipt> {
         self.put_blob(grant, &Manifest::new(kind, serde_json::json!({"name": name})).to_bytes()).await
     }
+}
+
+/// A blob and the proof of its upload.
+type Receipt = (Digest, String);
+
+fn vouched<T>(what: T, receipt: &Receipt) -> Vouched<T> {
+    Vouched { what, receipts: BTreeMap::from([receipt.clone()]) }
 }
 
 fn pipeline() -> Pipeline {
@@ -122,7 +147,7 @@ async fn start(dir: &std::path::Path) -> TestResult<(Handle, Client)> {
     let policy = Policy { poll_ms: 300, tick_ms: 50, lease_ms: 1000, ..Policy::default() };
     let config = Config { policy, alone: false, park: false, ..Config::embedded() };
     let handle = Coordinator::start(store, config).await?;
-    let client = Client { address: handle.address(), token: Some(handle.token().secret().to_owned()) };
+    let client = Client::of(&handle);
     Ok((handle, client))
 }
 
@@ -138,13 +163,8 @@ async fn join(client: &Client, name: &str) -> TestResult<Joined> {
     client.call("POST", "/v1/workers", join).await
 }
 
-/// Polls until there is an assignment of `stage`.
-async fn assignment(
-    client: &Client,
-    name: &str,
-    joined: &Joined,
-    stage: &str,
-) -> TestResult<protocol::message::Assignment> {
+/// Polls until it gets a task of `stage`.
+async fn assignment(client: &Client, name: &str, joined: &Joined, stage: &str) -> TestResult<Assignment> {
     let (mut version, mut ready) = (0, Vec::new());
     loop {
         let poll = Poll { incarnation: joined.incarnation, doing: vec![], ready, version };
@@ -178,71 +198,141 @@ async fn a_run_goes_through_over_http_and_survives_a_restart() -> TestResult {
     assert_eq!(again.run, run);
 
     let joined = join(&client, "w").await?;
-    let data = assignment(&client, "w", &joined, "dataset").await?.grant;
-    let output = client.put_manifest(&data, ArtifactKind::Dataset, "clips").await?;
+    let data = assignment(&client, "w", &joined, "dataset").await?;
+    let (under, data) = (client.under(&data), data.grant);
+    let receipt = under.put_manifest(&data, ArtifactKind::Dataset, "clips").await?;
+    let output = receipt.0;
     let rows = vec![MetricRow { step: 1, key: "clips".into(), value: 400.0 }];
-    client.call::<()>("POST", "/v1/metrics", MetricBatch { grant: data.clone(), rows }).await?;
+    under.call::<()>("POST", "/v1/metrics", MetricBatch { grant: data.clone(), rows }).await?;
     let logs = LogBatch { grant: data.clone(), first: 0, lines: vec!["hello".into()] };
-    client.call::<()>("POST", "/v1/logs", logs.clone()).await?;
-    client.call::<()>("POST", "/v1/logs", logs).await?;
+    under.call::<()>("POST", "/v1/logs", logs.clone()).await?;
+    under.call::<()>("POST", "/v1/logs", logs).await?;
     let finished = TaskOutcome::Finished { output, metrics: BTreeMap::from([("clips".into(), 400.0)]) };
-    let report = ReportOutcome { grant: data.clone(), outcome: finished };
-    client.call::<()>("POST", "/v1/outcomes", report.clone()).await?;
-    // The answer may have been lost.
-    client.call::<()>("POST", "/v1/outcomes", report).await?;
+    let report = vouched(ReportOutcome { grant: data.clone(), outcome: finished }, &receipt);
+    under.call::<()>("POST", "/v1/outcomes", report.clone()).await?;
+    // The first answer may have been lost.
+    under.call::<()>("POST", "/v1/outcomes", report).await?;
 
     let vae = assignment(&client, "w", &joined, "vae").await?;
+    let under = client.under(&vae);
     assert_eq!(vae.stage.inputs["dataset"], output);
-    let checkpoint = client.put_manifest(&vae.grant, ArtifactKind::Checkpoint, "step 5").await?;
+    let receipt = under.put_manifest(&vae.grant, ArtifactKind::Checkpoint, "step 5").await?;
+    let checkpoint = receipt.0;
     let commit = CommitCheckpoint { grant: vae.grant.clone(), step: 5, manifest: checkpoint, metrics: BTreeMap::new() };
-    client.call::<()>("POST", "/v1/checkpoints", commit.clone()).await?;
-    let missing = CommitCheckpoint { step: 6, manifest: Digest::of(b"nothing"), ..commit };
-    assert_eq!(client.refused("/v1/checkpoints", missing).await?.0, 404, "a manifest that was not uploaded");
-    // That try has failed; the next goes on from what there is.
+    under.call::<()>("POST", "/v1/checkpoints", vouched(commit.clone(), &receipt)).await?;
+    let receipt = under.put_manifest(&vae.grant, ArtifactKind::Checkpoint, "step 6").await?;
+    std::fs::remove_file(checkpoint::blob_path(dir.path(), receipt.0))?;
+    let missing = CommitCheckpoint { step: 6, manifest: receipt.0, ..commit };
+    let refused = under.refused("/v1/checkpoints", vouched(missing, &receipt)).await?;
+    assert_eq!(refused.0, 404, "a manifest that is not there");
+    // The attempt has failed; the next one continues from the existing checkpoint.
     let failed = vae;
     let vae = assignment(&client, "w", &joined, "vae").await?;
     assert_eq!((vae.grant.attempt, vae.resume), (failed.grant.attempt.next(), Some(checkpoint)));
-
-    let stale = Grant { fence: protocol::Fence(0), ..vae.grant.clone() };
-    let metrics = MetricBatch { grant: stale, rows: vec![] };
-    let (status, error) = client.refused("/v1/metrics", metrics).await?;
-    assert_eq!((status, error.code.as_str()), (409, "stale-fence"));
-
-    // The fence of now with the attempt of before: refused before the store, which knows fences alone, is asked.
-    let other = Grant { attempt: protocol::Attempt(9), ..vae.grant.clone() };
-    let metrics = MetricBatch { grant: other.clone(), rows: vec![] };
-    let logs = LogBatch { grant: other.clone(), first: 0, lines: vec![] };
+    let metrics = MetricBatch { grant: failed.grant.clone(), rows: vec![] };
+    let logs = LogBatch { grant: failed.grant.clone(), first: 0, lines: vec![] };
     let request = Request::builder().method("PUT").uri(format!("/v1/blobs/{}", Digest::of(b"late")));
-    let request = request.header("x-stride-grant", serde_json::to_string(&other)?).body(Body::from("late"))?;
-    let refused = [
-        client.try_call("POST", "/v1/metrics", metrics).await?.0,
-        client.try_call("POST", "/v1/logs", logs).await?.0,
-        client.send(request).await?.0,
-    ];
-    assert_eq!(refused, [StatusCode::CONFLICT; 3], "metrics, logs, blob");
+    let request = request.header(GRANT_HEADER, serde_json::to_string(&failed.grant)?).body(Body::from("late"))?;
+    let (status, error) = under.refused("/v1/metrics", metrics).await?;
+    assert_eq!((status, error.code.as_str()), (409, "stale-fence"));
+    let carried = format!("with fence {} has been superseded", failed.grant.fence);
+    assert!(error.message.ends_with(&carried), "the fence of now is not told: {}", error.message);
+    let refused = [under.try_call("POST", "/v1/logs", logs).await?.0, under.send(request).await?.0];
+    assert_eq!(refused, [StatusCode::CONFLICT; 2], "logs, blob");
 
-    // As by `kill -9`: the worker goes on and re-attaches with the same incarnation and grant.
+    // The worker survives the restart and reconnects with the same incarnation, grant and secret.
     handle.shutdown().await;
     let (handle, client) = start(dir.path()).await?;
     let same = assignment(&client, "w", &joined, "vae").await?;
-    assert_eq!((&same.grant, same.resume), (&vae.grant, Some(checkpoint)));
-    let output = client.put_manifest(&vae.grant, ArtifactKind::Vae, "vae").await?;
-    let finished = TaskOutcome::Finished { output, metrics: BTreeMap::from([("mpjpe".into(), 40.0)]) };
+    assert_eq!((&same.grant, &same.secret, same.resume), (&vae.grant, &vae.secret, Some(checkpoint)));
+    let under = client.under(&vae);
+    let receipt = under.put_manifest(&vae.grant, ArtifactKind::Vae, "vae").await?;
+    let finished = TaskOutcome::Finished { output: receipt.0, metrics: BTreeMap::from([("mpjpe".into(), 40.0)]) };
     let report = ReportOutcome { grant: vae.grant.clone(), outcome: finished };
-    client.call::<()>("POST", "/v1/outcomes", report).await?;
+    under.call::<()>("POST", "/v1/outcomes", vouched(report, &receipt)).await?;
     let view = until_over(&handle, &run).await?;
     assert_eq!(view.state, RunState::Finished);
     assert_eq!(view.stages[1].metrics["mpjpe"], 40.0);
+    let view: protocol::message::RunView = client.call("GET", &format!("/v1/runs/{run}"), ()).await?;
+    let (whole, vae) = (view.times, view.stages[1].times);
+    assert!(whole.created_ms <= whole.started_ms && whole.started_ms <= vae.started_ms, "{view:?}");
+    assert!(whole.created_ms.is_some() && vae.started_ms <= vae.ended_ms && vae.ended_ms <= whole.ended_ms, "{view:?}");
+    let rows: Vec<registry::HistoryRow> = client.call("GET", &format!("/v1/history?run={run}"), ()).await?;
+    let kinds: Vec<&str> = rows.iter().map(|row| row.entry.kind.name()).collect();
+    let expected =
+        ["submitted", "granted", "finished", "granted", "checkpoint", "retried", "granted", "finished", "ended"];
+    assert_eq!(kinds, expected);
+    assert!(rows[5].entry.why.is_some() && rows[8].entry.why.as_deref() == Some("finished"));
+    let after = format!("/v1/history?worker=w&after={}&limit=1", rows[3].id - 1);
+    let of_worker: Vec<registry::HistoryRow> = client.call("GET", &after, ()).await?;
+    assert_eq!(of_worker, rows[3..4]);
+    assert_eq!(client.try_call("GET", "/v1/history?run=none", ()).await?.0, StatusCode::NOT_FOUND);
+    let (_, text) = client.try_call("GET", "/metrics", ()).await?;
+    let text = String::from_utf8(text)?;
+    for line in ["stride_workers{state=\"idle\"} 1", "stride_values_total 0", "stride_storage_trouble 0", "# EOF"] {
+        assert!(text.lines().any(|it| it == line), "{line}\n{text}");
+    }
+    assert!(text.contains("stride_commit_seconds_bucket") && !text.contains(run.as_str()), "{text}");
     let lines: Vec<registry::LogRow> = client.call("GET", &format!("/v1/runs/{run}/logs?stage=dataset"), ()).await?;
     assert_eq!(lines.iter().map(|line| line.text.as_str()).collect::<Vec<_>>(), ["hello"]);
     let curves: coordinator::shell::StageMetrics = client.call("GET", &format!("/v1/runs/{run}/metrics"), ()).await?;
     assert_eq!(curves[&"dataset".into()]["clips"].points[0].value, 400.0);
 
-    // Nothing is computed twice.
+    // All values are known, so no stage is computed twice.
     let second = handle.submit(submission(None)?).await?;
     let view = until_over(&handle, &second).await?;
     assert!(view.stages.iter().all(|stage| stage.state == StageState::Cached), "{view:#?}");
     assert!(handle.control(&second, Control::Pause).await.is_err());
+    handle.shutdown().await;
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn curves_come_in_buckets_as_json_and_packed() -> TestResult {
+    let dir = tempfile::tempdir()?;
+    let (handle, client) = start(dir.path()).await?;
+    let run = handle.submit(submission(None)?).await?;
+    let joined = join(&client, "w").await?;
+    let data = assignment(&client, "w", &joined, "dataset").await?;
+    let value = |step: u64| if step == 1_234 { f64::NAN } else { step as f64 };
+    let rows = (1..=5_000).map(|step| MetricRow { step, key: "clips & more".into(), value: value(step) }).collect();
+    client.under(&data).call::<()>("POST", "/v1/metrics", MetricBatch { grant: data.grant, rows }).await?;
+
+    let path = format!("/v1/metrics?run={run}&run={run}&key=clips%20%26%20more&key=none&buckets=50");
+    let curves: coordinator::shell::Curves = client.call("GET", &path, ()).await?;
+    let [series] = curves.series.as_slice() else { panic!("{curves:?}") };
+    assert_eq!((&series.run, series.stage.as_str(), series.key.as_str()), (&run, "dataset", "clips & more"));
+    assert_eq!((series.total, series.columns.nan.iter().sum::<u64>()), (5_000, 1));
+    let rows = series.columns.x.len();
+    assert!((40..=50).contains(&rows), "{rows}");
+    assert_eq!((series.columns.last.last(), series.columns.max.last()), (Some(&5_000.0), Some(&5_000.0)));
+
+    let request = Request::builder().method("GET").uri(&path).header("accept", "application/octet-stream");
+    let (status, packed) = client.send(request.body(Body::empty())?).await?;
+    assert_eq!(status, StatusCode::OK);
+    let length = u32::from_le_bytes(packed[..4].try_into()?) as usize;
+    let head: serde_json::Value = serde_json::from_slice(&packed[4..4 + length])?;
+    assert_eq!((&head["series"][0]["rows"], &head["series"][0]["x0"]), (&rows.into(), &series.columns.x[0].into()));
+    assert_eq!(packed.len(), 4 + length + rows * 7 * 4);
+
+    let points: coordinator::shell::StageMetrics =
+        client.call("GET", &format!("/v1/runs/{run}/metrics?stage=dataset&after=1232&limit=3"), ()).await?;
+    let points: Vec<_> = points[&"dataset".into()]["clips & more"].points.iter().map(|p| (p.step, p.value)).collect();
+    assert_eq!((points.len(), points[0], points[1].0), (3, (1_233, 1_233.0), 1_234));
+    assert!(points[1].1.is_nan());
+
+    for (query, expected, says) in [
+        (String::new(), 400, "no curve was asked for"),
+        ("?run=none".to_owned(), 404, "is not known"),
+        (format!("?run={run}&run=none"), 404, "is not known"),
+        (format!("?run={run}&stage=none"), 404, "has no stage `none`"),
+        (format!("?run={run}&buckets=many"), 400, "`buckets` is `many`"),
+        (format!("?run={run}&limit=5"), 400, "there is no `limit`"),
+    ] {
+        let (status, answer) = client.try_call("GET", &format!("/v1/metrics{query}"), ()).await?;
+        let error: ApiError = serde_json::from_slice(&answer)?;
+        assert!(status.as_u16() == expected && error.message.contains(says), "{query}: {status} {error:?}");
+    }
     handle.shutdown().await;
     Ok(())
 }
@@ -253,7 +343,8 @@ async fn p2_a_silent_worker_loses_its_task_and_its_writes_are_refused() -> TestR
     let (handle, client) = start(dir.path()).await?;
     handle.submit(submission(None)?).await?;
     let first = join(&client, "a").await?;
-    let lost = assignment(&client, "a", &first, "dataset").await?.grant;
+    let lost = assignment(&client, "a", &first, "dataset").await?;
+    let (under, lost) = (client.under(&lost), lost.grant);
     let begun = std::time::Instant::now();
     let second = join(&client, "b").await?;
     let taken = assignment(&client, "b", &second, "dataset").await?.grant;
@@ -261,13 +352,13 @@ async fn p2_a_silent_worker_loses_its_task_and_its_writes_are_refused() -> TestR
     assert!(waited > Duration::from_millis(500) && waited < Duration::from_secs(10), "{waited:?}");
     assert!(taken.fence > lost.fence && taken.attempt > lost.attempt);
     let report = ReportOutcome { grant: lost.clone(), outcome: TaskOutcome::Yielded { at: 0 } };
-    let (status, error) = client.refused("/v1/outcomes", report).await?;
+    let (status, error) = under.refused("/v1/outcomes", report).await?;
     assert_eq!((status, error.code.as_str()), (409, "stale-fence"));
     let request = Request::builder().method("PUT").uri(format!("/v1/blobs/{}", Digest::of(b"late")));
-    let request = request.header("x-stride-grant", serde_json::to_string(&lost)?).body(Body::from("late"))?;
-    assert_eq!(client.send(request).await?.0, StatusCode::CONFLICT);
+    let request = request.header(GRANT_HEADER, serde_json::to_string(&lost)?).body(Body::from("late"))?;
+    assert_eq!(under.send(request).await?.0, StatusCode::CONFLICT);
 
-    // Another build's worker is told so, and is nobody here.
+    // A worker of another build is refused and does not join.
     let other = Join {
         protocol: PROTOCOL_VERSION + 1,
         worker: "c".into(),
@@ -280,7 +371,7 @@ async fn p2_a_silent_worker_loses_its_task_and_its_writes_are_refused() -> TestR
     assert_eq!((status, error.code.as_str()), (400, "invalid"));
     assert!(error.message.contains("use one build for both"), "{}", error.message);
 
-    // A process that joins under the name replaces the old one, whose polls are refused.
+    // A process that joins with the same name replaces the old one, whose polls are refused.
     join(&client, "b").await?;
     let poll = Poll { incarnation: second.incarnation, doing: vec![], ready: vec![], version: 0 };
     assert_eq!(client.refused("/v1/workers/b/poll", poll.clone()).await?.0, 409);
@@ -289,7 +380,7 @@ async fn p2_a_silent_worker_loses_its_task_and_its_writes_are_refused() -> TestR
     Ok(())
 }
 
-/// Two workers and one task for three leases: who polls keeps it, though nothing else is heard and decided meanwhile.
+/// Two workers and one task for three leases: polls alone keep the lease, without any other event.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn polls_alone_keep_a_lease_and_show_progress() -> TestResult {
     let dir = tempfile::tempdir()?;
@@ -304,7 +395,7 @@ async fn polls_alone_keep_a_lease_and_show_progress() -> TestResult {
         for (i, (name, joined)) in [("a", &first), ("b", &second)].into_iter().enumerate() {
             done += 1;
             let progress = Progress { done, total: 100, ..Progress::default() };
-            let doing = Doing { grant: held.clone(), progress, lost: vec![] };
+            let doing = Doing::new(held.clone(), progress);
             let doing = if name == "a" { vec![doing] } else { vec![] };
             let poll = Poll { incarnation: joined.incarnation, doing, ready: vec![], version: version[i] };
             let desired: DesiredAssignments = client.call("POST", &format!("/v1/workers/{name}/poll"), poll).await?;
@@ -319,8 +410,8 @@ async fn polls_alone_keep_a_lease_and_show_progress() -> TestResult {
     Ok(())
 }
 
-/// Loss of power in the middle of a write: the log of the database is cut at 24 places, 7 of them inside its last frames.
-/// What is left is always a beginning of the facts, and can be recovered from.
+/// Simulates a loss of power during a write by cutting the database's log at 24 places, 7 of them within its last
+/// frames. The rest is always a prefix of the facts from which recovery is possible.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn p1_a_torn_log_is_a_whole_beginning_of_itself() -> TestResult {
     let dir = tempfile::tempdir()?;
@@ -329,7 +420,7 @@ async fn p1_a_torn_log_is_a_whole_beginning_of_itself() -> TestResult {
         handle.submit(submission(Some(&format!("run {i}")))?).await?;
         join(&client, "w").await?;
     }
-    // Copied while it is open, as a disk is found after the power failed.
+    // Copied while open, like a disk after a loss of power.
     let wal = std::fs::read_dir(dir.path())?
         .flatten()
         .map(|entry| entry.path())
@@ -342,7 +433,8 @@ async fn p1_a_torn_log_is_a_whole_beginning_of_itself() -> TestResult {
         let torn = tempfile::tempdir()?;
         std::fs::write(torn.path().join(main.file_name().ok_or("a name")?), &database)?;
         std::fs::write(torn.path().join(wal.file_name().ok_or("a name")?), log)?;
-        // As if its user had decided to go on with what is left: opened as it is, the store would be refused.
+        // Adopts the store, which is the user's decision to continue with the remaining data. A normal open would
+        // refuse it.
         let store = Store::adopt(torn.path(), None, Holder::this_process("a test")).await?;
         let recovery = store.recovery().await?;
         Ok((torn, recovery))
@@ -353,7 +445,7 @@ async fn p1_a_torn_log_is_a_whole_beginning_of_itself() -> TestResult {
     let end = log.len();
     let cuts = (0..=16).map(|i| end * i / 16).chain([1, 31, 32, 500, 4000, 4119, 4121].map(|back| end - back));
     for cut in cuts {
-        // Cut before the tables were made it is an empty place, not a damaged one.
+        // A log cut before the creation of the tables is an empty store, not a damaged one.
         let (_, recovery) = open(&log[..cut]).await.map_err(|error| format!("cut at {cut} of {end}: {error}"))?;
         let left = &recovery.facts;
         assert_eq!(left[..], whole[..left.len()], "cut at {cut} of {end}");
@@ -365,7 +457,7 @@ async fn p1_a_torn_log_is_a_whole_beginning_of_itself() -> TestResult {
     Ok(())
 }
 
-/// A blob that is made as it is sent.
+/// A blob that is generated while it is sent.
 const LARGE_PARTS: u64 = 256;
 const LARGE_BYTES: u64 = LARGE_PARTS << 20;
 
@@ -375,7 +467,7 @@ fn part(i: u64) -> Vec<u8> {
     part
 }
 
-/// The most memory that this process has had, in bytes.
+/// Peak memory of this process in bytes.
 fn peak() -> TestResult<u64> {
     let status = std::fs::read_to_string("/proc/self/status")?;
     let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:")).ok_or("no VmHWM")?;
@@ -383,13 +475,14 @@ fn peak() -> TestResult<u64> {
 }
 
 impl Client {
-    /// Sends the head of a request whose body is to follow.
+    /// Sends the head of a request, before its body.
     async fn begin(&self, head: &str, headers: &[(&str, String)], length: u64) -> TestResult<TcpStream> {
         let mut text =
             format!("{head} HTTP/1.1\r\nhost: localhost\r\nconnection: close\r\ncontent-length: {length}\r\n");
         if let Some(token) = &self.token {
             text += &format!("authorization: Bearer {token}\r\n");
         }
+        text += &format!("{SECRET_HEADER}: {}\r\n", self.secret);
         for (name, value) in headers {
             text += &format!("{name}: {value}\r\n");
         }
@@ -398,15 +491,16 @@ impl Client {
         Ok(stream)
     }
 
-    async fn staged(&self, grant: &Grant, digest: Digest) -> TestResult<coordinator::shell::BlobStored> {
+    async fn staged(&self, grant: &Grant, digest: Digest, receipt: &str) -> TestResult<BlobStored> {
         let request = Request::builder().method("GET").uri(format!("/v1/blobs/{digest}/staged"));
-        let request = request.header("x-stride-grant", serde_json::to_string(grant)?).body(Body::empty())?;
+        let request = request.header(GRANT_HEADER, serde_json::to_string(grant)?).header(RECEIPT_HEADER, receipt);
+        let request = request.body(Body::empty())?;
         let (status, answer) = self.send(request).await?;
         assert!(status.is_success(), "{status} {}", String::from_utf8_lossy(&answer));
         Ok(serde_json::from_slice(&answer)?)
     }
 
-    /// Fetches a blob: the status, how long it should be, how much came, and what that hashes to.
+    /// Downloads a blob: status, expected length, received length, and digest of the received bytes.
     async fn fetch(&self, digest: Digest) -> TestResult<(u16, u64, u64, Digest)> {
         let mut stream = self.begin(&format!("GET /v1/blobs/{digest}"), &[], 0).await?;
         let (mut head, mut buffer) = (Vec::new(), vec![0; 1 << 16]);
@@ -416,7 +510,7 @@ impl Client {
         let head = String::from_utf8(head)?.to_ascii_lowercase();
         let length = head.lines().find_map(|line| line.strip_prefix("content-length: ")).ok_or("no length")?.parse()?;
         let (mut hasher, mut came) = (protocol::digest::Hasher::default(), 0);
-        // A connection that is reset ends the body as well.
+        // A reset also ends the body.
         while let Ok(read @ 1..) = stream.read(&mut buffer).await {
             hasher.update(&buffer[..read]);
             came += read as u64;
@@ -425,24 +519,25 @@ impl Client {
     }
 }
 
-/// Whole blobs in memory would need several times what is allowed here.
+/// Blobs held in memory would exceed the limit of this test several times.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_large_blob_passes_in_little_memory_and_a_cut_upload_goes_on() -> TestResult {
     let dir = tempfile::tempdir()?;
     let store = Store::open(dir.path(), Holder::this_process("a test")).await?;
     let handle = Coordinator::start(store.clone(), Config { park: false, ..Config::embedded() }).await?;
-    let client = Client { address: handle.address(), token: Some(handle.token().secret().to_owned()) };
+    let client = Client::of(&handle);
     handle.submit(submission(None)?).await?;
     let joined = join(&client, "w").await?;
-    let grant = assignment(&client, "w", &joined, "dataset").await?.grant;
+    let assignment = assignment(&client, "w", &joined, "dataset").await?;
+    let (client, grant) = (client.under(&assignment), assignment.grant);
     let mut hasher = protocol::digest::Hasher::default();
     (0..LARGE_PARTS).for_each(|i| hasher.update(&part(i)));
     let digest = hasher.finish();
     let before = peak()?;
 
-    // Without a grant nothing of the body is read: what is on the way fills the sockets' buffers and no more.
+    // Without a grant no body is read: only the sockets' buffers fill up.
     let stale = Grant { fence: protocol::Fence(0), ..grant.clone() };
-    let header = |grant: &Grant| -> TestResult<_> { Ok(("x-stride-grant", serde_json::to_string(grant)?)) };
+    let header = |grant: &Grant| -> TestResult<_> { Ok((GRANT_HEADER, serde_json::to_string(grant)?)) };
     let put = format!("PUT /v1/blobs/{digest}");
     for headers in [vec![], vec![header(&stale)?]] {
         let mut stream = client.begin(&put, &headers, 10 << 30).await?;
@@ -453,7 +548,7 @@ async fn a_large_blob_passes_in_little_memory_and_a_cut_upload_goes_on() -> Test
         assert!(sent < LARGE_PARTS / 4, "{sent} MiB were taken without a grant");
     }
 
-    // Cut in the middle.
+    // Cuts off the upload in the middle.
     let headers = vec![header(&grant)?];
     let mut stream = client.begin(&put, &headers, LARGE_BYTES).await?;
     for i in 0..LARGE_PARTS / 2 {
@@ -461,7 +556,7 @@ async fn a_large_blob_passes_in_little_memory_and_a_cut_upload_goes_on() -> Test
     }
     drop(stream);
     let staged = loop {
-        let there = client.staged(&grant, digest).await?;
+        let there = client.staged(&grant, digest, "").await?;
         assert!(!there.stored);
         if there.staged > 0 {
             break there.staged;
@@ -479,14 +574,17 @@ async fn a_large_blob_passes_in_little_memory_and_a_cut_upload_goes_on() -> Test
     }
     let mut answer = String::new();
     stream.read_to_string(&mut answer).await?;
-    assert!(answer.starts_with("HTTP/1.1 200") && answer.contains("\"stored\":true"), "{answer}");
-    assert!(client.staged(&grant, digest).await?.stored, "it need not be sent again");
+    assert!(answer.starts_with("HTTP/1.1 200"), "{answer}");
+    let stored: BlobStored = serde_json::from_str(answer.split_once("\r\n\r\n").ok_or("no body")?.1)?;
+    let receipt = stored.receipt.filter(|_| stored.stored).ok_or("all of it has arrived")?;
+    assert!(client.staged(&grant, digest, &receipt).await?.stored, "it need not be sent again");
+    assert!(!client.staged(&grant, digest, "").await?.stored, "without a receipt it might be another's");
 
     assert_eq!(client.fetch(digest).await?, (200, LARGE_BYTES, LARGE_BYTES, digest));
     let grown = peak()?.saturating_sub(before);
     assert!(grown < 100 << 20, "{} MiB of memory for a blob of {LARGE_PARTS} MiB", grown >> 20);
 
-    // A damaged blob is never sent whole, and is refused once that is known.
+    // A damaged blob is never sent completely, and is refused once the damage is known.
     let path = dir.path().join("blobs/sha256").join(&digest.hex()[..2]).join(&digest.hex()[2..]);
     let file = std::fs::OpenOptions::new().write(true).open(path)?;
     std::os::unix::fs::FileExt::write_all_at(&file, b"x", LARGE_BYTES / 2)?;

@@ -1,10 +1,10 @@
-//! What must not stop work, and what must not be remembered for ever, on the pure half with a clock of its own.
+//! Progress despite failures, and limits of remembered data, for the pure half with a virtual clock.
 
 #[allow(dead_code, reason = "not every test file uses all of it")]
 mod common;
 
 use coordinator::state::execution::ExecutionState;
-use coordinator::{Control, Event, Observation, Policy, journal, refused_for_good};
+use coordinator::{Control, Event, Observation, Policy, State, journal, refused_for_good};
 use protocol::message::{
     Assignment, CommitCheckpoint, FailureClass, ReportOutcome, Role, RunState, StageState, TaskOutcome,
 };
@@ -14,8 +14,8 @@ use registry::WriteError;
 
 use crate::common::{PureCoordinator, failed, gang_of_three, pipelines};
 
-/// Two workers; `a`, which holds the only task, is never heard again. The other polls every second until it has the task, while
-/// `tick` looks at the clock. How long that took.
+/// Returns the time until a second worker gets the only task of a silent one. The second worker `b` polls every second,
+/// and `tick` runs the timer.
 fn taken_after(mut tick: impl FnMut(&mut PureCoordinator, u64)) -> u64 {
     let mut coordinator = PureCoordinator::new(Policy::default());
     coordinator.submit("dataset", WorkerRange::default());
@@ -33,7 +33,7 @@ fn taken_after(mut tick: impl FnMut(&mut PureCoordinator, u64)) -> u64 {
     panic!("never taken");
 }
 
-/// The actor gets to no tick for 6 s, three times in a row: polls are heard meanwhile, so nobody's lease is longer for it.
+/// The actor handles no tick for 6 s, three times in a row. Polls are received meanwhile, so no lease is extended.
 #[test]
 fn p3_a_slow_disk_stretches_no_lease() {
     let undisturbed = taken_after(|coordinator, _| coordinator.tick());
@@ -46,7 +46,7 @@ fn p3_a_slow_disk_stretches_no_lease() {
     assert!(stalled <= 19_000, "noticed by the first look after the lease, not {stalled} ms after the loss");
 }
 
-/// A process that slept through 6 s heard nobody in them: that much longer everybody's lease is, and no more.
+/// A process that overslept by 6 s received no polls then, so all leases are extended by exactly that time.
 #[test]
 fn p3_leniency_is_as_long_as_the_clock_overslept() {
     let taken = taken_after(|coordinator, second| match second {
@@ -76,22 +76,22 @@ fn p15_a_task_that_makes_progress_survives_any_number_of_losses() {
     let mut coordinator = PureCoordinator::new(Policy::default());
     let (run, _) = gang_of_three(&mut coordinator);
     for name in ["b", "c"] {
-        coordinator.happen(Event::WorkerGone { worker: name.into() }).expect("taken");
+        coordinator.happen(Event::WorkerGone { worker: name.into(), incarnation: None }).expect("taken");
     }
     for step in 1..=250 {
         let assignment = coordinator.assignment("a").expect("it trains");
         save(&mut coordinator, &assignment, step, &format!("step {step}"));
-        coordinator.happen(Event::WorkerGone { worker: "a".into() }).expect("taken");
+        coordinator.happen(Event::WorkerGone { worker: "a".into(), incarnation: None }).expect("taken");
         assert_eq!(coordinator.run_state(&run), RunState::Running, "after loss {step}");
         coordinator.now += 40_000;
         coordinator.join("a");
         coordinator.tick();
     }
-    // Without progress the budget is what it says.
+    // Without progress the budget applies.
     let budget = Policy::default().infrastructure_budget;
     for loss in 1..=budget {
         assert_eq!(coordinator.run_state(&run), RunState::Running, "after {loss} losses in a row");
-        coordinator.happen(Event::WorkerGone { worker: "a".into() }).expect("taken");
+        coordinator.happen(Event::WorkerGone { worker: "a".into(), incarnation: None }).expect("taken");
         coordinator.now += 40_000;
         coordinator.join("a");
         coordinator.tick();
@@ -106,7 +106,7 @@ fn members(coordinator: &PureCoordinator, name: &str) -> Vec<WorkerId> {
     }
 }
 
-/// Each member of a gang of three in turn, the first one included; the last one alone ends the stage.
+/// Every member of a gang of three in turn, including the first one. The failure of the last member ends the stage.
 #[test]
 fn p15_a_member_out_of_memory_leaves_its_gang_to_the_others() {
     for order in [["a", "b", "c"], ["c", "a", "b"], ["b", "c", "a"]] {
@@ -119,7 +119,7 @@ fn p15_a_member_out_of_memory_leaves_its_gang_to_the_others() {
             if let Some(next) = left.first() {
                 assert_eq!(coordinator.run_state(&run), RunState::Running, "{name} of {order:?}");
                 assert!(coordinator.assignment(name).is_none(), "not taken into it again");
-                // Not when it polls, not when it joins anew.
+                // Neither a poll nor another join changes this.
                 let incarnation = coordinator.join(name);
                 coordinator.poll(name, incarnation);
                 let mut members = members(&coordinator, next.as_str());
@@ -130,7 +130,7 @@ fn p15_a_member_out_of_memory_leaves_its_gang_to_the_others() {
             }
         }
         assert_eq!(coordinator.run_state(&run), RunState::Failed);
-        // Asked for again, everybody may try.
+        // After a resume, all workers may try again.
         coordinator.control(&run, Control::Resume).expect("taken up");
         assert_eq!(members(&coordinator, "a").len(), 3);
     }
@@ -153,6 +153,7 @@ fn a_gang_has_no_more_members_than_a_batch_has_slices() {
             source: String::new(),
             idempotency_key: None,
             until: Some("vae".into()),
+            owner: protocol::Owner::local("me"),
         };
         coordinator.happen(submit).expect("submitted");
         for name in ["a", "b", "c", "d"] {
@@ -165,7 +166,36 @@ fn a_gang_has_no_more_members_than_a_batch_has_slices() {
     }
 }
 
-/// A plain task's end, a gang's end and a gang's checkpoint, whose blobs were collected before they were named.
+#[test]
+fn another_owners_run_keeps_its_placement() {
+    let mut coordinator = PureCoordinator::new(Policy::default());
+    let mut submit = |name: &str, min| {
+        let event = Event::Submit {
+            pipeline: Box::new(pipelines::quickstart(1, WorkerRange { min, max: min }, &[])),
+            source: String::new(),
+            idempotency_key: None,
+            until: Some("dataset".into()),
+            owner: protocol::Owner { name: name.into(), ..Default::default() },
+        };
+        coordinator.happen(event).expect("submitted");
+        let executions: Vec<_> = coordinator.state.executions.values().collect();
+        assert_eq!(executions.len(), 1, "both want the same stage");
+        executions[0].placement.workers.min
+    };
+    assert_eq!(submit("alice", 1), 1);
+    assert_eq!(submit("bob", 9), 1, "he waits for what she has computed");
+    assert_eq!(submit("alice", 2), 1, "his run waits for it as well");
+    let mut coordinator = PureCoordinator::new(Policy::default());
+    let run = coordinator.submit("dataset", WorkerRange { min: 1, max: 1 });
+    coordinator.submit("dataset", WorkerRange { min: 2, max: 2 });
+    let placement =
+        |coordinator: &PureCoordinator| coordinator.state.executions.values().next().expect("one").placement.clone();
+    assert_eq!(placement(&coordinator).workers.min, 2, "its owner's newest wish counts");
+    assert_eq!(coordinator.run_state(&run), RunState::Running);
+}
+
+/// The end of a plain task, the end of a gang and a checkpoint of a gang, with blobs that were collected before they
+/// were named.
 #[test]
 fn what_names_a_missing_blob_is_a_failed_try_and_is_tried_again() {
     for checkpoint in [None, Some(false), Some(true)] {
@@ -227,7 +257,7 @@ fn two_states_of_one_step_end_the_stage_and_are_both_named() {
     }
 }
 
-/// Four generations of one gang under one entropy, and one under another.
+/// Several generations of a gang under the same entropy, and the same under another one.
 #[test]
 fn every_generation_has_a_secret_of_its_own() {
     let mut secrets = Vec::new();
@@ -241,7 +271,7 @@ fn every_generation_has_a_secret_of_its_own() {
                 role => panic!("{role:?}"),
             }
             if coordinator.state.workers.contains_key(&WorkerId::from(next)) {
-                coordinator.happen(Event::WorkerGone { worker: next.into() }).expect("taken");
+                coordinator.happen(Event::WorkerGone { worker: next.into(), incarnation: None }).expect("taken");
             } else {
                 coordinator.join(next);
             }
@@ -259,6 +289,7 @@ fn submit(coordinator: &mut PureCoordinator, seed: u64) -> RunId {
         source: String::new(),
         idempotency_key: None,
         until: None,
+        owner: protocol::Owner::local("me"),
     };
     let effects = coordinator.happen(submit).expect("submitted");
     let run = effects.into_iter().find_map(|effect| match effect {
@@ -268,7 +299,8 @@ fn submit(coordinator: &mut PureCoordinator, seed: u64) -> RunId {
     run.expect("a submission gives a run")
 }
 
-/// Cancelled, failed and resumed runs: what an unfinished stage has comes back with the run that wants it, under numbers that were never used.
+/// Cancelled, failed and resumed runs. A resumed run continues its unfinished stages, with numbers that were never
+/// used.
 #[test]
 fn an_ended_run_leaves_memory_and_is_taken_up_where_it_was() {
     let mut coordinator = PureCoordinator::new(Policy::default());
@@ -294,7 +326,7 @@ fn an_ended_run_leaves_memory_and_is_taken_up_where_it_was() {
     coordinator.control(&run, Control::Cancel).expect("taken");
     coordinator.report(&second, TaskOutcome::Yielded { at: 3 });
 
-    // Another run of the same: it finds the value of the first stage, and the checkpoint of the second.
+    // Another run of the same pipeline finds the value of the first stage and the checkpoint of the second.
     let other = coordinator.submit("vae", WorkerRange { min: 1, max: 3 });
     assert_ne!(other, run);
     let third = coordinator.assignment("a").expect("it trains for another run");
@@ -309,7 +341,14 @@ fn an_ended_run_leaves_memory_and_is_taken_up_where_it_was() {
     assert!(coordinator.state.executions.is_empty());
 }
 
-/// What a submission costs, counted: runs, executions and workers that decisions look at, and the size of the state.
+/// Size of a snapshot with all of its parts, in bytes.
+fn stored_bytes(state: &State) -> usize {
+    let parts = journal::changed_parts(&State::new(Policy::default()), state);
+    let texts = parts.iter().filter_map(|part| part.stored().1);
+    journal::snapshot(state).len() + texts.map(|text| text.len()).sum::<usize>()
+}
+
+/// The cost of a submission, as the number of objects that decisions inspect and the size of the state.
 #[test]
 fn a_submission_costs_the_same_however_many_runs_have_ended() {
     let mut coordinator = PureCoordinator::new(Policy::default());
@@ -319,7 +358,7 @@ fn a_submission_costs_the_same_however_many_runs_have_ended() {
             let run = submit(coordinator, seed);
             coordinator.control(&run, Control::Cancel).expect("taken");
         }
-        ((coordinator.state.visits - before) / count, journal::snapshot(&coordinator.state).len())
+        ((coordinator.state.visits - before) / count, stored_bytes(&coordinator.state))
     };
     let (visits, size) = cost(&mut coordinator, 0..10);
     cost(&mut coordinator, 10..150);
@@ -327,7 +366,7 @@ fn a_submission_costs_the_same_however_many_runs_have_ended() {
     assert_eq!(visits, later_visits);
     assert!(later_size <= size + 20, "the state grew from {size} to {later_size} bytes");
 
-    // Runs that wait beside it are not looked at either, while nobody is idle.
+    // Waiting runs are not inspected either while no worker is idle.
     for seed in 1000..1040 {
         submit(&mut coordinator, seed);
     }
@@ -339,7 +378,7 @@ fn a_submission_costs_the_same_however_many_runs_have_ended() {
 fn a_worker_that_is_away_for_an_hour_leaves_memory_and_comes_back_as_another_process() {
     let mut coordinator = PureCoordinator::new(Policy::default());
     let old = coordinator.join("a");
-    coordinator.happen(Event::WorkerGone { worker: "a".into() }).expect("taken");
+    coordinator.happen(Event::WorkerGone { worker: "a".into(), incarnation: None }).expect("taken");
     coordinator.now += 3_590_000;
     coordinator.tick();
     assert!(coordinator.state.workers.contains_key(&WorkerId::from("a")));
@@ -365,6 +404,7 @@ fn a_pipeline_of_more_than_a_thousand_stages_is_refused() {
             source: String::new(),
             idempotency_key: None,
             until: Some("nowhere".into()),
+            owner: protocol::Owner::local("me"),
         };
         coordinator.happen(event).expect_err("refused").to_string()
     };
@@ -380,7 +420,8 @@ fn a_pipeline_of_more_than_a_thousand_stages_is_refused() {
     assert!(refused.contains("nowhere"), "a thousand are taken: {refused}");
 }
 
-/// What another build wrote: a later minor version with what this one knows, one with what it does not, and another major version.
+/// Data of other builds: a later minor version without unknown kinds, one with an unknown kind, and another major
+/// version.
 #[test]
 fn what_is_stored_says_of_which_format_it_is() {
     let mut coordinator = PureCoordinator::new(Policy::default());
@@ -395,9 +436,11 @@ fn what_is_stored_says_of_which_format_it_is() {
         recover(&stored)
     };
     assert!(recover(&coordinator.store.recovery).is_ok());
-    assert!(with("\"format\":[1,1]", "\"format\":[1,7]").is_ok());
-    let refused = with("\"format\":[1,1]", "\"format\":[2,0]").expect_err("another major version");
-    assert!(refused.contains("format 2.0") && refused.contains("1.x") && refused.contains("decision 2"), "{refused}");
+    let (major, minor) = journal::FORMAT;
+    let now = format!("\"format\":[{major},{minor}]");
+    assert!(with(&now, "\"format\":[2,7]").is_ok());
+    let refused = with(&now, "\"format\":[3,0]").expect_err("another major version");
+    assert!(refused.contains("format 3.0") && refused.contains("2.x") && refused.contains("decision 2"), "{refused}");
     let refused = with("\"execution-state\"", "\"horoscope\"").expect_err("an unknown kind");
     assert!(refused.contains("horoscope") && refused.contains("decision 2"), "{refused}");
     let mut stored = coordinator.store.recovery.clone();
@@ -405,14 +448,14 @@ fn what_is_stored_says_of_which_format_it_is() {
     let refused = recover(&stored).expect_err("one is missing");
     assert!(refused.contains("decision 3") && refused.contains("missing"), "{refused}");
 
-    // The same through a snapshot.
+    // The same for a snapshot.
     coordinator.store.snapshot(&coordinator.state);
     let whole = recover(&coordinator.store.recovery).expect("it opens");
     assert!(
         whole.run(&run).is_ok() && whole.executions.values().all(|execution| execution.state == ExecutionState::Open)
     );
     let (_, text) = coordinator.store.recovery.snapshot.as_mut().expect("a snapshot");
-    *text = text.replace("\"format\":[1,1]", "\"format\":[3,1]");
+    *text = text.replace(&now, "\"format\":[3,1]");
     let refused = recover(&coordinator.store.recovery).expect_err("another major version");
     assert!(refused.contains("format 3.1") && refused.contains("snapshot"), "{refused}");
 }

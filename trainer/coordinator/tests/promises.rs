@@ -1,6 +1,6 @@
-//! Promises of `docs` by number, on the pure half with a clock of its own: leases, budgets, and how runs end.
+//! Numbered promises of `docs`, for the pure half with a virtual clock: leases, budgets, and ends of runs.
 //!
-//! What is here is exact where a process test could only measure: every moment is tried, and nothing waits.
+//! Unlike process tests, which can only measure, these tests are exact: they try every moment without waiting.
 
 #[allow(dead_code, reason = "not every test file uses all of it")]
 mod common;
@@ -8,14 +8,15 @@ mod common;
 use coordinator::state::task::{Lease, Part};
 use coordinator::{Control, Event, Millis, Observation, Policy, Rejected, observe};
 use protocol::message::{
-    CommitCheckpoint, Doing, FailureClass, Grant, Poll, Progress, ReportOutcome, RunState, StageState, TaskOutcome,
+    CommitCheckpoint, Doing, FailureClass, Grant, LossCause, LostPeer, Poll, Progress, ReportOutcome, RunState,
+    StageState, TaskOutcome,
 };
 use protocol::stage::WorkerRange;
 use protocol::{Digest, RunId, WorkerId};
 
 use crate::common::{PureCoordinator, failed, gang_of_three};
 
-/// Sampled: a worker that dies at each of 40 moments between two looks at the clock, 25 ms apart.
+/// Sampled: a worker dies at 40 moments between two ticks, 25 ms apart.
 #[test]
 fn p3_the_task_of_a_dead_worker_is_another_s_within_16_seconds() {
     let policy = Policy::default();
@@ -26,7 +27,7 @@ fn p3_the_task_of_a_dead_worker_is_another_s_within_16_seconds() {
         let a = coordinator.join("a");
         let lost = coordinator.assignment("a").expect("the only worker gets it").grant;
         let b = coordinator.join("b");
-        // The clock is looked at every second, from a moment that has nothing to do with when `a` was last heard.
+        // Ticks are a second apart, independent of the last poll of `a`.
         let first = coordinator.now;
         coordinator.now += offset;
         coordinator.poll("a", a);
@@ -43,7 +44,7 @@ fn p3_the_task_of_a_dead_worker_is_another_s_within_16_seconds() {
             assert!(tick < heard + 60_000, "never taken");
         };
         let after = coordinator.now - heard;
-        // The loss may be followed by a first back-off of half a second.
+        // A first back-off of half a second may follow the loss.
         let bound = policy.lease_ms + policy.tick_ms;
         assert!(after > policy.lease_ms, "a lease of {} ms ended after {after} ms", policy.lease_ms);
         let backoff = policy.backoff(1).next_multiple_of(policy.tick_ms);
@@ -77,8 +78,8 @@ fn only_the_first_member_of_a_gang_commits_and_reports_the_end() {
     assert_eq!(coordinator.run_state(&run), RunState::Finished);
 }
 
-/// Sampled: one gang of three. Its first member is silent past its lease, wakes with its old grant, tells its progress and that it lost the
-/// others; then the same as an event, as if it had been heard before the gang went on without it.
+/// Sampled: one gang of three. Its first member is silent beyond its lease and then polls with its old grant, with
+/// progress and complaints. The test then repeats the complaint as an event from before the member was removed.
 #[test]
 fn p2_what_a_member_says_that_was_left_behind_is_not_believed() {
     let mut coordinator = PureCoordinator::new(Policy::default());
@@ -97,9 +98,10 @@ fn p2_what_a_member_says_that_was_left_behind_is_not_believed() {
     }
     assert_eq!(gang(&coordinator), ["b", "c"].map(WorkerId::from));
 
-    let lost = vec!["b".into(), "c".into()];
+    let lost = |name: &str| LostPeer { worker: name.into(), cause: LossCause::Unreachable };
     let progress = Progress { done: 999, total: 1000, ..Progress::default() };
-    let doing = vec![Doing { grant: old.clone(), progress, lost: lost.clone() }];
+    let doing = Doing { holds: Some(999), lost: ["b", "c"].map(lost).into(), ..Doing::new(old.clone(), progress) };
+    let doing = vec![doing];
     let poll = Poll { incarnation: a, doing, ready: Vec::new(), version: 0 };
     let heard =
         observe(&mut coordinator.state, Millis(coordinator.now), Observation::Poll { worker: "a".into(), poll });
@@ -109,12 +111,13 @@ fn p2_what_a_member_says_that_was_left_behind_is_not_believed() {
     let told: Vec<u64> = view.stages.iter().map(|stage| stage.progress.done).collect();
     assert!(!told.contains(&999), "{told:?}");
 
-    let refused = coordinator.happen(Event::PeersLost { grant: old.clone(), lost });
-    assert!(matches!(refused, Err(Rejected::StaleFence { .. })), "{refused:?}");
+    let event = Event::GangDivided { task: old.task.clone(), fence: old.fence };
+    assert_eq!(coordinator.happen(event), Ok(Vec::new()), "the generation is over");
     assert_eq!(gang(&coordinator), ["b", "c"].map(WorkerId::from));
 }
 
-/// One gap of 8 s between two looks at the clock of a process that was stopped: who was heard in it has a lease from then on, not a lease and 8 s.
+/// A stopped process leaves a gap of 8 s between two ticks. A worker heard during the gap gets one lease from then on,
+/// without an extra 8 s.
 #[test]
 fn p3_a_late_clock_gives_nobody_more_than_a_lease_from_now() {
     let mut coordinator = PureCoordinator::new(Policy::default());
@@ -133,7 +136,7 @@ fn p3_a_late_clock_gives_nobody_more_than_a_lease_from_now() {
     assert!(coordinator.now - heard > 15_000, "its lease was cut short");
 }
 
-/// One restart after a simulated hour, with workers that come back at once, late within the lease, and never.
+/// A restart after a simulated hour, with workers that poll at once, late within the lease, or never.
 #[test]
 fn p3_after_an_hour_without_a_coordinator_leases_get_one_interval_of_grace() {
     for back_after in [0, 14_000] {
@@ -150,7 +153,7 @@ fn p3_after_an_hour_without_a_coordinator_leases_get_one_interval_of_grace() {
         coordinator.poll("a", a);
         coordinator.tick();
         assert_eq!(coordinator.assignment("a").expect("still its own").grant, held, "back after {back_after} ms");
-        // Then silent for good: nothing stays with it.
+        // After that the worker is silent and loses its task.
         for _ in 0..17 {
             coordinator.now += 1000;
             coordinator.tick();
@@ -159,7 +162,8 @@ fn p3_after_an_hour_without_a_coordinator_leases_get_one_interval_of_grace() {
     }
 }
 
-/// All pairs of budgets from 0 to 3, a restart of the coordinator between any two tries, both kinds of failure mixed.
+/// All pairs of budgets from 0 to 3, with a restart of the coordinator between any two attempts, and both kinds of
+/// failure mixed.
 #[test]
 fn p15_each_budget_allows_exactly_one_try_more_than_it_says() {
     for (faults, losses) in (0..4u32).flat_map(|f| (0..4u32).map(move |l| (f, l))) {
@@ -178,7 +182,7 @@ fn p15_each_budget_allows_exactly_one_try_more_than_it_says() {
             loop {
                 let assignment = coordinator.assignment("a").expect("granted once the back-off is over");
                 attempts += 1;
-                // The other budget is used up on the way, to its end and no further.
+                // The other budget is also used up, exactly to its end.
                 let class = if others < other && attempts % 2 == 0 {
                     others += 1;
                     if class == FailureClass::Fault { FailureClass::Infrastructure } else { FailureClass::Fault }
@@ -209,7 +213,7 @@ fn p15_each_budget_allows_exactly_one_try_more_than_it_says() {
     }
 }
 
-/// Every class of failure that trying again cannot mend, after none and after two tries that could be mended.
+/// Every class of final failure, after none and after two failures that can be retried.
 #[test]
 fn p15_a_final_failure_is_not_tried_again() {
     for class in [FailureClass::Input, FailureClass::Diverged, FailureClass::OutOfMemory, FailureClass::Storage] {
@@ -231,14 +235,14 @@ fn p15_a_final_failure_is_not_tried_again() {
             assert_eq!(view.stages[0].state, StageState::Failed);
             assert_eq!(view.stages[0].attempt.0, before + 1);
             assert!(coordinator.assignment("a").is_none());
-            // Asked for again, it begins again.
+            // A resumed run starts again.
             coordinator.control(&run, Control::Resume).expect("taken up");
             assert!(coordinator.assignment("a").is_some());
         }
     }
 }
 
-/// A run in each of its states, made as a run gets there.
+/// Brings a run into one of its states by regular events.
 fn in_state(state: RunState, held: bool) -> (PureCoordinator, RunId) {
     let mut coordinator = PureCoordinator::new(Policy::default());
     let run = coordinator.submit("dataset", WorkerRange::default());
@@ -264,9 +268,9 @@ fn in_state(state: RunState, held: bool) -> (PureCoordinator, RunId) {
     (coordinator, run)
 }
 
-/// The whole table: each state, idle and with a worker that never answers, asked for each action, with the coordinator
-/// killed before the event is stored, after it, and not at all. A process is not told by signal here: a worker that
-/// ignores everything loses its task when the grace is over, and with it the right to write.
+/// The whole table: each state, idle and with a worker that never answers, with each action. The coordinator is killed
+/// before the event is stored, after it, or not at all. A worker that ignores all requests loses its task, and the
+/// right to write, after the grace period.
 #[test]
 fn p14_pause_resume_and_cancel_end_where_the_table_says_whoever_is_killed() {
     use RunState::{Cancelled, Failed, Finished, Paused, Running};
@@ -284,7 +288,7 @@ fn p14_pause_resume_and_cancel_end_where_the_table_says_whoever_is_killed() {
                     let case = format!("{state:?}, held: {held}, {action:?}, killed {killed}");
                     let (mut coordinator, run) = in_state(state, held);
                     if killed == "before" {
-                        // Nobody was answered, so the client asks again.
+                        // The request was not answered, so the client repeats it.
                         coordinator.restart(false);
                     }
                     let asked = coordinator.control(&run, action);
@@ -299,7 +303,7 @@ fn p14_pause_resume_and_cancel_end_where_the_table_says_whoever_is_killed() {
                     while coordinator.is_held() && expected != Running {
                         coordinator.now += 1000;
                         if worker {
-                            // It lives and polls, and does not do what it is told.
+                            // The worker polls but ignores the request.
                             coordinator.poll("a", coordinator.state.workers[&"a".into()].incarnation);
                         }
                         coordinator.tick();
@@ -313,7 +317,7 @@ fn p14_pause_resume_and_cancel_end_where_the_table_says_whoever_is_killed() {
     }
 }
 
-/// Draining with a worker that does not answer; then a new start gives the work out again.
+/// Drains with a worker that does not react; the next start grants the work again.
 #[test]
 fn p14_a_drain_ends_though_a_worker_ignores_it() {
     let (mut coordinator, run) = in_state(RunState::Running, true);
@@ -343,7 +347,7 @@ fn members(coordinator: &PureCoordinator) -> Vec<String> {
     gang.map(|member| member.worker.to_string()).collect()
 }
 
-/// Sampled: of three workers one has the inputs when the stage begins, one gets them later, one never does.
+/// Sampled: of three workers, one has the inputs when the stage starts, one gets them later, and one never does.
 #[test]
 fn p4_a_gang_waits_for_nobody_who_fetches_its_inputs() {
     let mut coordinator = PureCoordinator::new(Policy::default());
@@ -379,14 +383,14 @@ fn p4_a_gang_waits_for_nobody_who_fetches_its_inputs() {
     coordinator.prepare("a");
     assert_eq!(members(&coordinator), ["b", "a"]);
     assert_eq!(coordinator.assignment("b").expect("it trains").grant.attempt, held.grant.attempt);
-    // With nobody left to hand it over, a worker that begins needs the checkpoint too.
+    // Without a member to hand over the state, a new worker needs the checkpoint too.
     for name in ["a", "b"] {
-        coordinator.happen(Event::WorkerGone { worker: name.into() }).expect("gone");
+        coordinator.happen(Event::WorkerGone { worker: name.into(), incarnation: None }).expect("gone");
     }
     assert_eq!(coordinator.asked("c")[0].resume, Some(Digest::of(b"state")));
 }
 
-/// Sampled: two workers of one instruction set and one of another, before and after something is saved.
+/// Sampled: two workers of one instruction set and one of another, before and after a checkpoint.
 #[test]
 fn p1_all_that_work_on_a_stage_share_an_instruction_set() {
     let mut coordinator = PureCoordinator::new(Policy::default());
@@ -404,7 +408,7 @@ fn p1_all_that_work_on_a_stage_share_an_instruction_set() {
     assert_eq!(vae(&coordinator).instruction_set.as_deref(), Some("avx2"));
     let over = |coordinator: &mut PureCoordinator, names: &[&str]| {
         for name in names {
-            coordinator.happen(Event::WorkerGone { worker: (*name).into() }).expect("gone");
+            coordinator.happen(Event::WorkerGone { worker: (*name).into(), incarnation: None }).expect("gone");
         }
         for _ in 0..5 {
             coordinator.now += 1_000;

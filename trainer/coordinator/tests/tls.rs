@@ -1,4 +1,4 @@
-//! TLS: the right certificate is believed, and no other.
+//! Tests of TLS: clients trust the right certificate and no other.
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
 use std::fs;
@@ -18,7 +18,7 @@ struct Files {
     key: PathBuf,
 }
 
-/// An authority, and a certificate of it for `localhost`.
+/// Creates an authority and its certificate for `localhost`.
 fn authority(dir: &Path, name: &str) -> Files {
     let files = Files {
         ca: dir.join(format!("{name}.ca.pem")),
@@ -72,13 +72,19 @@ async fn only_the_pinned_authority_is_believed() {
     let by_address = ask(&format!("https://127.0.0.1:{port}"), &token, Some(&ours.ca)).await.unwrap_err();
     assert!(by_address.contains("another name"), "{by_address}");
 
-    // Plain HTTP is told what to do, and never reaches a route.
+    // A session that is bought here is sent here alone, and never without TLS.
+    let server = Server::new(&url, Some(token.clone()), Some(&ours.ca)).unwrap();
+    let bought = server.request(Method::POST, "/v1/session").send().await.unwrap();
+    let cookie = bought.headers()["set-cookie"].to_str().unwrap().to_owned();
+    assert!(cookie.starts_with(&format!("__Host-stride-{port}=")) && cookie.contains("; Secure"), "{cookie}");
+
+    // A plain HTTP request gets advice and never reaches a route.
     let (status, text) = ask(&format!("http://localhost:{port}"), &token, None).await.unwrap();
     assert!(status == 400 && text.contains("this server speaks TLS"), "{status} {text}");
     let refused = ask(&format!("http://localhost:{port}"), &token, Some(&ours.ca)).await.unwrap_err();
     assert!(refused.contains("not encrypted"), "{refused}");
 
-    // This machine's own commands have a door without TLS, and `https` there says what is wrong.
+    // Commands on this machine use an address without TLS; `https` there gives a clear error.
     assert_eq!(ask(&handle.local_url(), handle.token(), None).await.unwrap().0, 200);
     let local = handle.local_url().replace("http://127.0.0.1", "https://localhost");
     let plain = ask(&local, &token, Some(&ours.ca)).await.unwrap_err();
@@ -92,7 +98,7 @@ fn keys_that_everybody_can_read_and_files_that_do_not_fit_are_refused() {
     let (ours, theirs) = (authority(dir.path(), "ours"), authority(dir.path(), "theirs"));
     assert!(tls::server(&ours.certificate, &ours.key).is_ok());
     let mixed = tls::server(&ours.certificate, &theirs.key).unwrap_err().to_string();
-    assert!(mixed.contains("does not serve with the key"), "{mixed}");
+    assert!(mixed.contains("does not match the key"), "{mixed}");
     let swapped = tls::server(&ours.key, &ours.key).unwrap_err().to_string();
     assert!(swapped.contains("no certificate in PEM"), "{swapped}");
     fs::set_permissions(&ours.key, fs::Permissions::from_mode(0o644)).unwrap();

@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-use motion::files;
+use motion::DataPath;
 
 use crate::error::HubError;
 use crate::found::Found;
@@ -51,14 +51,14 @@ fn commit(settings: &Settings, name: &Name) -> Option<String> {
         return Some(name.revision.clone());
     }
     // A branch that was never resolved has no file.
-    let bytes = files::read(&root(settings, name).join("refs").join(&name.revision), COMMIT_BYTES).ok()?;
+    let bytes = DataPath::local(root(settings, name).join("refs").join(&name.revision)).read(COMMIT_BYTES).ok()?;
     String::from_utf8(bytes).ok().map(|text| text.trim().to_owned()).filter(|text| is_commit(text))
 }
 
 fn names(folder: &Path) -> BTreeSet<String> {
     // Missing files are reported by the reader that needs them.
-    let Ok(all) = files::tree(folder) else { return BTreeSet::new() };
-    let name = |path: PathBuf| Some(path.strip_prefix(folder).ok()?.to_string_lossy().into_owned());
+    let Ok(all) = DataPath::local(folder).tree() else { return BTreeSet::new() };
+    let name = |path: DataPath| Some(path.shown().strip_prefix(folder).ok()?.to_string_lossy().into_owned());
     all.into_iter().filter_map(name).collect()
 }
 

@@ -64,7 +64,7 @@ impl Settings {
 /// Reads the token that `hf auth login` stores, if there is one.
 fn kept_token(file: &Path) -> Option<String> {
     // Public repositories need no token.
-    let bytes = motion::files::read(file, TOKEN_BYTES).ok()?;
+    let bytes = motion::DataPath::local(file).read(TOKEN_BYTES).ok()?;
     let token = String::from_utf8(bytes).ok()?.trim().to_owned();
     (!token.is_empty()).then_some(token)
 }

@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Component, Path, PathBuf};
 
-use motion::files;
+use motion::DataPath;
 use serde::Deserialize;
 
 use crate::error::HubError;
@@ -93,7 +93,7 @@ fn repository_file(repository: &mut dyn Repository, name: &str) -> Result<PathBu
 
 fn json<T: serde::de::DeserializeOwned>(repository: &mut dyn Repository, name: &str) -> Result<T, Failure> {
     let file = repository_file(repository, name)?;
-    let bytes = files::read(&file, LISTING_BYTES).map_err(|e| Failure::Content(format!("`{name}` {e}")))?;
+    let bytes = DataPath::local(file).read(LISTING_BYTES).map_err(|e| Failure::Content(format!("`{name}` {e}")))?;
     serde_json::from_slice(&bytes).map_err(|e| Failure::Content(format!("`{name}`: {e}")))
 }
 

@@ -156,10 +156,11 @@ fn what_is_read_is_fetched_once_and_found_again() {
     let found = fetch(&settings, "", Encoder::SentenceT5).expect("it is there");
     let root = cache.path().join("models--org--small");
     assert_eq!((&found.folder, found.commit.as_str()), (&root.join("snapshots").join(COMMIT), COMMIT));
-    let mut files: Vec<String> = motion::files::tree(&found.folder)
+    let mut files: Vec<String> = motion::DataPath::local(&found.folder)
+        .tree()
         .expect("a folder")
         .iter()
-        .map(|file| file.strip_prefix(&found.folder).expect("below").display().to_string())
+        .map(|file| file.shown().strip_prefix(&found.folder).expect("below").display().to_string())
         .collect();
     files.sort();
     let read = [

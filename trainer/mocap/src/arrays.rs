@@ -10,9 +10,9 @@
 use std::io::{Cursor, Read as _};
 use std::path::Path;
 
-use motion::files;
+use motion::DataPath;
 use motion::npy::{self, Array};
-use protocol::limits;
+use protocol::{excerpt, excerpts, limits};
 
 /// Names of joint arrays in an `.npz`, in order of preference.
 pub const KEYS: [&str; 7] = ["joints", "Jtr", "joints3d", "positions", "new_joints", "keypoints3d", "arr_0"];
@@ -36,9 +36,9 @@ pub struct Joints {
 ///
 /// # Errors
 /// A message that names the file.
-pub fn read(file: &Path) -> Result<Joints, String> {
-    let bytes = files::read(file, limits::CLIP_BYTES).map_err(|e| format!("{}: {e}", file.display()))?;
-    parse(file, &bytes)
+pub fn read(file: &DataPath) -> Result<Joints, String> {
+    let bytes = file.read(limits::CLIP_BYTES).map_err(|e| format!("{}: {e}", file.display()))?;
+    parse(file.shown(), &bytes)
 }
 
 /// Reads joints from a file's bytes; `file` is only its name in errors.
@@ -50,7 +50,8 @@ pub fn parse(file: &Path, bytes: &[u8]) -> Result<Joints, String> {
     if !bytes.starts_with(b"PK") {
         return joints(file, npy::parse(file, bytes, true).map_err(|e| e.to_string())?, None);
     }
-    let mut archive = zip::ZipArchive::new(Cursor::new(bytes)).map_err(|e| format!("{shown}: no .npz archive: {e}"))?;
+    let mut archive = zip::ZipArchive::new(Cursor::new(bytes))
+        .map_err(|e| format!("{shown}: no .npz archive: {}", excerpt(&e.to_string())))?;
     if archive.len() > MEMBERS {
         return Err(format!("{shown}: {} arrays, at most {MEMBERS} are read", archive.len()));
     }
@@ -63,10 +64,9 @@ pub fn parse(file: &Path, bytes: &[u8]) -> Result<Joints, String> {
         } else {
             ""
         };
-        let some: Vec<&str> = names.iter().map(String::as_str).take(20).collect();
         return Err(format!(
             "{shown}: has {}, expected joints [T, J, 3] as one of {}{hint}",
-            some.join(", "),
+            excerpts(names.iter().map(String::as_str), 20),
             KEYS.join(", ")
         ));
     };
@@ -79,9 +79,10 @@ pub fn parse(file: &Path, bytes: &[u8]) -> Result<Joints, String> {
 /// Unpacks a member's bytes.
 fn member(file: &Path, archive: &mut zip::ZipArchive<Cursor<&[u8]>>, key: &str) -> Result<Vec<u8>, String> {
     let fail = |what: String| format!("{}: array `{key}`: {what}", file.display());
-    let member = archive.by_name(&format!("{key}.npy")).map_err(|e| fail(e.to_string()))?;
+    let unpack = |e: &dyn std::fmt::Display| fail(format!("cannot be unpacked: {}", excerpt(&e.to_string())));
+    let member = archive.by_name(&format!("{key}.npy")).map_err(|e| unpack(&e))?;
     let mut bytes = vec![];
-    member.take(limits::CLIP_BYTES + 1).read_to_end(&mut bytes).map_err(|e| fail(e.to_string()))?;
+    member.take(limits::CLIP_BYTES + 1).read_to_end(&mut bytes).map_err(|e| unpack(&e))?;
     if bytes.len() as u64 > limits::CLIP_BYTES {
         return Err(fail(format!("unpacks to more than {} bytes; no more are read", limits::CLIP_BYTES)));
     }
@@ -155,7 +156,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("take.npz");
         std::fs::write(&file, bytes).unwrap();
-        read(&file)
+        read(&DataPath::local(file))
     }
 
     #[test]
@@ -174,6 +175,7 @@ mod tests {
         }
         let kit = npy::to_bytes(&[2, 63], &data[..126]).unwrap();
         assert_eq!(read_bytes(&kit).unwrap(), Joints { data: data[..126].to_vec(), joints: 21, rate: None });
+        protocol::show_excerpts();
         let said = |members: &[(&str, Vec<u8>)]| read_bytes(&archive(members)).unwrap_err();
         assert!(said(&[("poses", kit.clone()), ("trans", kit.clone())]).contains("body parameters"));
         assert!(said(&[("x", kit.clone())]).contains("has x, expected joints"));

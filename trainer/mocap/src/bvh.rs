@@ -29,9 +29,9 @@ mod write;
 
 pub use write::{ROTATIONS, angles};
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
-use motion::files;
+use motion::DataPath;
 use motion::quaternion::{self as quat, Quat, Vec3};
 
 /// Largest size of a file, in bytes.
@@ -127,9 +127,9 @@ impl Bvh {
     ///
     /// # Errors
     /// The defect, with file and line.
-    pub fn read(file: &Path) -> Result<Self, BvhError> {
-        let bytes = files::read(file, MAX_BYTES).map_err(|source| BvhError::Io { file: file.into(), source })?;
-        Self::parse(file, &bytes)
+    pub fn read(file: &DataPath) -> Result<Self, BvhError> {
+        let bytes = file.read(MAX_BYTES).map_err(|source| BvhError::Io { file: file.shown().into(), source })?;
+        Self::parse(file.shown(), &bytes)
     }
 
     /// Number of values in a row.

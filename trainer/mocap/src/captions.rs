@@ -12,7 +12,7 @@ use std::path::Path;
 
 use motion::synthetic::tokens;
 use motion::text::{self, Caption};
-use protocol::excerpt;
+use protocol::{excerpt, json_mistake};
 use serde_json::Value;
 
 /// Names of the column with the clip.
@@ -175,7 +175,7 @@ fn csv_records(content: &str) -> Result<Vec<(usize, Vec<String>)>, String> {
 }
 
 fn of_json(content: &str) -> Result<Vec<Row>, String> {
-    let value: Value = serde_json::from_str(content).map_err(|e| format!(" {e}"))?;
+    let value: Value = serde_json::from_str(content).map_err(|e| format!(" {}", json_mistake(&e)))?;
     let sentences = |value: &Value| -> Result<Vec<Caption>, String> {
         let one = |value: &Value| {
             value.as_str().ok_or_else(|| format!("`{}` is no sentence", excerpt(&value.to_string()))).and_then(sentence)
@@ -277,6 +277,7 @@ mod tests {
 
     #[test]
     fn tables_say_what_their_rows_say() {
+        protocol::show_excerpts();
         let file = Path::new("captions.csv");
         let csv = "name,Caption,from,to,source\r\nwalks/a.bvh,\"a man, \"\"slowly\"\",\nwalks\",,,take 1\r\n\r\nb,turns left,0.5,3,\r\n";
         let rows = of_table(file, csv).unwrap();

@@ -7,14 +7,13 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
-use std::path::Path;
 
 use motion::dataset::{Clip, Entry, Split, statistics};
 use motion::features::{extract, mirror_joints};
 use motion::quaternion::{self as quat, Vec3};
 use motion::random::Stream;
 use motion::text::Caption;
-use motion::{Dataset, Skeleton};
+use motion::{DataPath, Dataset, Skeleton};
 use protocol::Seed;
 use protocol::stage::DataFormat;
 use serde::{Deserialize, Serialize};
@@ -73,9 +72,9 @@ pub struct FromFile {
 ///
 /// # Errors
 /// A message that names the file.
-pub fn joints(file: &Path, recipe: &Recipe) -> Result<(Vec<f32>, String, Up), String> {
+pub fn joints(file: &DataPath, recipe: &Recipe) -> Result<(Vec<f32>, String, Up), String> {
     let skeleton = Skeleton::of(recipe.format);
-    let is_bvh = file.extension().is_some_and(|e| e.eq_ignore_ascii_case("bvh"));
+    let is_bvh = file.shown().extension().is_some_and(|e| e.eq_ignore_ascii_case("bvh"));
     let (take, width) = if is_bvh {
         let bvh = Bvh::read(file).map_err(|e| e.to_string())?;
         (Take::of_bvh(&bvh, &recipe.reading).map_err(|e| format!("{}: {e}", file.display()))?, 66)
@@ -102,7 +101,7 @@ pub fn joints(file: &Path, recipe: &Recipe) -> Result<(Vec<f32>, String, Up), St
 }
 
 /// Reads arrays unchanged from `.npy`, as metres and y up by default; the axis of `.npz` is detected.
-fn of_array(file: &Path, recipe: &Recipe) -> Result<(Take, usize), String> {
+fn of_array(file: &DataPath, recipe: &Recipe) -> Result<(Take, usize), String> {
     let found = arrays::read(file)?;
     let format = if found.joints == 21 { DataFormat::Kit } else { DataFormat::Humanml3d };
     let rate = found.rate.or(recipe.rate).unwrap_or(Skeleton::of(format).fps);
@@ -115,7 +114,7 @@ fn of_array(file: &Path, recipe: &Recipe) -> Result<(Take, usize), String> {
     }
     let wide: Vec<f64> = found.data.iter().map(|v| f64::from(*v)).collect();
     let points = |frame: &[f64]| -> Vec<Vec3> { frame.chunks_exact(3).map(|p| [p[0], p[1], p[2]]).collect() };
-    let zipped = file.extension().is_some_and(|e| e.eq_ignore_ascii_case("npz"));
+    let zipped = file.shown().extension().is_some_and(|e| e.eq_ignore_ascii_case("npz"));
     let mut up = recipe.reading.up.unwrap_or(Up::Y);
     let mut said = format!("{} joints, {up} up", found.joints);
     if found.joints == 22 {
@@ -415,7 +414,7 @@ pub fn spread(count: usize, most: usize) -> Vec<usize> {
 ///
 /// # Errors
 /// A message that names the file.
-pub fn read_target(file: &Path, skeleton: &Skeleton) -> Result<Vec<f64>, String> {
+pub fn read_target(file: &DataPath, skeleton: &Skeleton) -> Result<Vec<f64>, String> {
     let array = motion::npy::read_any_float(file).map_err(|e| e.to_string())?;
     let joints = skeleton.joints;
     let lengths = match array.shape[..] {

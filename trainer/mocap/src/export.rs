@@ -13,7 +13,7 @@ use std::process::{Command, Stdio};
 use motion::features::recover_joints;
 use motion::npy::{self, NpyError};
 use motion::waypoints::Waypoint;
-use motion::{Skeleton, draw};
+use motion::{DataPath, Skeleton, draw};
 use protocol::stage::DataFormat;
 
 use crate::body::Body;
@@ -182,7 +182,7 @@ impl Motion {
         match Form::of(file) {
             Ok(Form::Npy) => Self::read_npy(file),
             Ok(Form::Bvh) => {
-                let bvh = Bvh::read(file)?;
+                let bvh = Bvh::read(&DataPath::local(file))?;
                 let take = Take::of_bvh(&bvh, reading);
                 let take = take.map_err(|source| ExportError::Map { file: file.into(), source })?;
                 let skeleton = Skeleton::of(DataFormat::Humanml3d);
@@ -208,7 +208,7 @@ impl Motion {
     /// # Errors
     /// If the file is no array, has another shape, or has values that are not finite.
     pub fn read_npy(file: &Path) -> Result<Self, ExportError> {
-        let array = npy::read_any_float(file)?;
+        let array = npy::read_any_float(&DataPath::local(file))?;
         let refuse = |what: String| ExportError::Array { file: file.into(), what };
         let known = [DataFormat::Humanml3d, DataFormat::Kit].map(Skeleton::of);
         let fits = |skeleton: &&&Skeleton| match array.shape[..] {

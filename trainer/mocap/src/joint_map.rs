@@ -20,12 +20,11 @@ use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
-use motion::Skeleton;
-use motion::files;
 use motion::quaternion::{self as quat, Vec3};
-use protocol::excerpt;
+use motion::{DataPath, Skeleton};
 use protocol::pipeline::yaml_as_json;
 use protocol::stage::DataFormat;
+use protocol::{excerpt, excerpts, json_mistake};
 use serde::{Deserialize, Serialize};
 
 use crate::bvh::Bvh;
@@ -156,20 +155,32 @@ enum Place {
 }
 
 impl JointMap {
-    /// Loads a built-in map by its name, or a map from a file.
+    /// A shipped map by its name.
+    pub fn shipped(name: &str) -> Option<Self> {
+        let (name, text) = SHIPPED.iter().find(|(shipped, _)| *shipped == name)?;
+        Self::parse(Path::new(name), text).ok()
+    }
+
+    /// The map in a file.
+    ///
+    /// # Errors
+    /// It is not there, or is no map.
+    pub fn read(file: &DataPath) -> Result<Self, MapError> {
+        match file.read(MAP_BYTES) {
+            Ok(bytes) => Self::parse(file.shown(), &String::from_utf8_lossy(&bytes)),
+            Err(error) if error.kind() == std::io::ErrorKind::NotFound => {
+                Err(MapError::Unknown { name: file.display().to_string() })
+            }
+            Err(source) => Err(MapError::Io { file: file.shown().into(), source }),
+        }
+    }
+
+    /// A shipped map by its name, or a map of a file of the user's own.
     ///
     /// # Errors
     /// If neither exists, or the file is not a map.
     pub fn load(name: &str) -> Result<Self, MapError> {
-        if let Some((name, text)) = SHIPPED.iter().find(|(shipped, _)| *shipped == name) {
-            return Self::parse(Path::new(name), text);
-        }
-        let file = Path::new(name);
-        match files::read(file, MAP_BYTES) {
-            Ok(bytes) => Self::parse(file, &String::from_utf8_lossy(&bytes)),
-            Err(error) if error.kind() == std::io::ErrorKind::NotFound => Err(MapError::Unknown { name: name.into() }),
-            Err(source) => Err(MapError::Io { file: file.into(), source }),
-        }
+        Self::shipped(name).map_or_else(|| Self::read(&DataPath::local(name)), Ok)
     }
 
     /// Parses a map; `file` is only its name in errors.
@@ -178,8 +189,9 @@ impl JointMap {
     /// YAML that is not a map, missing joints, or unknown ones.
     pub fn parse(file: &Path, text: &str) -> Result<Self, MapError> {
         let fail = |what: String| MapError::Text { file: file.into(), what };
-        let value = yaml_as_json(text).map_err(|mistakes| fail(mistakes.join("; ")))?;
-        let map: Self = serde_json::from_value(value).map_err(|e| fail(format!(" {e}; expected `name` and `joints`, each a node's name, {{from, towards, fraction}} or {{between, towards, metres}}")))?;
+        let value =
+            yaml_as_json(text).map_err(|mistakes| fail(format!(" no map: {}", excerpt(&mistakes.join("; ")))))?;
+        let map: Self = serde_json::from_value(value).map_err(|e| fail(format!(" {}; expected `name` and `joints`, each a node's name, {{from, towards, fraction}} or {{between, towards, metres}}", json_mistake(&e))))?;
         let names = joint_names();
         let missing: Vec<&str> = names.iter().copied().filter(|name| !map.joints.contains_key(*name)).collect();
         let strange: Vec<&str> = map.joints.keys().map(String::as_str).filter(|name| !names.contains(name)).collect();
@@ -263,9 +275,9 @@ impl JointMap {
             (0..bvh.nodes.len()).filter(|i| same(&bvh.nodes[*i].name)).collect()
         };
         let fail = |problem: String| MapError::Node {
-            map: self.name.clone(),
+            map: excerpt(&self.name),
             joint: joint.into(),
-            node: node.into(),
+            node: excerpt(node),
             problem,
         };
         let mut found = all(&|name| name == node);
@@ -275,8 +287,8 @@ impl JointMap {
         match found[..] {
             [one] => Ok(one),
             [] => {
-                let names: Vec<&str> = bvh.nodes.iter().filter(|n| !n.end).map(|n| n.name.as_str()).take(60).collect();
-                Err(fail(format!("which the file has not; it has {}", names.join(", "))))
+                let names = bvh.nodes.iter().filter(|n| !n.end).map(|n| n.name.as_str());
+                Err(fail(format!("which the file has not; it has {}", excerpts(names, 60))))
             }
             _ => Err(fail(format!("and the file has {} nodes of that name", found.len()))),
         }

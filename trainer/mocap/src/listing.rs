@@ -10,10 +10,10 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 use std::path::{Path, PathBuf};
 
+use motion::DataPath;
 use motion::dataset::{Split, is_clip_id};
-use motion::files;
 use motion::text::Caption;
-use protocol::limits;
+use protocol::{excerpt, excerpts, limits};
 
 use crate::captions;
 
@@ -25,10 +25,10 @@ const NO_CLIPS: [&str; 4] = ["Mean", "Std", "mean", "std"];
 const SHOWN: usize = 40;
 
 /// A clip that is not read yet.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone)]
 pub struct ClipFile {
     pub id: String,
-    pub path: PathBuf,
+    pub path: DataPath,
     /// The recording that the clip belongs to.
     pub source: String,
     pub captions: Vec<Caption>,
@@ -37,7 +37,7 @@ pub struct ClipFile {
 }
 
 /// The clips of a folder.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone)]
 pub struct Listing {
     /// Clips sorted by id.
     pub clips: Vec<ClipFile>,
@@ -69,19 +69,20 @@ impl fmt::Display for ListError {
 
 impl std::error::Error for ListError {}
 
-/// Lists a folder; `table` is a file of captions, relative to the working directory.
+/// Looks through a folder; `table` is a file of captions, which need not be in it.
 ///
 /// # Errors
 /// All mistakes of the folder together.
-pub fn list(folder: &Path, table: Option<&Path>) -> Result<Listing, ListError> {
-    let fail = |problems| ListError { folder: folder.into(), problems };
-    let root = ["joints", "new_joints"].iter().map(|name| folder.join(name)).find(|path| path.is_dir());
-    let root = root.unwrap_or_else(|| folder.to_owned());
-    let found = files::tree(&root).map_err(|e| fail(vec![e.to_string()]))?;
+pub fn list(folder: &DataPath, table: Option<&DataPath>) -> Result<Listing, ListError> {
+    let fail = |problems| ListError { folder: folder.shown().into(), problems };
+    let root = ["joints", "new_joints"].iter().map(|name| folder.join(name)).find(DataPath::is_folder);
+    let root = root.unwrap_or_else(|| folder.clone());
+    let found = root.tree().map_err(|e| fail(vec![e.to_string()]))?;
     let (mut problems, mut clips) = (vec![], BTreeMap::new());
     for path in found {
-        let ending = path.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase).unwrap_or_default();
-        let id = id_of(path.strip_prefix(&root).unwrap_or(&path));
+        let shown = path.shown();
+        let ending = shown.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase).unwrap_or_default();
+        let id = id_of(shown.strip_prefix(root.shown()).unwrap_or(shown));
         if !ENDINGS.contains(&ending.as_str()) || NO_CLIPS.contains(&id.as_str()) || id == "tgt_offsets" {
             continue;
         }
@@ -113,8 +114,8 @@ pub fn list(folder: &Path, table: Option<&Path>) -> Result<Listing, ListError> {
     }
     for (file, required) in tables(folder, table) {
         match read_text(&file, limits::CLIP_LIST_BYTES) {
-            Ok(Some(text)) => match captions::of_table(&file, &text) {
-                Ok(rows) => apply(&file, rows, &mut clips, &mut notes, &mut problems),
+            Ok(Some(text)) => match captions::of_table(file.shown(), &text) {
+                Ok(rows) => apply(file.shown(), rows, &mut clips, &mut notes, &mut problems),
                 Err(problem) => problems.push(problem),
             },
             Ok(None) if required => problems.push(format!("{}: no such file", file.display())),
@@ -136,8 +137,8 @@ fn id_of(path: &Path) -> String {
     parts.iter().map(|part| part.to_string_lossy()).collect::<Vec<_>>().join("_")
 }
 
-fn read_text(file: &Path, most: u64) -> Result<Option<String>, String> {
-    match files::read(file, most) {
+fn read_text(file: &DataPath, most: u64) -> Result<Option<String>, String> {
+    match file.read(most) {
         Err(e) if e.kind() == std::io::ErrorKind::NotFound => Ok(None),
         Err(e) => Err(format!("{}: {e}", file.display())),
         Ok(bytes) => String::from_utf8(bytes).map(Some).map_err(|_| format!("{}: not UTF-8 text", file.display())),
@@ -145,19 +146,19 @@ fn read_text(file: &Path, most: u64) -> Result<Option<String>, String> {
 }
 
 /// Reads the captions in a clip's own file.
-fn texts(folder: &Path, clip: &mut ClipFile) -> Result<(), String> {
+fn texts(folder: &DataPath, clip: &mut ClipFile) -> Result<(), String> {
     for file in [folder.join("texts").join(format!("{}.txt", clip.id)), clip.path.with_extension("txt")] {
         if let Some(text) = read_text(&file, limits::CAPTIONS_BYTES)? {
-            clip.captions = captions::of_text(&file, &text)?;
+            clip.captions = captions::of_text(file.shown(), &text)?;
             break;
         }
     }
     Ok(())
 }
 
-fn tables(folder: &Path, table: Option<&Path>) -> Vec<(PathBuf, bool)> {
+fn tables(folder: &DataPath, table: Option<&DataPath>) -> Vec<(DataPath, bool)> {
     let own = match table {
-        Some(table) => vec![(table.to_owned(), true)],
+        Some(table) => vec![(table.clone(), true)],
         None => vec![(folder.join("captions.csv"), false), (folder.join("captions.json"), false)],
     };
     own.into_iter().chain([(folder.join("index.csv"), false)]).collect()
@@ -174,7 +175,7 @@ fn apply(
 ) {
     let mut by_stem: BTreeMap<String, Vec<String>> = BTreeMap::new();
     for clip in clips.values() {
-        let stem = clip.path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+        let stem = clip.path.shown().file_stem().unwrap_or_default().to_string_lossy().into_owned();
         by_stem.entry(stem).or_default().push(clip.id.clone());
     }
     let mut unknown = BTreeSet::new();
@@ -191,7 +192,7 @@ fn apply(
                 problems.push(format!(
                     "{}: `{}` may be {}; write the path",
                     file.display(),
-                    row.clip,
+                    excerpt(&row.clip),
                     ids.join(" or ")
                 ));
                 continue;
@@ -211,18 +212,17 @@ fn apply(
         }
     }
     if !unknown.is_empty() {
-        let some: Vec<&str> = unknown.iter().map(String::as_str).take(5).collect();
         notes.push(format!(
             "{}: {} rows are of clips that the folder has not, such as {}",
             file.display(),
             unknown.len(),
-            some.join(", ")
+            excerpts(unknown.iter().map(String::as_str), 5)
         ));
     }
 }
 
 /// Reads the folder's own lists. Returns false if one of the three is missing.
-fn lists(folder: &Path, clips: &mut BTreeMap<String, ClipFile>, problems: &mut Vec<String>) -> bool {
+fn lists(folder: &DataPath, clips: &mut BTreeMap<String, ClipFile>, problems: &mut Vec<String>) -> bool {
     let mut texts = vec![];
     for split in Split::ALL {
         match read_text(&folder.join(format!("{split}.txt")), limits::CLIP_LIST_BYTES) {
@@ -250,6 +250,10 @@ mod tests {
 
     use super::*;
 
+    fn local(path: impl Into<PathBuf>) -> DataPath {
+        DataPath::local(path)
+    }
+
     fn folder(files: &[(&str, &str)]) -> tempfile::TempDir {
         let folder = tempfile::tempdir().unwrap();
         for (name, content) in files {
@@ -262,6 +266,7 @@ mod tests {
 
     #[test]
     fn captions_and_sources_find_their_clips() {
+        protocol::show_excerpts();
         let folder = folder(&[
             ("a/walk.bvh", ""),
             ("a/run.BVH", ""),
@@ -272,7 +277,7 @@ mod tests {
             ("texts/a_run.txt", "a man runs#a/DET#0.0#0.0\n"),
             ("captions.csv", "file,caption,source\nb/walk.npz,walks on,take\nrun,runs,take\nnone,x,\n"),
         ]);
-        let listing = list(folder.path(), None).unwrap();
+        let listing = list(&local(folder.path()), None).unwrap();
         let ids: Vec<&str> = listing.clips.iter().map(|clip| clip.id.as_str()).collect();
         assert_eq!(ids, ["a_run", "a_walk", "b_walk"]);
         let captions: Vec<Vec<&str>> =
@@ -281,12 +286,13 @@ mod tests {
         let sources: Vec<&str> = listing.clips.iter().map(|clip| clip.source.as_str()).collect();
         assert_eq!(sources, ["take", "a_walk", "take"]);
         assert!(listing.notes[0].contains("1 rows") && listing.notes[0].contains("none") && !listing.has_lists);
-        let said = list(folder.path(), Some(Path::new("gone.csv"))).unwrap_err().to_string();
+        let said = list(&local(folder.path()), Some(&local("gone.csv"))).unwrap_err().to_string();
         assert!(said.contains("gone.csv: no such file"), "{said}");
     }
 
     #[test]
     fn all_mistakes_of_a_folder_come_together() {
+        protocol::show_excerpts();
         let folder = folder(&[
             ("a/b.bvh", ""),
             ("a_b.npy", ""),
@@ -298,7 +304,7 @@ mod tests {
             ("val.txt", "c_b"),
             ("test.txt", ""),
         ]);
-        let said = list(folder.path(), None).unwrap_err();
+        let said = list(&local(folder.path()), None).unwrap_err();
         let text = said.to_string();
         for part in
             ["gives the clip `a_b` too", "a_b.txt:1: 1 field", "`b` may be c_b or d_b", "`c_b` is in more than one"]
@@ -306,7 +312,7 @@ mod tests {
             assert!(text.contains(part), "{part}: {text}");
         }
         let empty = tempfile::tempdir().unwrap();
-        assert!(list(empty.path(), None).unwrap_err().to_string().contains("no file that ends in .bvh"));
-        assert!(list(&empty.path().join("gone"), None).unwrap_err().to_string().contains("gone"));
+        assert!(list(&local(empty.path()), None).unwrap_err().to_string().contains("no file that ends in .bvh"));
+        assert!(list(&local(empty.path().join("gone")), None).unwrap_err().to_string().contains("gone"));
     }
 }

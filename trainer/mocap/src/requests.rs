@@ -15,7 +15,7 @@ use std::io::Read;
 use std::path::Path;
 use std::str::FromStr;
 
-use motion::files;
+use motion::DataPath;
 use serde::Deserialize;
 
 /// Largest size of a file, in bytes.
@@ -123,7 +123,7 @@ pub fn read(file: &Path) -> Result<Vec<Request>, RequestError> {
         }
         bytes
     } else {
-        files::read(file, MOST_BYTES).map_err(failed)?
+        DataPath::local(file).read(MOST_BYTES).map_err(failed)?
     };
     let text = String::from_utf8(bytes).map_err(|_| format!("{name}: is no text in UTF-8"))?;
     let ending = file.extension().and_then(|ending| ending.to_str()).unwrap_or_default().to_lowercase();

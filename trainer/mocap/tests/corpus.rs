@@ -10,7 +10,7 @@ use mocap::listing::{Listing, list};
 use mocap::sample::write_bvh_folder;
 use mocap::take::Reading;
 use motion::dataset::Split;
-use motion::{Dataset, Skeleton, synthetic};
+use motion::{DataPath, Dataset, Skeleton, synthetic};
 use protocol::Seed;
 use protocol::stage::{DataFormat, DataSynthetic};
 use shared::{entries, load, worst};
@@ -20,7 +20,7 @@ fn recipe(format: DataFormat, target: Option<Vec<f64>>) -> Recipe {
 }
 
 fn target(folder: &Path, format: DataFormat) -> Option<Vec<f64>> {
-    Some(read_target(&folder.join("tgt_offsets.npy"), Skeleton::of(format)).expect("well formed"))
+    Some(read_target(&DataPath::local(folder.join("tgt_offsets.npy")), Skeleton::of(format)).expect("well formed"))
 }
 
 /// Makes all clips of a folder, in order.
@@ -50,7 +50,7 @@ fn the_mini_sets_are_made_again() {
         [("humanml3d-mini", DataFormat::Humanml3d, 5e-4), ("kit-mini", DataFormat::Kit, 5e-3)]
     {
         let Some(folder) = shared::data(part) else { return };
-        let listing = list(&folder, None).unwrap_or_else(|e| panic!("{e}"));
+        let listing = list(&DataPath::local(&folder), None).unwrap_or_else(|e| panic!("{e}"));
         let (made, mut report) = make(&listing, &recipe(format, target(&folder, format)));
         let mut error = 0.0_f64;
         for clip in &made {
@@ -63,7 +63,7 @@ fn the_mini_sets_are_made_again() {
 
         // With the folder's lists the result equals the opened folder.
         let dataset = assemble(format, made.clone(), Division::Lists, &mut report).unwrap();
-        let (opened, _) = Dataset::open(&folder, format).unwrap();
+        let (opened, _) = Dataset::open(&DataPath::local(&folder), format).unwrap();
         let by_id = |dataset: &Dataset| -> BTreeMap<(Split, String), (usize, usize, Vec<String>)> {
             let lines =
                 |e: &motion::dataset::Entry| e.captions.iter().map(|c| dataset.captions[*c].to_line()).collect();
@@ -100,7 +100,7 @@ fn the_mini_sets_are_made_again() {
 fn clips_without_features_become_a_folder_that_opens() {
     let Some(folder) = shared::data("humanml3d-mini/raw-extra") else { return };
     let format = DataFormat::Humanml3d;
-    let mut listing = list(&folder, None).unwrap();
+    let mut listing = list(&DataPath::local(&folder), None).unwrap();
     listing.clips.truncate(60);
     assert!(!listing.has_lists);
     let (made, mut report) = make(&listing, &Recipe { mirror: true, ..recipe(format, target(&folder, format)) });
@@ -112,7 +112,7 @@ fn clips_without_features_become_a_folder_that_opens() {
     println!("{report}");
     let out = tempfile::tempdir().unwrap();
     synthetic::write_folder(&dataset, out.path()).unwrap();
-    let (opened, _) = Dataset::open(out.path(), format).unwrap();
+    let (opened, _) = Dataset::open(&DataPath::local(out.path()), format).unwrap();
     assert_eq!(opened.entries.len(), dataset.entries.len());
     assert_eq!((opened.mean, opened.std), (dataset.mean, dataset.std));
 }
@@ -125,7 +125,7 @@ fn mirrored_twins_are_the_published_ones() {
     let mut cases = 0;
     for case in entries(&golden, |name| name.starts_with("mirror_")) {
         let name = case.file_name().unwrap().to_string_lossy().replace("mirror_", "");
-        let mut listing = list(&mini, None).unwrap();
+        let mut listing = list(&DataPath::local(&mini), None).unwrap();
         listing.clips.retain(|clip| clip.id == name);
         let (made, _) = make(&listing, &Recipe { mirror: true, ..recipe(format, target(&mini, format)) });
         let expected = load(&case.join("vecs.npy")).data;
@@ -160,7 +160,7 @@ fn a_folder_of_bvh_gives_the_features_of_its_clips() {
     // One of the clips crawls.
     let error = write_bvh_folder(out.path(), 12, Seed(5)).unwrap();
     assert!(error <= 1e-3, "{error}");
-    let listing = list(out.path(), None).unwrap();
+    let listing = list(&DataPath::local(out.path()), None).unwrap();
     let (made, report) = make(&listing, &recipe(DataFormat::Humanml3d, None));
     println!("{error:.1e} m\n{report}");
     assert!(report.read.keys().next().unwrap().contains("joint map `smpl`, unit centimetre, y up"));
@@ -196,7 +196,7 @@ fn long_takes_are_cut_and_short_ones_left_out() {
         "clip,text,from,to\nlong,walks on,,\nlong,turns,8,14\nshort,stops,,\n",
     )
     .unwrap();
-    let listing = list(out.path(), None).unwrap();
+    let listing = list(&DataPath::local(out.path()), None).unwrap();
     let (made, report) = make(&listing, &recipe(DataFormat::Humanml3d, None));
     let ids: Vec<(&str, usize, usize)> =
         made.iter().map(|clip| (clip.id.as_str(), clip.frames, clip.captions.len())).collect();

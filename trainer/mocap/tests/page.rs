@@ -1,7 +1,6 @@
 //! The viewer's page: complete, safe against captions, and with exact positions.
 
-mod base64;
-
+use browser::decoded;
 use mocap::Body;
 use mocap::html::{MOST_PANELS, Page, Panel, STEP, Section};
 use motion::waypoints::Waypoint;
@@ -9,8 +8,6 @@ use motion::{Skeleton, features, synthetic};
 use protocol::stage::{DataFormat, DataSynthetic};
 use protocol::{Digest, Seed};
 use serde_json::Value;
-
-use self::base64::decoded;
 
 fn motion() -> Vec<f32> {
     let dataset = synthetic::generate(&DataSynthetic { clips: 1, ..DataSynthetic::default() }, Seed(1));

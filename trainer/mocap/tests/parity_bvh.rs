@@ -2,6 +2,7 @@
 
 mod shared;
 
+use motion::DataPath;
 use std::path::{Path, PathBuf};
 
 use mocap::bvh::Bvh;
@@ -20,7 +21,7 @@ fn folders() -> Vec<PathBuf> {
 }
 
 fn read(file: &Path) -> Bvh {
-    Bvh::read(file).unwrap_or_else(|e| panic!("{e}"))
+    Bvh::read(&DataPath::local(file)).unwrap_or_else(|e| panic!("{e}"))
 }
 
 /// The largest extent of the first frame along an axis, the scale of tolerances.
@@ -78,7 +79,7 @@ fn broken_files_are_refused_with_file_and_line() {
         let broken = folder.join("broken");
         for (name, case) in expected["broken"].as_object().expect("cases") {
             let must = case["must"].as_str().expect("must");
-            match (must, Bvh::read(&broken.join(name))) {
+            match (must, Bvh::read(&DataPath::local(broken.join(name)))) {
                 ("read", found) => {
                     let bvh = found.unwrap_or_else(|e| panic!("{e}"));
                     let nodes: Vec<String> = bvh.nodes.iter().map(|node| node.name.clone()).collect();

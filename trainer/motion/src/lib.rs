@@ -6,6 +6,7 @@
 //! Shapes: `T` raw frames, `L = T - 1` feature frames, `J` joints, `D` feature width (263 or 251). All arrays are
 //! row-major and frame-major.
 
+pub mod data_access;
 pub mod dataset;
 pub mod draw;
 pub mod features;
@@ -17,13 +18,16 @@ pub mod paths;
 pub mod placement;
 pub mod quaternion;
 pub mod random;
+pub mod roots;
 pub mod skeleton;
 pub mod synthetic;
 pub mod text;
 mod values;
+pub mod vocabulary;
 pub mod waypoints;
 
 pub use dataset::Dataset;
+pub use files::DataPath;
 pub use random::Stream;
 pub use skeleton::Skeleton;
 pub use values::{Floats, Values};

@@ -8,9 +8,9 @@ use std::io::{Error, ErrorKind, Write as _};
 use std::path::{Path, PathBuf};
 
 use npyz::{DType, NpyHeader, Order, TypeChar, WriterBuilder as _};
-use protocol::limits;
+use protocol::{excerpt, limits};
 
-use crate::files;
+use crate::files::DataPath;
 
 /// An array of a file, row-major.
 #[derive(Debug, Clone, PartialEq)]
@@ -72,15 +72,17 @@ impl NpyError {
 }
 
 /// Reads an f32 array, one clip's features.
-pub fn read(file: &Path) -> Result<Array, NpyError> {
-    let bytes = files::read(file, limits::CLIP_BYTES).map_err(|source| NpyError::Io { file: file.into(), source })?;
-    parse(file, &bytes, false)
+pub fn read(file: &DataPath) -> Result<Array, NpyError> {
+    parse(file.shown(), &bytes_of(file, limits::CLIP_BYTES)?, false)
 }
 
 /// Reads an f32 or f64 array, rounding f64. For statistics, which published sets store in either type.
-pub fn read_any_float(file: &Path) -> Result<Array, NpyError> {
-    let bytes = files::read(file, limits::ARRAY_BYTES).map_err(|source| NpyError::Io { file: file.into(), source })?;
-    parse(file, &bytes, true)
+pub fn read_any_float(file: &DataPath) -> Result<Array, NpyError> {
+    parse(file.shown(), &bytes_of(file, limits::ARRAY_BYTES)?, true)
+}
+
+fn bytes_of(file: &DataPath, limit: u64) -> Result<Vec<u8>, NpyError> {
+    file.read(limit).map_err(|source| NpyError::Io { file: file.shown().into(), source })
 }
 
 /// Reads an array from bytes; `file` is only its name in errors.
@@ -88,7 +90,7 @@ pub fn parse(file: &Path, bytes: &[u8], allow_f64: bool) -> Result<Array, NpyErr
     let header_error = |source| NpyError::Header { file: file.into(), source };
     check_header(bytes).map_err(|what| header_error(Error::new(ErrorKind::InvalidData, what)))?;
     let mut rest = bytes;
-    let header = NpyHeader::from_reader(&mut rest).map_err(header_error)?;
+    let header = NpyHeader::from_reader(&mut rest).map_err(|error| header_error(quoted(&error)))?;
     let expected = if allow_f64 { "f32 or f64 (<f4, <f8)" } else { "f32 (<f4)" };
     let wrong_type = |found: String| NpyError::Type { file: file.into(), found, expected };
     let width = match header.dtype() {
@@ -97,7 +99,7 @@ pub fn parse(file: &Path, bytes: &[u8], allow_f64: bool) -> Result<Array, NpyErr
         {
             ty.size_field()
         }
-        other => return Err(wrong_type(other.descr())),
+        other => return Err(wrong_type(format!("`{}`", excerpt(&other.descr())))),
     };
     if header.order() == Order::Fortran && header.shape().len() > 1 {
         return Err(NpyError::Order { file: file.into() });
@@ -115,7 +117,12 @@ pub fn parse(file: &Path, bytes: &[u8], allow_f64: bool) -> Result<Array, NpyErr
     } else {
         body.into_vec::<f64>().map(|v| v.into_iter().map(|x| x as f32).collect())
     };
-    Ok(Array { shape, data: data.map_err(header_error)? })
+    Ok(Array { shape, data: data.map_err(|error| header_error(quoted(&error)))? })
+}
+
+/// Hides the reader's message about a header, which may quote it.
+fn quoted(error: &Error) -> Error {
+    Error::new(error.kind(), format!("its header cannot be read: {}", excerpt(&error.to_string())))
 }
 
 /// Largest nesting of brackets; the header of a plain array has a mapping and a tuple in it.

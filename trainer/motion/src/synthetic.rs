@@ -329,8 +329,19 @@ fn clip(seed: Seed, index: usize) -> (Vec<f32>, Vec<crate::text::Caption>) {
     (joints, words::captions(&mut stream, kind.words, manner, draw.side))
 }
 
+/// Clips that are made between two looks at whether to go on.
+const AT_ONCE: usize = 64;
+
 /// Makes the set. Clip `i` shows movement `i` modulo their number; the splits are drawn from the seed.
+///
+/// # Panics
+/// Never.
 pub fn generate(settings: &DataSynthetic, seed: Seed) -> Dataset {
+    generate_while(settings, seed, &|_| true).expect("generation is never stopped")
+}
+
+/// Makes the set while `go_on`, which is asked every few clips with how many are made, returns true; else `None`.
+pub fn generate_while(settings: &DataSynthetic, seed: Seed, go_on: &dyn Fn(usize) -> bool) -> Option<Dataset> {
     let skeleton = Skeleton::of(DataFormat::Humanml3d);
     let count = settings.clips;
     let share = |part: f64| (part.clamp(0.0, 1.0) * count as f64).round() as usize;
@@ -351,7 +362,7 @@ pub fn generate(settings: &DataSynthetic, seed: Seed) -> Dataset {
         captions: vec![],
         entries: vec![],
     };
-    let made = in_parallel(count, |index| {
+    let make = |index| {
         let (joints, captions) = clip(seed, index);
         let mut versions = vec![];
         if settings.mirror {
@@ -360,7 +371,14 @@ pub fn generate(settings: &DataSynthetic, seed: Seed) -> Dataset {
         }
         versions.insert(0, (format!("{index:06}"), features_of(&joints), captions));
         versions
-    });
+    };
+    let mut made = Vec::new();
+    for first in (0..count).step_by(AT_ONCE) {
+        if !go_on(first) {
+            return None;
+        }
+        made.extend(in_parallel(AT_ONCE.min(count - first), |index| make(first + index)));
+    }
     for (versions, split) in made.into_iter().zip(splits) {
         for (id, features, captions) in versions {
             let frames = features.len() / skeleton.features;
@@ -373,10 +391,12 @@ pub fn generate(settings: &DataSynthetic, seed: Seed) -> Dataset {
         }
     }
     dataset.entries.sort_by_key(|entry| entry.split);
-    let (mean, std) = statistics(skeleton, dataset.clips.iter().map(|c| &*c.features));
+    let all = dataset.clips.iter().enumerate();
+    let wanted = all.take_while(|(i, _)| !i.is_multiple_of(AT_ONCE) || go_on(count)).map(|(_, clip)| &*clip.features);
+    let (mean, std) = statistics(skeleton, wanted);
     dataset.mean = mean.into_iter().map(|v| v as f32).collect();
     dataset.std = std.into_iter().map(|v| v as f32).collect();
-    dataset
+    go_on(count).then_some(dataset)
 }
 
 fn features_of(joints: &[f32]) -> Vec<f32> {

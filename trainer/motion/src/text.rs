@@ -310,6 +310,7 @@ mod tests {
 
     #[test]
     fn a_line_survives_and_a_bad_one_is_explained() {
+        protocol::show_excerpts();
         let caption = Caption::parse("a man kicks.#a/DET man/NOUN kick/VERB#2.0#6.5").unwrap();
         assert_eq!(Caption::parse(&caption.to_line()), Ok(caption.clone()));
         assert_eq!(caption.frames(20.0), Some((40, 130)));

@@ -18,7 +18,7 @@ use protocol::{excerpt, limits};
 use serde_json::Value;
 
 use crate::features::recover_joints;
-use crate::{Skeleton, files, npy};
+use crate::{DataPath, Skeleton, npy};
 
 /// Largest size of a file of waypoints, in bytes.
 const PATH_BYTES: u64 = 4 << 20;
@@ -57,7 +57,7 @@ struct Line {
 pub fn read(file: &Path, skeleton: &Skeleton, joints: &[String]) -> Result<Vec<Waypoint>, String> {
     let limit = if ending(file) == "npy" { limits::ARRAY_BYTES } else { PATH_BYTES };
     let bytes = if ["csv", "json", "npy"].contains(&ending(file).as_str()) {
-        files::read(file, limit).map_err(|error| format!("`{}`: {error}", file.display()))?
+        DataPath::local(file).read(limit).map_err(|error| format!("`{}`: {error}", file.display()))?
     } else {
         Vec::new()
     };
@@ -329,6 +329,7 @@ mod tests {
 
     #[test]
     fn the_first_waypoint_is_reached_from_where_the_body_stands() {
+        protocol::show_excerpts();
         let told = |t: &str| from("a.csv", &format!("t,x,y,z\n{t}\n"), &[]).unwrap();
         let check = |t: &str, start| check_start(&told(t), body(), start);
         assert_eq!(check("0,0,0.9,0.3", [0.0; 3]), Ok(()), "as far as a frame allows");
@@ -357,6 +358,7 @@ mod tests {
 
     #[test]
     fn mistakes_are_named_with_their_place() {
+        protocol::show_excerpts();
         for (name, text, joints, words) in [
             ("a.csv", "", &[][..], &["is empty"][..]),
             ("a.csv", "t,x,y\n", &[], &["line 1", "t,x,y,z"]),

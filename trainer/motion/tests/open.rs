@@ -7,7 +7,7 @@ use std::path::Path;
 
 use motion::Dataset;
 use motion::dataset::{OpenError, ProblemKind, SkipReason};
-use motion::{npy, synthetic};
+use motion::{DataPath, npy, synthetic};
 use protocol::Seed;
 use protocol::stage::{DataFormat, DataSynthetic, Split};
 
@@ -17,7 +17,7 @@ fn the_mini_sets_open_with_their_known_counts() {
         [("humanml3d-mini", DataFormat::Humanml3d, [259, 16, 44]), ("kit-mini", DataFormat::Kit, [47, 4, 9])]
     {
         let Some(folder) = shared::data(part) else { return };
-        let (dataset, report) = Dataset::open(&folder, format).unwrap_or_else(|e| panic!("{e}"));
+        let (dataset, report) = Dataset::open(&DataPath::local(&folder), format).unwrap_or_else(|e| panic!("{e}"));
         println!("{part}\n{report}");
         let found = [Split::Train, Split::Val, Split::Test].map(|split| dataset.entries_of(split).len());
         assert_eq!(found, counts, "{part}");
@@ -34,7 +34,11 @@ fn the_mini_sets_open_with_their_known_counts() {
         assert!(rows.iter().zip(&before).all(|(a, b)| (a - b).abs() < 1e-6 * unit));
 
         let files = dataset.to_files().unwrap();
-        assert_eq!(files, Dataset::open(&folder, format).unwrap().0.to_files().unwrap(), "other bytes the second time");
+        assert_eq!(
+            files,
+            Dataset::open(&DataPath::local(&folder), format).unwrap().0.to_files().unwrap(),
+            "other bytes the second time"
+        );
         let fetch = |name: &str| {
             files.iter().find(|(n, _)| n == name).map(|(_, b)| b.clone().into()).ok_or_else(|| "not there".to_owned())
         };
@@ -54,7 +58,7 @@ fn folder() -> (tempfile::TempDir, Vec<String>) {
 }
 
 fn open_error(folder: &Path) -> OpenError {
-    Dataset::open(folder, DataFormat::Humanml3d).expect_err("a broken folder")
+    Dataset::open(&DataPath::local(folder), DataFormat::Humanml3d).expect_err("a broken folder")
 }
 
 #[track_caller]
@@ -86,7 +90,7 @@ fn missing_parts_are_named() {
 fn every_bad_clip_is_named_at_once() {
     let (folder, ids) = folder();
     let motion = |i: usize| folder.path().join(format!("new_joint_vecs/{}.npy", ids[i]));
-    let rows = |i: usize| npy::read(&motion(i)).unwrap();
+    let rows = |i: usize| npy::read(&DataPath::local(motion(i))).unwrap();
     npy::write(&motion(0), &[50, 251], &vec![0.0; 50 * 251]).unwrap();
     let mut nan = rows(1);
     nan.data[7 * 263 + 5] = f32::NAN;
@@ -125,7 +129,7 @@ fn what_the_rules_leave_out_is_reported() {
     fs::write(text(4), "short#short/ADJ#0.5#1.0\n").unwrap();
     frames(5, 100);
     fs::write(text(5), "whole#whole/ADJ#0.0#nan\npart#part/NOUN#1.0#4.5\npart#part/NOUN#1.0#4.5\n").unwrap();
-    let (dataset, report) = Dataset::open(folder.path(), DataFormat::Humanml3d).unwrap();
+    let (dataset, report) = Dataset::open(&DataPath::local(folder.path()), DataFormat::Humanml3d).unwrap();
     println!("{report}");
     let reasons: Vec<_> = report.skips.iter().map(|s| (s.id.as_str(), s.reason.clone())).collect();
     assert_eq!(
@@ -154,7 +158,7 @@ fn odd_captions_are_left_out_and_listed() {
     let lines = ["whole#whole/ADJ#0#0", "inverted#a/DET#4#1", "more#a/DET#0#0#9", "past#a/DET#900#901"];
     fs::write(&text, lines.join("\n")).unwrap();
     fs::write(folder.path().join(format!("texts/{}.txt", ids[1])), "inverted#a/DET#4#1\n").unwrap();
-    let (dataset, report) = Dataset::open(folder.path(), DataFormat::Humanml3d).unwrap();
+    let (dataset, report) = Dataset::open(&DataPath::local(folder.path()), DataFormat::Humanml3d).unwrap();
     let reasons: Vec<_> = report.skips.iter().map(|s| (s.id.as_str(), s.reason.clone())).collect();
     let inverted = |line| SkipReason::CaptionTimes { line, range: "4 to 1 s".into() };
     assert_eq!(

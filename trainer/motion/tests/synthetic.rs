@@ -1,5 +1,6 @@
 //! The synthetic set: the same for the same seed, readable as a folder, physically plausible.
 
+use motion::DataPath;
 use motion::Dataset;
 use motion::features::{Turns, extract_with, mirror_joints, recover_from_rotations, recover_joints};
 use motion::synthetic::{generate, write_folder};
@@ -17,7 +18,8 @@ fn a_written_folder_opens_as_the_same_dataset() {
     assert_eq!(dataset, generate(&settings(40, true), Seed(5)));
     let folder = tempfile::tempdir().unwrap();
     write_folder(&dataset, folder.path()).unwrap();
-    let (opened, report) = Dataset::open(folder.path(), DataFormat::Humanml3d).unwrap_or_else(|e| panic!("{e}"));
+    let (opened, report) =
+        Dataset::open(&DataPath::local(folder.path()), DataFormat::Humanml3d).unwrap_or_else(|e| panic!("{e}"));
     assert!(report.skips.is_empty() && report.shared.is_empty(), "{report}");
     assert_eq!(opened.clips.len(), 80);
     for (a, b) in opened.entries.iter().zip(&dataset.entries) {

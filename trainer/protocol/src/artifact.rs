@@ -194,4 +194,23 @@ impl Manifest {
     pub fn digest(&self) -> Digest {
         Digest::of(&self.to_bytes())
     }
+
+    /// Digests in its own words, such as the teacher's in a student's.
+    pub fn mentions(&self) -> Vec<Digest> {
+        let mut found = Vec::new();
+        mentioned(&self.meta, &mut found);
+        found
+    }
+}
+
+/// Adds the digests that stand in `meta` to `found`.
+pub fn mentioned(meta: &serde_json::Value, found: &mut Vec<Digest>) {
+    use serde_json::Value;
+
+    match meta {
+        Value::String(text) => found.extend(text.parse::<Digest>()),
+        Value::Array(items) => items.iter().for_each(|item| mentioned(item, found)),
+        Value::Object(map) => map.values().for_each(|item| mentioned(item, found)),
+        Value::Null | Value::Bool(_) | Value::Number(_) => {}
+    }
 }

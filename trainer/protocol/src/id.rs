@@ -71,7 +71,8 @@ text_id! {
     StageName
 }
 text_id! {
-    /// One stage of one run on one shard, to be done once: `<run>/<stage>` or `<run>/<stage>/<shard>`.
+    /// One stage of one run on one shard, to be done once: `<run>/<stage>` or `<run>/<stage>/<shard>`; `<run>/<stage>/files` comes before a stage
+    /// whose files were not digested.
     TaskId
 }
 text_id! {
@@ -115,6 +116,13 @@ impl TaskId {
             None => Self(format!("{run}/{stage}")),
             Some(shard) => Self(format!("{run}/{stage}/{shard}")),
         }
+    }
+}
+
+impl TaskId {
+    /// The task of digesting what a stage's settings name outside the store.
+    pub fn of_resolving(run: &RunId, stage: &StageName) -> Self {
+        Self(format!("{run}/{stage}/files"))
     }
 }
 

@@ -4,14 +4,18 @@
 //! in seconds and a message can be read without running anything.
 
 pub mod artifact;
+mod bounded;
 pub mod canonical;
 pub mod digest;
 pub mod id;
 pub mod limits;
 pub mod message;
 pub mod model_ref;
+pub mod owner;
 pub mod pipeline;
 pub mod printable;
+pub mod proof;
+pub mod spelling;
 pub mod stage;
 pub mod sweep;
 pub mod units;
@@ -20,6 +24,7 @@ pub use artifact::{ArtifactKind, FileEntry, Manifest};
 pub use digest::Digest;
 pub use id::{Alias, Attempt, Fence, Generation, Incarnation, ModelName, RunId, Seed, StageName, TaskId, WorkerId};
 pub use model_ref::{ModelRef, Pick};
+pub use owner::{Group, Owner};
 pub use pipeline::Pipeline;
-pub use printable::{excerpt, printable};
+pub use printable::{excerpt, excerpts, json_mistake, printable, show_excerpts};
 pub use units::Steps;

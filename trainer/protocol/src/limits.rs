@@ -9,7 +9,9 @@ pub const STAGES: usize = 1_000;
 /// Largest size in bytes of a small call: a poll, the end of a checkpoint or a task, a command.
 pub const CALL_BYTES: usize = 1 << 20;
 /// Largest size in bytes of a batch of values or of log lines.
-pub const BATCH_BYTES: usize = 16 << 20;
+pub const BATCH_BYTES: usize = 4 << 20;
+/// Largest number of values, or of log lines, of a batch.
+pub const BATCH_ENTRIES: usize = 10_000;
 /// Largest size in bytes of a submission, which holds its pipeline as written and as read.
 pub const SUBMISSION_BYTES: usize = 8 << 20;
 /// Largest size of a blob, in bytes.
@@ -23,6 +25,24 @@ pub const CALLS_BYTES: usize = 32 << 20;
 pub const CLIENTS_WAITING: usize = 64;
 /// Largest number of batches of values and log lines waiting to be stored; a further one must retry.
 pub const BATCHES_WAITING: usize = 64;
+/// Largest number of calls that read much of the tables (lists of runs, curves, log lines) answered at a time.
+pub const READS_AT_ONCE: usize = 2;
+/// Largest number of such calls that wait; a further one must retry.
+pub const READS_WAITING: usize = 64;
+/// Largest number of runs in one answer; `before` asks for earlier ones.
+pub const RUNS_LISTED: u32 = 500;
+/// Largest number of log lines in one answer; `after` asks for later ones.
+pub const LINES_READ: u32 = 10_000;
+/// Largest number of rows of history in one answer; `after` asks for later ones.
+pub const HISTORY_READ: u32 = 10_000;
+/// Largest number of points of one curve in an answer; `after` asks for later ones.
+pub const CURVE_POINTS: usize = 10_000;
+/// Largest number of buckets of one curve.
+pub const CURVE_BUCKETS: usize = 4_000;
+/// Largest number of buckets of all curves in an answer.
+pub const CURVE_CELLS: usize = 200_000;
+/// Largest number of runs whose curves are in one answer.
+pub const CURVE_RUNS: usize = 50;
 /// Seconds after which a caller should retry.
 pub const COME_AGAIN_S: u32 = 1;
 

@@ -6,6 +6,8 @@
 //!
 //! Every write carries a [`Grant`]. The coordinator checks its fence in the transaction that stores the write. It
 //! answers 409 with [`ApiError`] code `stale-fence` to an old one.
+//!
+//! Names and grants are not secret. [`proof`](crate::proof) says how a call proves whose it is.
 
 use std::collections::BTreeMap;
 
@@ -13,17 +15,18 @@ use serde::{Deserialize, Serialize};
 
 use crate::stage::{Backend, CheckpointPolicy, Mode, StageSettings};
 use crate::sweep::{SearchKind, Values};
-use crate::{Attempt, Digest, Fence, Generation, Incarnation, RunId, Seed, StageName, TaskId, WorkerId};
+use crate::{Attempt, Digest, Fence, Generation, Incarnation, Owner, RunId, Seed, StageName, TaskId, WorkerId};
 
 /// Version of these messages; a worker with another version is refused.
-pub const PROTOCOL_VERSION: u32 = 4;
+pub const PROTOCOL_VERSION: u32 = 5;
 
 /// `POST /v1/workers`: a process registers as a worker.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Join {
     /// Version of the worker's messages, [`PROTOCOL_VERSION`].
     pub protocol: u32,
-    /// The worker's name, unique among live workers.
+    /// The worker's name, unique among live workers. It stays with the token that joined, and with the process until that leaves
+    /// or its lease ends.
     pub worker: WorkerId,
     /// Process id, for display.
     pub pid: u32,
@@ -67,8 +70,38 @@ pub struct Doing {
     /// Grant of the assignment.
     pub grant: Grant,
     pub progress: Progress,
-    /// Gang members that this one could not reach in this generation. The coordinator drops them from the gang.
-    pub lost: Vec<WorkerId>,
+    /// Steps applied in the training state that this member holds in memory; `None` while it has only initialised itself.
+    pub holds: Option<u64>,
+    /// The member that this one waits for now.
+    pub waits_for: Option<WorkerId>,
+    /// Gang members that this one cannot go on with in this generation. The coordinator decides who of them leaves the gang.
+    pub lost: Vec<LostPeer>,
+}
+
+impl Doing {
+    /// Work on `grant` that has come so far, with no state in memory and nothing to complain of.
+    pub fn new(grant: Grant, progress: Progress) -> Self {
+        Self { grant, progress, holds: None, waits_for: None, lost: Vec::new() }
+    }
+}
+
+/// A gang member that another cannot go on with.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+pub struct LostPeer {
+    pub worker: WorkerId,
+    pub cause: LossCause,
+}
+
+/// The reason for which a member cannot go on with a peer.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum LossCause {
+    /// No connection, or no byte of it for too long.
+    Unreachable,
+    /// Reachable, but training alone would be faster.
+    Slow,
+    /// It sends what this build does not expect.
+    Disagrees,
 }
 
 /// Progress of a task.
@@ -82,6 +115,13 @@ pub struct Progress {
     pub unit: String,
     /// Newest values, for a progress line.
     pub metrics: BTreeMap<String, f64>,
+}
+
+/// `POST /v1/workers/{worker}/gone`: the process ends.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Gone {
+    /// Incarnation from [`Joined`].
+    pub incarnation: Incarnation,
 }
 
 /// The answer to [`Poll`].
@@ -106,6 +146,8 @@ pub struct Prepare {
     pub inputs: BTreeMap<String, Digest>,
     /// Checkpoint to continue from, unless a member would supply its state.
     pub resume: Option<Digest>,
+    /// The members that it would join. It is ready once it reaches all of them.
+    pub peers: Vec<Member>,
 }
 
 /// The right to write for a task.
@@ -126,6 +168,9 @@ pub struct Grant {
 pub struct Assignment {
     /// Grant, carried by every write.
     pub grant: Grant,
+    /// Secret of the grant, shown by every write in [`SECRET_HEADER`](crate::proof::SECRET_HEADER). The server adds it to its
+    /// answer; the state does not hold it.
+    pub secret: String,
     /// Settings and inputs of the stage.
     pub stage: StageTask,
     /// Part of the worker: alone, a shard, or a gang member.
@@ -163,6 +208,8 @@ pub enum Role {
         /// Number of shards.
         of: u32,
     },
+    /// Digests what the stage's settings name outside the store, before the stage has a key. Answers [`TaskOutcome::Resolved`].
+    Resolve,
     /// Merges the shards of a map stage into its artifact.
     Merge {
         /// Artifacts of the shards, in order.
@@ -193,6 +240,7 @@ pub struct Member {
 pub struct MetricBatch {
     /// Grant of the write.
     pub grant: Grant,
+    #[serde(deserialize_with = "crate::bounded::batch")]
     pub rows: Vec<MetricRow>,
 }
 
@@ -203,7 +251,13 @@ pub struct MetricRow {
     pub step: u64,
     /// Name of the value.
     pub key: String,
+    /// NaN for everything that is not finite, and `null` in JSON.
+    #[serde(deserialize_with = "null_is_nan")]
     pub value: f64,
+}
+
+fn null_is_nan<'de, D: serde::Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
+    Option::<f64>::deserialize(deserializer).map(|value| value.unwrap_or(f64::NAN))
 }
 
 /// `POST /v1/logs`: lines of a task's log.
@@ -213,6 +267,7 @@ pub struct LogBatch {
     pub grant: Grant,
     /// Number of the first line within the attempt and worker; a batch sent twice is stored once.
     pub first: u64,
+    #[serde(deserialize_with = "crate::bounded::batch")]
     pub lines: Vec<String>,
 }
 
@@ -247,6 +302,11 @@ pub enum TaskOutcome {
         /// Final metrics by name.
         metrics: BTreeMap<String, f64>,
     },
+    /// The digests that [`Role::Resolve`] asks for.
+    Resolved {
+        /// By the field that names each file or folder.
+        digests: BTreeMap<String, Digest>,
+    },
     /// Stopped between steps, with a checkpoint committed.
     Yielded {
         /// Number of steps applied.
@@ -271,6 +331,8 @@ pub enum FailureClass {
     Diverged,
     /// The memory was exhausted: final.
     OutOfMemory,
+    /// The coordinator or another member refuses what is too large or of another build: final.
+    Refused,
     /// The store is full or not writable: final; after freeing space, `resume` continues.
     Storage,
     /// The store has no intact copy of an input: its producer runs again, within the restart budget.
@@ -279,6 +341,16 @@ pub enum FailureClass {
     Fault,
     /// A lost peer or a network error: counts against the infrastructure budget.
     Infrastructure,
+}
+
+impl FailureClass {
+    /// Returns true if another try on another worker would fail the same way.
+    pub fn is_final(self) -> bool {
+        match self {
+            Self::Input | Self::Diverged | Self::OutOfMemory | Self::Refused | Self::Storage => true,
+            Self::Damaged | Self::Fault | Self::Infrastructure => false,
+        }
+    }
 }
 
 /// `POST /v1/runs`: submits a pipeline.
@@ -300,12 +372,32 @@ pub struct RunView {
     pub run: RunId,
     /// The pipeline's name.
     pub pipeline: String,
+    /// The token that submitted it.
+    #[serde(default)]
+    pub owner: Owner,
     pub state: RunState,
+    /// It is paused because the process that worked on it ended, not because a user paused it.
+    #[serde(default)]
+    pub interrupted: bool,
     /// Stages in topological order, then the stages made by sweeps.
     pub stages: Vec<StageView>,
     /// Sweeps that have started.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub sweeps: Vec<SweepView>,
+    /// What keeps the coordinator from storing or reading what the run needs.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub storage: Option<StorageProblem>,
+    #[serde(default, skip_serializing_if = "Times::are_unknown")]
+    pub times: Times,
+}
+
+/// Why a store does not take or give what it should.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct StorageProblem {
+    /// Since when, in milliseconds since 1970.
+    pub since_ms: i64,
+    /// What is wrong, in words.
+    pub what: String,
 }
 
 /// State of a run.
@@ -328,6 +420,27 @@ impl RunState {
     /// Returns true if the state cannot change any more.
     pub fn is_final(self) -> bool {
         matches!(self, Self::Finished | Self::Failed | Self::Cancelled)
+    }
+}
+
+/// Times of a run or a stage by the server's clock, in milliseconds since 1970.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Times {
+    /// Time of the submission; a stage has none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub created_ms: Option<i64>,
+    /// Start of the first work.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub started_ms: Option<i64>,
+    /// End of the newest attempt at all of it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub ended_ms: Option<i64>,
+}
+
+impl Times {
+    /// Returns true if no time is known.
+    pub fn are_unknown(&self) -> bool {
+        *self == Self::default()
     }
 }
 
@@ -356,9 +469,27 @@ pub struct StageView {
     pub instruction_set: Option<String>,
     /// Reason of a failure, or of waiting.
     pub message: Option<String>,
+    /// Idle workers that it lacks, if that is what it waits for.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub wants_workers: Option<usize>,
     /// Swept stage that it belongs to, if a sweep made it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub of: Option<StageName>,
+    #[serde(default, skip_serializing_if = "Times::are_unknown")]
+    pub times: Times,
+    /// Stages that it reads.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub needs: Vec<StageName>,
+}
+
+impl StageView {
+    /// The message of a stage that the submission left out (`until`).
+    pub const NOT_ASKED_FOR: &str = "not asked for";
+
+    /// Returns false for a stage that the submission left out (`until`).
+    pub fn is_asked_for(&self) -> bool {
+        self.state != StageState::Skipped || self.message.as_deref() != Some(Self::NOT_ASKED_FOR)
+    }
 }
 
 /// A sweep as clients see it.
@@ -448,7 +579,8 @@ pub enum StageState {
 /// Answer to every refused call.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ApiError {
-    /// Code for programs: `stale-fence`, `not-found`, `conflict`, `invalid`, `storage`, `gate`, `internal`.
+    /// Code for programs: `stale-fence`, `unproven`, `unvouched`, `name-held`, `forbidden`, `not-found`, `conflict`, `invalid`,
+    /// `storage`, `gate`, `internal`.
     pub code: String,
     /// Description for users.
     pub message: String,

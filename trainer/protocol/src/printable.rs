@@ -1,11 +1,14 @@
 //! Untrusted texts for a terminal.
 //!
-//! A caption, a path or a stage's message may hold escape sequences, which a terminal executes. They clear the screen,
-//! change its title, or answer as if the user had typed. Printed text passes [`printable`] at the place where it is
-//! printed.
+//! A caption, a path or a stage's message may hold escape sequences, which a terminal obeys: they clear what stands there, change its title, or
+//! answer as if the user had typed. What is printed goes through [`printable`], at the place where it is printed.
+//!
+//! Errors quote files through [`excerpt`] and [`json_mistake`] alone. They show nothing of a file unless the process asked for it with
+//! [`show_excerpts`]: a worker reads files that those who see its messages may not read.
 
 use std::borrow::Cow;
 use std::fmt::Write as _;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 /// Escapes control characters and marks that change the reading direction as `\u001b`, which is also valid JSON. Line
 /// ends and tabs stay.
@@ -31,8 +34,52 @@ pub fn printable(text: &str) -> Cow<'_, str> {
 /// Largest number of characters of a text in an error.
 const SHOWN: usize = 120;
 
-/// Start of an untrusted text, for an error.
+/// Stands for text of a file that is not shown.
+const HIDDEN: &str = "...";
+
+static SHOWS_EXCERPTS: AtomicBool = AtomicBool::new(false);
+
+/// Lets errors of this process quote the files that they are about. Only for a command whose user reads both: never for a worker of a server.
+pub fn show_excerpts() {
+    SHOWS_EXCERPTS.store(true, Ordering::Relaxed);
+}
+
+/// The beginning of a text out of a file, for an error; `...` unless this process shows excerpts.
 pub fn excerpt(text: &str) -> String {
+    if SHOWS_EXCERPTS.load(Ordering::Relaxed) { beginning(text) } else { HIDDEN.to_owned() }
+}
+
+/// Names out of a file, for an error, at most `most` of them; `...` unless this process shows excerpts.
+pub fn excerpts<'a>(names: impl IntoIterator<Item = &'a str>, most: usize) -> String {
+    if !SHOWS_EXCERPTS.load(Ordering::Relaxed) {
+        return HIDDEN.to_owned();
+    }
+    names.into_iter().take(most).map(beginning).collect::<Vec<_>>().join(", ")
+}
+
+/// The kind and place of a mistake in JSON. The reader's own message may quote the text, and so is an excerpt.
+pub fn json_mistake(error: &serde_json::Error) -> String {
+    let what = match error.classify() {
+        serde_json::error::Category::Syntax => "no JSON",
+        serde_json::error::Category::Eof => "JSON that ends too early",
+        serde_json::error::Category::Data | serde_json::error::Category::Io => "JSON of another form",
+    };
+    let text = error.to_string();
+    // Such a name is one of ours.
+    if let Some(rest) = text.strip_prefix("missing field `")
+        && let Some((name, _)) = rest.split_once('`')
+    {
+        return format!("JSON without the key `{name}`");
+    }
+    let said = if SHOWS_EXCERPTS.load(Ordering::Relaxed) { format!(" ({text})") } else { String::new() };
+    match error.line() {
+        0 => format!("{what}{said}"),
+        line => format!("{what} at line {line} column {}{said}", error.column()),
+    }
+}
+
+/// The first 120 characters of a text, escaped. Only for texts that are no part of a file.
+pub fn beginning(text: &str) -> String {
     let begins: String = text.chars().take(SHOWN).collect();
     let more = if begins.len() < text.len() { "..." } else { "" };
     format!("{}{more}", begins.escape_debug())
@@ -43,7 +90,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_error_shows_the_beginning_of_a_text() {
+    fn an_error_shows_the_beginning_of_a_text_if_the_process_asked_for_it() {
+        let error = serde_json::from_str::<Vec<u8>>("\n[\"secret\"]").unwrap_err();
+        assert_eq!((excerpt("secret"), excerpts(["secret"], 2)), ("...".to_owned(), "...".to_owned()));
+        assert_eq!(json_mistake(&error), "JSON of another form at line 2 column 9");
+        show_excerpts();
+        assert!(json_mistake(&error).contains("secret"));
+        assert_eq!(excerpts(["a", "b", "c"], 2), "a, b");
         assert_eq!(excerpt("a\u{1b}b"), "a\\u{1b}b");
         assert_eq!(excerpt(&"\u{e9}".repeat(121)), format!("{}...", "\u{e9}".repeat(120)));
     }

@@ -57,7 +57,7 @@ pub use network::{LatentShape, Network, Positions};
 pub use placement::{CheckpointPolicy, Keep, Placement, WorkerRange};
 pub use problems::{Problem, Problems};
 pub use sampler::{Family, Sampler, Solver, measured_with};
-pub use spec::{Output, Ref, Shape, StageSpec, Target};
+pub use spec::{LossChange, Output, Ref, Shape, StageSpec, Target};
 pub use training::{Batch, Decay, Optimizer, Training};
 
 /// A folder or file outside the store that a stage reads.
@@ -218,6 +218,11 @@ impl StageSettings {
         self.spec().sampler()
     }
 
+    /// Returns the family of the model that a training gives.
+    pub fn family(&self) -> Option<Family> {
+        self.spec().family()
+    }
+
     /// Names of the values that an evaluation may return; `None` if unknown.
     pub fn metrics(&self) -> Option<BTreeSet<String>> {
         self.spec().metrics()
@@ -227,6 +232,13 @@ impl StageSettings {
     pub fn recorded(&self) -> Vec<&'static str> {
         let own = self.spec().recorded();
         if own.is_empty() { Vec::new() } else { own.iter().copied().chain(["gradient_norm", "lr"]).collect() }
+    }
+
+    /// Steps at which a training's loss becomes another sum, in order.
+    pub fn loss_changes(&self) -> Vec<LossChange> {
+        let mut changes = self.spec().loss_changes();
+        changes.sort_by_key(|change| change.at);
+        changes
     }
 
     /// Schema of the kind's keys.

@@ -1,11 +1,11 @@
-//! Arguments that several verbs have.
+//! Arguments that several commands share.
 
 use std::path::PathBuf;
 
 use clap::Args;
 use registry::Place;
 
-/// A pipeline on the command line.
+/// A pipeline file with overrides.
 #[derive(Debug, Clone, Args)]
 pub(super) struct PipelineArgs {
     /// The pipeline, a YAML file
@@ -15,11 +15,12 @@ pub(super) struct PipelineArgs {
     pub(super) set: Vec<String>,
 }
 
-/// Where a store's blobs lie.
+/// Location of a store's blobs.
 #[derive(Debug, Args)]
 pub(super) struct BlobArgs {
-    /// Where the blobs of a new store are to lie, which remembers it: another folder, s3://BUCKET/PREFIX, gs://BUCKET/PREFIX or
-    /// az://CONTAINER/PREFIX; credentials come from AWS_*, GOOGLE_* or AZURE_* in the environment [default: in the store's folder]
+    /// Location of a new store's blobs, which the store remembers: another folder, s3://BUCKET/PREFIX,
+    /// gs://BUCKET/PREFIX or az://CONTAINER/PREFIX; credentials come from AWS_*, GOOGLE_* or AZURE_* in the environment
+    /// [default: the store's folder]
     #[arg(long, env = "STRIDE_BLOBS", value_name = "PLACE")]
     pub(super) blobs: Option<Place>,
 }

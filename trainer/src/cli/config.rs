@@ -15,7 +15,7 @@ pub(crate) enum ConfigVerb {
     Show {
         #[command(flatten)]
         pipeline: PipelineArgs,
-        /// YAML, or JSON
+        /// Format of the pipeline: YAML or JSON
         #[arg(short, long, value_enum, default_value_t)]
         output: Output,
     },
@@ -23,14 +23,14 @@ pub(crate) enum ConfigVerb {
 
 #[derive(Debug, Args)]
 pub(crate) struct DevicesArgs {
-    /// How the list is printed
+    /// Format of the list
     #[arg(short, long, value_enum, default_value_t)]
     pub(super) output: Output,
 }
 
 #[derive(Debug, Args)]
 pub(crate) struct SchemaArgs {
-    /// Prints the reference of all stage kinds and their keys, `docs/pipeline.md`, instead
+    /// Prints `docs/pipeline.md` instead, the reference of all stage kinds and their keys
     #[arg(long)]
     markdown: bool,
 }
@@ -67,7 +67,7 @@ pub(crate) fn config(verb: &ConfigVerb) -> Result<u8> {
     Ok(0)
 }
 
-/// Block mappings, flow lists; every text quoted that could be read as something else.
+/// Writes block mappings with flow lists. Quotes every text that could be read as another type.
 fn yaml(value: &Value, indent: usize, text: &mut String) {
     let Some(map) = value.as_object() else { return };
     for (key, value) in map {

@@ -1,4 +1,4 @@
-//! `trainer generate --control`: where a motion should go, and how far from it it went.
+//! `trainer generate --control`: target positions of a motion, and the distances of the generated motion from them.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -11,7 +11,7 @@ use motion::waypoints::{self, Waypoint};
 use protocol::Manifest;
 use protocol::artifact::Role;
 use protocol::limits::{FEEDBACK_ROUNDS, REFINE_STEPS};
-use stages::control::Heed;
+use stages::control::ControlOptions;
 use stages::generate::{Generated, Generator};
 use stages::hint::{Hint, metres};
 
@@ -19,26 +19,26 @@ use super::model::{self, Found};
 use crate::problem::{Problem, Result};
 use crate::reader::Reader;
 
-/// Metres beyond which a waypoint counts as missed, in the papers.
+/// Distance in metres beyond which the papers count a waypoint as missed.
 const MISSED: f64 = 0.5;
 
 #[derive(Debug, Args)]
 pub(super) struct ControlArgs {
-    /// Positions to pass: a .csv with columns t,x,y,z or t,joint,x,y,z, a .json of [t, x, y, z] by joint (seconds and metres; the motion starts
-    /// at x = z = 0 and faces z), or a motion as .npy
+    /// Target positions: a .csv with columns t,x,y,z or t,joint,x,y,z, a .json of [t, x, y, z] by joint (seconds and
+    /// metres; the motion starts at x = z = 0 and faces z), or a motion as .npy
     #[arg(long, value_name = "FILE", conflicts_with = "edit")]
     control: Option<PathBuf>,
-    /// Joints that are told, such as pelvis,left_wrist [default: those that the file names, else the pelvis]
+    /// Controlled joints, such as pelvis,left_wrist [default: the joints in the file, else the pelvis]
     #[arg(long, value_name = "NAMES", value_delimiter = ',')]
     joints: Vec<String>,
-    /// How strongly positions are heeded; 0 not at all [default: 1, as trained]
+    /// Strength of the control; 0 turns it off [default: 1, as trained]
     #[arg(long, value_name = "S")]
     control_scale: Option<f64>,
-    /// Rounds in which the control part corrects what was drawn [default: as many as it was trained with]
+    /// Rounds in which the control part corrects the sample [default: as many as in its training]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(..=FEEDBACK_ROUNDS as u64))]
     feedback: Option<u64>,
-    /// Refines what was drawn: N steps that move the latent until the decoded motion passes the positions, at the cost of decoding it about 4 N times
-    /// [default: 0]
+    /// Refines the sample in N steps that move the latent until the decoded motion passes the positions; costs about 4
+    /// N decodings [default: 0]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(..=REFINE_STEPS as u64))]
     refine: Option<u64>,
     /// Takes the control part of another model, MODEL@ALIAS or MODEL:VERSION, which must have been trained for this one
@@ -46,36 +46,36 @@ pub(super) struct ControlArgs {
     control_from: Option<String>,
 }
 
-/// What a motion is told.
+/// Target positions of a motion and the strength of the control.
 #[derive(Debug)]
-pub(super) struct Told {
+pub(super) struct Targets {
     hint: Hint,
-    heed: Heed,
+    options: ControlOptions,
     pub(super) waypoints: Vec<Waypoint>,
 }
 
-/// How far a motion is from what it was told.
+/// Distances of a motion from its target positions.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Missed {
-    /// Positions told.
-    pub(super) told: usize,
-    /// Mean distance, metres.
+    /// Number of target positions.
+    pub(super) targets: usize,
+    /// Mean distance in metres.
     pub(super) average: f64,
-    /// Largest distance, metres.
+    /// Largest distance in metres.
     pub(super) worst: f64,
     /// Share of positions missed by more than half a metre.
     pub(super) location: f64,
 }
 
 impl ControlArgs {
-    /// Whether a path is given.
+    /// Returns true if a path is given.
     pub(super) fn given(&self) -> bool {
         self.control.is_some()
     }
 
-    /// Refuses options that say how to heed a path where nobody may give one.
+    /// Refuses options of control without a path, unless the command streams.
     pub(super) fn check(&self, streams: bool) -> Result<()> {
-        let Heed { scale, .. } = self.heed();
+        let ControlOptions { scale, .. } = self.options();
         if !(scale >= 0.0 && scale.is_finite()) {
             return Err(Problem::usage(format!("`--control-scale` is {scale}; expected 0 or more")));
         }
@@ -94,21 +94,21 @@ impl ControlArgs {
         }
     }
 
-    /// How positions are heeded.
-    pub(super) fn heed(&self) -> Heed {
-        Heed {
+    /// Strength of the control and its corrections.
+    pub(super) fn options(&self) -> ControlOptions {
+        ControlOptions {
             scale: self.control_scale.unwrap_or(1.0),
             feedback: self.feedback.map(|rounds| rounds as usize),
             refine: self.refine.unwrap_or(0) as usize,
         }
     }
 
-    /// Joints that are told.
+    /// The controlled joints.
     pub(super) fn joints(&self) -> &[String] {
         &self.joints
     }
 
-    /// `found` with the control part of another model, if one is named.
+    /// Replaces the control part of `found` with that of another model, if one is named.
     pub(super) async fn completed(&self, reader: &Reader, mut found: Found) -> Result<Found> {
         let Some(name) = &self.control_from else { return Ok(found) };
         let other = model::version(reader, name).await?;
@@ -128,8 +128,8 @@ impl ControlArgs {
         Ok(found)
     }
 
-    /// What a motion for a model is told; `None` without a path. Without `frames` it ends with the path.
-    pub(super) fn told(&self, generator: &Generator, label: &str, frames: Option<usize>) -> Result<Option<Told>> {
+    /// Reads the target positions for a model; `None` without a path. Without `frames`, the motion ends with the path.
+    pub(super) fn targets(&self, generator: &Generator, label: &str, frames: Option<usize>) -> Result<Option<Targets>> {
         let Some(file) = &self.control else { return Ok(None) };
         if generator.control().is_none() {
             return Err(
@@ -163,20 +163,20 @@ impl ControlArgs {
         }
         let mut hint = Hint::none(frames, skeleton.joints);
         waypoints.iter().for_each(|waypoint| hint.tell(waypoint.frame, waypoint.joint, waypoint.position));
-        Ok(Some(Told { hint, heed: self.heed(), waypoints }))
+        Ok(Some(Targets { hint, options: self.options(), waypoints }))
     }
 }
 
-/// What to do about a model without a control part.
+/// Hint for a model without a control part.
 pub(super) const TRAIN: &str = "a `train.control` stage gives a model that has one";
 
-impl Told {
-    /// Positions and how they are heeded.
-    pub(super) fn request(&self) -> (&Hint, Heed) {
-        (&self.hint, self.heed)
+impl Targets {
+    /// Target positions and strength of the control.
+    pub(super) fn request(&self) -> (&Hint, ControlOptions) {
+        (&self.hint, self.options)
     }
 
-    /// How far `motion` is from it.
+    /// Measures the distances of `motion` from its targets.
     pub(super) fn missed(&self, motion: &Generated) -> Option<Missed> {
         let skeleton = Skeleton::of(motion.format);
         let joints = metres(&motion.features, skeleton);
@@ -187,6 +187,6 @@ impl Told {
             squares.sum::<f64>().sqrt()
         };
         let worst = self.waypoints.iter().map(distance).fold(0.0, f64::max);
-        Some(Missed { told: self.hint.told(), average: errors.average, worst, location: errors.location })
+        Some(Missed { targets: self.hint.told(), average: errors.average, worst, location: errors.location })
     }
 }

@@ -1,4 +1,4 @@
-//! `trainer data`: what a recording is, and recordings to try things with.
+//! `trainer data`: inspects recordings and writes sample recordings.
 
 use std::path::{Path, PathBuf};
 
@@ -8,6 +8,7 @@ use mocap::bvh::Bvh;
 use mocap::detect::Up;
 use mocap::joint_map::JointMap;
 use mocap::take::{self, Reading};
+use motion::DataPath;
 use protocol::Seed;
 use serde_json::json;
 
@@ -16,9 +17,9 @@ use crate::problem::{Problem, Result};
 
 #[derive(Debug, Subcommand)]
 pub(crate) enum DataVerb {
-    /// Says what a recording (.bvh, .npy, .npz) is and how it would be read, and proposes a joint map
+    /// Shows what a recording (.bvh, .npy, .npz) contains and how it would be read, and proposes a joint map
     Inspect(InspectArgs),
-    /// Writes synthetic clips as recordings with captions beside them
+    /// Writes synthetic clips as recordings with their captions
     Sample(SampleArgs),
 }
 
@@ -38,22 +39,22 @@ pub(crate) struct InspectArgs {
     /// A joint map to try: the name of a shipped one, or a YAML file
     #[arg(long, value_name = "MAP")]
     map: Option<String>,
-    /// How the answer is printed; as a table, the map is YAML on stdout and all else on stderr
+    /// Format of the answer; as a table, the map is YAML on stdout and the rest is on stderr
     #[arg(short, long, value_enum, default_value_t)]
     output: Output,
 }
 
 #[derive(Debug, Args)]
 pub(crate) struct SampleArgs {
-    /// The folder to write to, which must be empty or not there
+    /// The folder to write to, which must be empty or not exist
     folder: PathBuf,
     /// The format of the files
     #[arg(long, value_enum)]
     format: SampleFormat,
-    /// How many
+    /// Number of clips
     #[arg(long, default_value_t = 30, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=10_000))]
     clips: u32,
-    /// Other clips for another number
+    /// Seed of the clips; another number gives other clips
     #[arg(long, default_value_t = 7, value_name = "N")]
     seed: u64,
 }
@@ -75,7 +76,7 @@ fn inspect(args: &InspectArgs) -> Result<u8> {
     if !args.file.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("bvh")) {
         return inspect_array(&args.file, args.output);
     }
-    let bvh = Bvh::read(&args.file).map_err(Problem::usage)?;
+    let bvh = Bvh::read(&DataPath::local(&args.file)).map_err(Problem::usage)?;
     let map = args.map.as_deref().map(JointMap::load).transpose().map_err(Problem::usage)?;
     let seconds = bvh.frames as f64 / bvh.rate;
     let joints = bvh.nodes.iter().filter(|node| !node.end).count();
@@ -108,7 +109,7 @@ fn inspect(args: &InspectArgs) -> Result<u8> {
 }
 
 fn inspect_array(file: &Path, output: Output) -> Result<u8> {
-    let joints = arrays::read(file).map_err(Problem::usage)?;
+    let joints = arrays::read(&DataPath::local(file)).map_err(Problem::usage)?;
     let frames = joints.data.len() / (3 * joints.joints);
     if output == Output::Json {
         print::json(&json!({"file": file, "joints": joints.joints, "frames": frames, "fps": joints.rate}));

@@ -1,4 +1,4 @@
-//! `trainer export`: a motion of an array or a recording in another form.
+//! `trainer export`: converts the motion of an array or a recording to another format.
 
 use std::path::PathBuf;
 
@@ -20,16 +20,16 @@ pub(crate) struct ExportArgs {
     input: Vec<PathBuf>,
     #[command(flatten)]
     out: OutArgs,
-    /// What stands above pictures and pages [default: the file's name]
+    /// Title of pictures and pages [default: the file's name]
     #[arg(long, value_name = "TEXT")]
     caption: Option<String>,
-    /// Which joints of a recording are which: the name of a map that ships, or a file [default: found by the joints' names]
+    /// Joint map of a recording: the name of a shipped map, or a file [default: detected from the names of the joints]
     #[arg(long, value_name = "MAP")]
     joint_map: Option<String>,
-    /// Metres in one unit of a recording [default: found by the length of its legs]
+    /// Metres per unit of a recording [default: detected from the length of its legs]
     #[arg(long, value_name = "METRES")]
     unit: Option<f64>,
-    /// Which axis of a recording points up: x, y, z, -x, -y or -z [default: where the neck is from the ankles]
+    /// Vertical axis of a recording: x, y, z, -x, -y or -z [default: the direction from the ankles to the neck]
     #[arg(long, value_name = "AXIS", value_parser = up, allow_hyphen_values = true)]
     up: Option<Up>,
 }
@@ -39,7 +39,7 @@ fn up(word: &str) -> std::result::Result<Up, String> {
 }
 
 impl ExportArgs {
-    /// How the report is printed.
+    /// Format of the report.
     pub(super) fn report(&self) -> Output {
         self.out.report()
     }

@@ -1,4 +1,4 @@
-//! `trainer gallery`: what the models of a run draw for the same sentences from the same seeds, side by side on one page.
+//! `trainer gallery`: one page with the motions of a run's models for the same sentences and seeds, side by side.
 
 use std::path::PathBuf;
 
@@ -20,7 +20,7 @@ use crate::print::{self, Output};
 use crate::problem::{Problem, Result};
 use crate::reader::Reader;
 
-/// What is drawn when nobody says: movements that every set has.
+/// Default sentences: movements that every dataset has.
 const SENTENCES: [&str; 6] = [
     "a person walks forward",
     "a person runs in a circle",
@@ -35,28 +35,28 @@ pub(crate) struct GalleryArgs {
     /// The run: its name, a unique beginning of it, or `@last`
     #[arg(default_value = "@last")]
     run: String,
-    /// Stages whose models are shown, in this order [default: all that gave one, in the order of the pipeline]
+    /// Stages whose models are shown, in this order [default: all that have a model, in the order of the pipeline]
     #[arg(long, value_name = "STAGE", value_delimiter = ',')]
     stage: Vec<String>,
-    /// What is drawn, may be repeated [default: six movements]
+    /// Sentence to draw, may be repeated [default: six movements]
     #[arg(long = "prompt", value_name = "TEXT")]
     prompts: Vec<String>,
-    /// Sampling steps of every model [default: as each was measured]
+    /// Sampling steps of every model [default: as in its evaluation]
     #[arg(long, value_name = "N")]
     steps: Option<usize>,
     #[command(flatten)]
     sampler: SamplerArgs,
     #[command(flatten)]
     sentences: SentenceArgs,
-    /// Where to compute: flex, ndarray, wgpu or cuda [default: the first that this build and machine have]
+    /// Computing backend: flex, ndarray, wgpu or cuda [default: the first that this build and machine have]
     #[arg(long)]
     backend: Option<String>,
-    /// Where to write the page, or for a sheet of poses a `.png`
+    /// File of the page, or a `.png` for a sheet of poses
     #[arg(short = 'o', long = "out", value_name = "FILE", default_value = "gallery.html")]
     out: PathBuf,
     #[command(flatten)]
     target: Target,
-    /// How the report is printed
+    /// Format of the report
     #[arg(long, value_enum, default_value_t)]
     pub(super) report: Output,
 }
@@ -79,7 +79,7 @@ pub(crate) async fn gallery(args: GalleryArgs) -> Result<u8> {
     }
     let (device, _) = model::device(args.backend.as_deref())?;
 
-    // A row for each sentence and seed, a column for each model.
+    // One row per sentence and seed, one column per model.
     let mut rows: Vec<Vec<Motion>> = vec![Vec::new(); requests.len() * seeds.len()];
     let mut lengths: Vec<Option<usize>> = vec![None; rows.len()];
     let mut drawn = Vec::new();
@@ -88,7 +88,7 @@ pub(crate) async fn gallery(args: GalleryArgs) -> Result<u8> {
         let generator = Generator::load(&found.manifest, &found.blobs, &device).map_err(Problem::failed)?;
         let sampler = match args.sampler.sampler(args.steps, generator.sampler(), &found.measured) {
             Ok(sampler) => sampler,
-            // Measured in several ways: as the papers draw from its kind, which the page says.
+            // The evaluations use several samplers: use the papers' sampler of its kind, which the page notes.
             Err(_) => args.sampler.sampler(args.steps, generator.sampler(), &[]).map_err(Problem::usage)?,
         };
         generator.check_sampler(&sampler).map_err(model::refused)?;
@@ -97,7 +97,7 @@ pub(crate) async fn gallery(args: GalleryArgs) -> Result<u8> {
             is_known(&generator, name, &request.caption)?;
             for (k, seed) in seeds.iter().enumerate() {
                 let row = i * seeds.len() + k;
-                // As long for all models as the first one makes it, so that they compare.
+                // The first model sets the length for all, so that the motions are comparable.
                 let frames = match (request.length, lengths[row]) {
                     (Some(length), _) => length.frames(fps),
                     (None, Some(frames)) => frames,

@@ -1,4 +1,4 @@
-//! `trainer generate`: sentences to moving figures, or to a part of a motion whose rest stays.
+//! `trainer generate`: generates motions from sentences, or replaces part of a motion.
 
 use std::ops::Range;
 use std::path::{Path, PathBuf};
@@ -7,13 +7,14 @@ use std::time::{Duration, Instant};
 use clap::Args;
 use mocap::export::{Motion, Outs, numbered};
 use mocap::requests::Request;
-use motion::{Skeleton, npy};
+use motion::vocabulary::Vocabulary;
+use motion::{DataPath, Skeleton, npy};
 use protocol::Seed;
 use protocol::stage::Sampler;
 use serde_json::{Value, json};
 use stages::generate::{Generated, Generator, Timing};
 
-use super::control::{ControlArgs, Missed, Told};
+use super::control::{ControlArgs, Missed, Targets};
 use super::keep::Span;
 use super::model::{self, Found};
 use super::out::{self, OutArgs};
@@ -21,6 +22,7 @@ use super::remote::check_parent;
 use super::sampler::SamplerArgs;
 use super::sentences::SentenceArgs;
 use super::stream::{self, Opening, StreamArgs};
+use super::words;
 use crate::client::Target;
 use crate::print::{self, Output};
 use crate::problem::{Problem, Result};
@@ -29,32 +31,34 @@ use crate::reader::Reader;
 #[derive(Debug, Args)]
 #[command(mut_arg("out", |out| out.required(false).required_unless_present("stream")))]
 pub(crate) struct GenerateArgs {
-    /// What the motion should be, in words; several sentences make several motions
+    /// Description of the motion in words; several sentences make several motions
     #[arg(required_unless_present_any = ["captions", "stream"])]
     prompt: Vec<String>,
     /// MODEL@ALIAS, MODEL@best or MODEL:VERSION
     #[arg(short, long, required_unless_present = "stage", conflicts_with = "stage")]
     model: Option<String>,
-    /// What a stage of a run gave, such as the teacher
+    /// The model of a run's stage, such as the teacher
     #[arg(long, value_name = "STAGE")]
     stage: Option<String>,
     /// The run of --stage: its name, a unique beginning of it, or `@last`
     #[arg(long, default_value = "@last", requires = "stage")]
     run: String,
-    /// Sampling steps [default: as the model was measured]
-    #[arg(long, value_name = "N")]
+    /// Sampling steps [default: as in the model's evaluation]
+    #[arg(long, value_name = "N", allow_negative_numbers = true)]
     steps: Option<usize>,
     #[command(flatten)]
     sampler: SamplerArgs,
     #[command(flatten)]
     sentences: SentenceArgs,
-    /// A motion, features [frames, features] as `--out FILE.npy` writes them, of which a part is drawn anew: masked token models only
+    /// A motion to change in part, features [frames, features] as `--out FILE.npy` writes them; for masked token models
+    /// only
     #[arg(long, value_name = "FILE.npy", requires = "keep", conflicts_with_all = ["frames", "seconds"])]
     edit: Option<PathBuf>,
-    /// What stays of it, FROM:TO in frames or seconds, from the end if negative: `0:1s,-1s:` keeps the first and the last second
+    /// Spans of it to keep, FROM:TO in frames or seconds, from the end if negative: `0:1s,-1s:` keeps the first and the
+    /// last second
     #[arg(long, value_name = "SPANS", value_delimiter = ',', requires = "edit", allow_hyphen_values = true)]
     keep: Vec<Span>,
-    /// Where to compute: flex, ndarray, wgpu or cuda [default: the first that this build and machine have]
+    /// Computing backend: flex, ndarray, wgpu or cuda [default: the first that this build and machine have]
     #[arg(long)]
     backend: Option<String>,
     #[command(flatten)]
@@ -79,17 +83,19 @@ struct Row {
     seed: u64,
     frames: usize,
     seconds: f64,
-    /// Whether the model makes anything of the sentence.
+    /// True if the model recognises a word of the sentence.
     known: bool,
+    /// Words of the sentence that its training data lacks.
+    unknown_words: Vec<String>,
     kept: Vec<Range<usize>>,
     timing: Timing,
     missed: Option<Missed>,
     files: Vec<String>,
-    /// How far the skeleton of a file is off the motion, in metres.
+    /// Largest distance of a file's skeleton from the motion in metres.
     off: Option<f64>,
 }
 
-/// What all motions of the report share.
+/// Values that all motions of the report share.
 struct Shared {
     label: String,
     sampler: Sampler,
@@ -97,12 +103,12 @@ struct Shared {
 }
 
 impl GenerateArgs {
-    /// How the report is printed.
+    /// Format of the report.
     pub(super) fn report(&self) -> Output {
         self.out.report()
     }
 
-    /// The files of a motion besides those of `--out`, by its number.
+    /// Writes the other files of motion `number`, besides those of `--out`.
     fn write_arrays(&self, motion: &Generated, number: usize, count: usize) -> Result<Vec<String>> {
         let rows = motion.frames;
         let width = |values: &[f32]| values.len() / rows.max(1);
@@ -131,26 +137,27 @@ impl GenerateArgs {
     }
 }
 
-/// The model, with the control part that is wanted.
-async fn found(args: &GenerateArgs) -> Result<Found> {
+/// Finds the model, with the requested control part.
+async fn found(args: &GenerateArgs) -> Result<(Found, Option<Vocabulary>)> {
     let reader = Reader::open(&args.target).await?;
     let found = match (&args.stage, &args.model) {
         (Some(stage), _) => model::stage(&reader, &reader.find(&args.run).await?, stage).await?,
         (None, model) => model::version(&reader, model.as_deref().unwrap_or_default()).await?,
     };
+    let vocabulary = words::vocabulary(&reader, found.artifact).await?;
     let found = args.control.completed(&reader, found).await?;
     reader.close().await;
-    Ok(found)
+    Ok((found, vocabulary))
 }
 
 async fn stream(args: GenerateArgs) -> Result<u8> {
-    // Names of files are looked at before the model.
+    // The names of files are checked before the model is loaded.
     args.out.files(1)?;
-    let found = found(&args).await?;
+    let (found, _) = found(&args).await?;
     let (device, _) = model::device(args.backend.as_deref())?;
     let GenerateArgs { stream, steps, sampler, sentences, control, out, target, .. } = args;
-    let (seed, heed, joints) = (sentences.seed(), control.heed(), control.joints().to_vec());
-    let opening = Opening { found, device, steps, sampler, seed, heed, joints };
+    let (seed, options, joints) = (sentences.seed(), control.options(), control.joints().to_vec());
+    let opening = Opening { found, device, steps, sampler, seed, control: options, joints };
     let insecure = target.server.connection.insecure;
     stream::stream(stream, opening, out, insecure, |fps| sentences.bound(fps)).await
 }
@@ -166,7 +173,7 @@ pub(crate) async fn generate(args: GenerateArgs) -> Result<u8> {
     args.check(&requests)?;
     let outs = args.out.files(count)?;
     let start = Instant::now();
-    let Found { manifest, blobs, label, measured } = found(&args).await?;
+    let (Found { manifest, blobs, label, measured, .. }, vocabulary) = found(&args).await?;
     let label = label.to_string();
     let (device, _) = model::device(args.backend.as_deref())?;
     let generator = Generator::load(&manifest, &blobs, &device).map_err(Problem::failed)?;
@@ -174,23 +181,35 @@ pub(crate) async fn generate(args: GenerateArgs) -> Result<u8> {
 
     let sampler = args.sampler.sampler(args.steps, generator.sampler(), &measured);
     let sampler = sampler.map_err(|why| Problem::usage(format!("{label}: {why}")))?;
+    if let Some((low, high)) = generator.family().exceeded_range(sampler.guidance) {
+        let guidance = sampler.guidance;
+        print::note(&format!(
+            "note: {label} was trained for guidance {low} to {high}; at {guidance} it may draw anything"
+        ));
+    }
     let edit = args.edit.as_deref().map(|path| Edit::read(path, &args.keep, &generator)).transpose()?;
     let skeleton = Skeleton::of(generator.format());
     let length = |request: &Request| request.length.map(|length| length.frames(skeleton.fps));
-    let told = args.control.told(&generator, &label, requests.first().and_then(length))?;
+    let targets = args.control.targets(&generator, &label, requests.first().and_then(length))?;
     let shared = Shared { label, sampler, loaded };
 
     let (mut rows, mut motions): (Vec<Row>, Vec<Vec<Motion>>) = (Vec::new(), Vec::new());
     for request in &requests {
-        let known = is_known(&generator, &shared.label, &request.caption)?;
+        let mut known = is_known(&generator, &shared.label, &request.caption)?;
+        let unknown_words = match known {
+            true => words::unknown(vocabulary.as_ref(), &shared.label, &request.caption),
+            false => Vec::new(),
+        };
+        known &= unknown_words.is_empty() || vocabulary.as_ref().is_some_and(|v| v.has_any(&request.caption));
         let mut drawn = Vec::new();
         for seed in &seeds {
-            let (motion, kept) = draw(&generator, request, Seed(*seed), &shared.sampler, edit.as_ref(), told.as_ref())?;
+            let (motion, kept) =
+                draw(&generator, request, Seed(*seed), &shared.sampler, edit.as_ref(), targets.as_ref())?;
             let number = rows.len() + 1;
             let arrays = args.write_arrays(&motion, number, count)?;
-            let (timing, missed) = (motion.timing, told.as_ref().and_then(|told| told.missed(&motion)));
+            let (timing, missed) = (motion.timing, targets.as_ref().and_then(|targets| targets.missed(&motion)));
             let note = format!("{}, {}, seed {seed}", shared.label, shared.sampler);
-            let waypoints = told.as_ref().map(|told| told.waypoints.clone()).unwrap_or_default();
+            let waypoints = targets.as_ref().map(|targets| targets.waypoints.clone()).unwrap_or_default();
             let motion = Motion { kept: kept.clone(), ..exported(&request.caption, note, motion, waypoints) };
             let motion = args.out.prepared(motion);
             let written = outs.write(number, &motion).map_err(out::refused)?;
@@ -201,6 +220,7 @@ pub(crate) async fn generate(args: GenerateArgs) -> Result<u8> {
                 frames,
                 seconds: frames as f64 / skeleton.fps,
                 known,
+                unknown_words: unknown_words.clone(),
                 kept,
                 timing,
                 missed,
@@ -210,7 +230,7 @@ pub(crate) async fn generate(args: GenerateArgs) -> Result<u8> {
             if outs.wants_all() {
                 drawn.push(motion);
             } else if let (Output::Json, Some(row)) = (args.report(), rows.last()) {
-                // Nothing is left to write for it, so nobody has to wait.
+                // This motion has no more files, so its line is printed at once.
                 print::out(&row.json(&shared, &[]).to_string());
             }
         }
@@ -227,7 +247,7 @@ pub(crate) async fn generate(args: GenerateArgs) -> Result<u8> {
     Ok(0)
 }
 
-/// Whether the model makes anything of a sentence; says so if it does not.
+/// Returns true if the model recognises a word of the sentence; prints a note if not.
 pub(super) fn is_known(generator: &Generator, label: &str, caption: &str) -> Result<bool> {
     let known = generator.knows(caption).map_err(model::refused)?;
     if !known && caption.trim().is_empty() {
@@ -240,7 +260,7 @@ pub(super) fn is_known(generator: &Generator, label: &str, caption: &str) -> Res
     Ok(known)
 }
 
-/// A drawn motion, ready to be written.
+/// Wraps a generated motion for export.
 pub(super) fn exported(
     caption: &str,
     note: String,
@@ -258,23 +278,23 @@ pub(super) fn exported(
     }
 }
 
-/// A motion, and which frames of an edited one stayed.
+/// Generates a motion. Also returns the frames of an edited motion that were kept.
 fn draw(
     generator: &Generator,
     request: &Request,
     seed: Seed,
     sampler: &Sampler,
     edit: Option<&Edit>,
-    told: Option<&Told>,
+    targets: Option<&Targets>,
 ) -> Result<(Generated, Vec<Range<usize>>)> {
     let (prompt, sampler) = (request.caption.as_str(), Some(sampler));
-    let drawn = match (edit, told) {
+    let drawn = match (edit, targets) {
         (None, None) => {
             let frames = request.length.map(|length| length.frames(Skeleton::of(generator.format()).fps));
             generator.generate(prompt, frames, sampler, seed).map(|motion| (motion, Vec::new()))
         }
-        (None, Some(told)) => {
-            let motion = generator.generate_controlled(prompt, sampler, seed, told.request());
+        (None, Some(targets)) => {
+            let motion = generator.generate_controlled(prompt, sampler, seed, targets.request());
             motion.map(|motion| (motion, Vec::new()))
         }
         (Some(edit), _) => {
@@ -285,7 +305,7 @@ fn draw(
     drawn.map_err(model::refused)
 }
 
-/// Pages and sheets: a section for each sentence if it has several motions.
+/// Writes the files that hold all motions. Each sentence has a section if it has several motions.
 fn write_together(outs: &Outs, label: &str, requests: &[Request], motions: &[Vec<Motion>]) -> Result<Vec<String>> {
     let several = motions.len() > 1 && motions.iter().any(|drawn| drawn.len() > 1);
     let sections: Vec<(String, Vec<&Motion>)> = if several {
@@ -298,13 +318,13 @@ fn write_together(outs: &Outs, label: &str, requests: &[Request], motions: &[Vec
     Ok(out::names(&written).collect())
 }
 
-/// Thousandths of a second.
+/// Converts a time to milliseconds.
 fn milliseconds(time: Duration) -> f64 {
     time.as_secs_f64() * 1e3
 }
 
 impl Row {
-    /// The line of a motion, which lies in `together` too.
+    /// The JSON line of a motion, which is also in the files `together`.
     fn json(&self, shared: &Shared, together: &[String]) -> Value {
         let Shared { label, sampler, loaded } = shared;
         json!({
@@ -312,6 +332,7 @@ impl Row {
             "model": label,
             "prompt": self.prompt,
             "known": self.known,
+            "unknown_words": self.unknown_words,
             "frames": self.frames,
             "seconds": self.seconds,
             "kept": self.kept.iter().map(|span| [span.start, span.end]).collect::<Vec<_>>(),
@@ -325,7 +346,7 @@ impl Row {
             "decoding_ms": milliseconds(self.timing.decoding),
             "load_ms": milliseconds(*loaded),
             "control": self.missed.map(|missed| json!({
-                "told": missed.told,
+                "told": missed.targets,
                 "average_error_m": missed.average,
                 "worst_error_m": missed.worst,
                 "missed_by_50cm": missed.location,
@@ -334,7 +355,7 @@ impl Row {
     }
 }
 
-/// The report for people.
+/// The report as text.
 fn table(rows: &[Row], shared: &Shared, together: &[String], edit: Option<&Edit>) -> String {
     let Shared { label, sampler, loaded } = shared;
     let files = |row: &Row| row.files.iter().chain(together).cloned().collect::<Vec<_>>().join(", ");
@@ -371,7 +392,7 @@ fn table(rows: &[Row], shared: &Shared, together: &[String], edit: Option<&Edit>
     for missed in rows.iter().filter_map(|row| row.missed) {
         text += &format!(
             "\n{} positions told: {:.1} cm off in the mean, {:.1} cm at worst, {:.0} % missed by more than 50 cm",
-            missed.told,
+            missed.targets,
             100.0 * missed.average,
             100.0 * missed.worst,
             100.0 * missed.location,
@@ -382,7 +403,7 @@ fn table(rows: &[Row], shared: &Shared, together: &[String], edit: Option<&Edit>
 
 /// A motion to edit.
 struct Edit {
-    /// Rows `[frames, features]`.
+    /// Values `[frames, features]`.
     motion: Vec<f32>,
     frames: usize,
     keep: Vec<Range<usize>>,
@@ -390,7 +411,7 @@ struct Edit {
 
 impl Edit {
     fn read(path: &Path, keep: &[Span], generator: &Generator) -> Result<Self> {
-        let array = npy::read(path).map_err(|error| Problem::usage(error.to_string()))?;
+        let array = npy::read(&DataPath::local(path)).map_err(|error| Problem::usage(error.to_string()))?;
         let skeleton = Skeleton::of(generator.format());
         let refuse = |what: String| Problem::usage(format!("{}: {what}", path.display()));
         let [frames, width] = array.shape[..] else {
@@ -410,7 +431,7 @@ impl Edit {
         Ok(Self { motion: array.data, frames, keep: keep.map_err(refuse)? })
     }
 
-    /// What stayed, and what was left out because it fills no token.
+    /// Describes the kept spans, and the last frames that fill no token.
     fn describe(&self, frames: usize, kept: &[Range<usize>]) -> String {
         let spans: Vec<String> = kept.iter().map(|span| format!("{}-{}", span.start, span.end - 1)).collect();
         let rest = match self.frames - frames {

@@ -1,5 +1,5 @@
-//! `trainer import`: published weights as a version of a model. A pipeline of `import.model` and `register` does it, which this writes and runs;
-//! `--print` shows it, to be kept and changed.
+//! `trainer import`: published weights as a version of a model. It writes and runs a pipeline of `import.model` and
+//! `register`. `--print` shows the pipeline, to be kept and changed.
 
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
@@ -11,7 +11,7 @@ use crate::print::{self, Output};
 use crate::problem::{Problem, Result};
 use crate::run;
 
-/// What becomes a version.
+/// Parts of a published model that become a version.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 enum Part {
     /// The denoiser of MLD, or MotionLCM's teacher, with its VAE
@@ -35,22 +35,22 @@ pub(crate) struct ImportArgs {
     /// File with the weights: of torch (`.ckpt`, `.tar`, `.pth`, `.pt`), or `.safetensors` under the published names
     #[arg(value_name = "FILE")]
     file: PathBuf,
-    /// The model of which it becomes a version
+    /// The model that gets the new version
     #[arg(long = "as", value_name = "MODEL")]
     model: String,
-    /// What it is
+    /// Kind of the weights
     #[arg(long, value_enum)]
     part: Part,
-    /// Folder with the mean and the deviation of the features that it was trained on: `mean.npy` and `std.npy`
+    /// Folder with the mean and the deviation of its training features: `mean.npy` and `std.npy`
     #[arg(long, value_name = "DIR")]
     statistics: PathBuf,
-    /// What it was trained on: `humanml3d` or `kit`
+    /// Format of its training data: `humanml3d` or `kit`
     #[arg(long, default_value = "humanml3d", value_name = "FORMAT")]
     format: String,
-    /// The text encoder that it was trained with: `clip=FOLDER`, `t5=FOLDER`, `sentence-t5=FOLDER` or `hashed`
+    /// Text encoder of its training: `clip=FOLDER`, `t5=FOLDER`, `sentence-t5=FOLDER` or `hashed`
     #[arg(long, default_value = "hashed", value_name = "ENCODER=FOLDER")]
     text: String,
-    /// File with the VAE, where FILE does not hold it
+    /// File with the VAE, if FILE does not hold it
     #[arg(long, value_name = "FILE")]
     vae: Option<PathBuf>,
     /// File with the tokenizer of a token model
@@ -59,7 +59,7 @@ pub(crate) struct ImportArgs {
     /// File with MoMask's residual transformer
     #[arg(long, value_name = "FILE")]
     residual: Option<PathBuf>,
-    /// Folder with `Mean_raw.npy` and `Std_raw.npy`, which a control part's hints are normalised with
+    /// Folder with `Mean_raw.npy` and `Std_raw.npy`, which normalise a control part's hints
     #[arg(long, value_name = "DIR", required_if_eq("part", "control"))]
     hint_statistics: Option<PathBuf>,
     /// Overrides a key of the pipeline, such as `stages.weights.heads=8`; may be repeated
@@ -71,7 +71,7 @@ pub(crate) struct ImportArgs {
     /// The store's folder
     #[arg(long, env = "STRIDE_STORE", default_value = ".stride", value_name = "DIR")]
     store: PathBuf,
-    /// How the result is printed
+    /// Format of the result
     #[arg(short, long, value_enum, default_value_t)]
     pub(super) output: Output,
 }
@@ -84,17 +84,18 @@ pub(crate) async fn import(args: ImportArgs, command: String) -> Result<u8> {
         return Ok(0);
     }
     let file = Box::new(pipeline_file::with_data(file)?);
-    let options = run::Options { store: args.store, blobs: None, workers: Some(1), output: args.output, command };
+    let options =
+        run::Options { store: args.store, blobs: None, workers: Some(1), output: args.output, ui: false, command };
     run::run(run::Request::Submit { file, until: None }, options).await
 }
 
-/// A path as YAML has a text.
+/// Quotes a path for YAML.
 fn quoted(path: &Path) -> String {
     serde_json::Value::from(path.display().to_string()).to_string()
 }
 
 impl ImportArgs {
-    /// The pipeline. Which captions are embedded does not matter, so a few are made up.
+    /// Writes the pipeline. Its embedded captions do not matter, so they are a few synthetic ones.
     fn pipeline(&self) -> Result<String> {
         let text = match self.text.split_once('=') {
             Some((encoder, folder)) => format!("{{encoder: {encoder}, path: {}}}", quoted(Path::new(folder))),

@@ -1,4 +1,4 @@
-//! Spans of time on a command line, such as `0:1s` and `-1s:`: what stays of a motion that is edited.
+//! Spans of time on a command line, such as `0:1s` and `-1s:`: the parts of an edited motion to keep.
 
 use std::ops::Range;
 use std::str::FromStr;
@@ -7,9 +7,9 @@ use std::str::FromStr;
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Place {
     value: f64,
-    /// Seconds, or else frames.
+    /// True for seconds, false for frames.
     seconds: bool,
-    /// Counted from the end.
+    /// True if counted from the end.
     from_end: bool,
 }
 
@@ -41,7 +41,7 @@ impl FromStr for Place {
     }
 }
 
-/// A span of a motion, open on a side that says nothing.
+/// A span of a motion; a missing end means the motion's end.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Span {
     from: Option<Place>,
@@ -61,10 +61,10 @@ impl FromStr for Span {
 }
 
 impl Span {
-    /// Its frames in a motion of `frames`.
+    /// Returns the frames of the span in a motion of `frames`.
     ///
     /// # Errors
-    /// It lies outside, or ends before it begins.
+    /// If the span is outside the motion, or ends before it begins.
     pub(super) fn of(self, frames: usize, fps: f64) -> Result<Range<usize>, String> {
         let outside = || {
             format!(

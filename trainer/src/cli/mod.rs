@@ -1,44 +1,50 @@
-//! Arguments, one type and one function per verb.
+//! Command line: one type and one function per verb.
 
+mod allowance_args;
 mod args;
 mod config;
 mod control;
 mod data;
-mod door;
+mod doctor;
+mod endpoint_args;
 mod export;
 mod gallery;
 mod generate;
 mod import;
 mod keep;
+mod metrics;
 mod model;
 mod out;
 mod remote;
 mod sampler;
 mod sentences;
 mod serve;
+mod shell;
 mod spectrum;
 mod stream;
 pub(crate) mod sweep;
 mod time;
+mod words;
 
 use std::path::PathBuf;
 use std::process::ExitCode;
 
 use access::ServerOptions;
-use clap::{Args, Parser, Subcommand};
+use clap::{Args, CommandFactory as _, Parser, Subcommand};
 use protocol::StageName;
 use registry::{OpenError, ReadStore};
 
 use self::args::{BlobArgs, PipelineArgs};
+use crate::advice::advice;
 use crate::client::Target;
 use crate::print::{self, Output};
 use crate::problem::{Problem, Result, exit};
 use crate::reader::Reader;
 use crate::{cost, pipeline_file, plan, run, verify};
 
-/// Trains text-to-motion models across workers and keeps what came out of it
+/// Trains text-to-motion models across workers and stores the results
 #[derive(Debug, Parser)]
-#[command(name = "trainer", version, propagate_version = true)]
+#[command(name = "trainer", version = env!("STRIDE_VERSION"), propagate_version = true, after_help = exit::HELP)]
 pub(crate) struct Cli {
     #[command(subcommand)]
     verb: Verb,
@@ -46,51 +52,85 @@ pub(crate) struct Cli {
 
 #[derive(Debug, Subcommand)]
 enum Verb {
-    /// Runs a pipeline on this machine; run it again to go on where it stopped
+    /// Runs a pipeline on this machine; run it again to continue where it stopped
+    #[command(
+        after_help = "Examples:\n  trainer run configs/quickstart.yaml\n  trainer run configs/smoke.yaml --until vae --workers 2 -o json"
+    )]
     Run(RunArgs),
     /// Shows what `run` would do, and why
+    #[command(
+        after_help = "Examples:\n  trainer plan configs/quickstart.yaml\n  trainer plan configs/motionpcm.yaml --no-time"
+    )]
     Plan(PlanArgs),
     /// Sends a pipeline to a server
+    #[command(after_help = "Example:\n  trainer submit configs/quickstart.yaml --follow")]
     Submit(remote::SubmitArgs),
     /// Coordinates runs for clients and workers elsewhere
     Serve(serve::ServeArgs),
     /// Shows a run, or all runs
+    #[command(after_help = "Examples:\n  trainer status\n  trainer status --all")]
     Status(remote::StatusArgs),
-    /// Shows what workers said
+    /// Shows the logs of workers
+    #[command(after_help = "Example:\n  trainer logs @last --stage vae --follow")]
     Logs(remote::LogsArgs),
-    /// What the sweeps of a run have tried, and what came of it
+    /// Shows the recorded values of a run's stages: the newest, a picture of all, or every one
+    #[command(
+        after_help = "Examples:\n  trainer metrics @last --stage vae\n  trainer metrics @last --key loss --plot loss.svg\n  trainer metrics @last --key loss --csv"
+    )]
+    Metrics(metrics::MetricsArgs),
+    /// Shows the trials of a run's sweeps and their results
     #[command(subcommand)]
     Sweep(sweep::SweepVerb),
     /// Ends a run
+    #[command(after_help = "Example:\n  trainer cancel @last")]
     Cancel(remote::ControlArgs),
-    /// Holds a run back: its workers save and stop
+    /// Pauses a run: its workers save and stop
+    #[command(after_help = "Example:\n  trainer pause @last")]
     Pause(remote::ControlArgs),
-    /// Takes a paused, failed or cancelled run up again
+    /// Continues a paused, failed or cancelled run
+    #[command(after_help = "Example:\n  trainer resume @last")]
     Resume(ResumeArgs),
-    /// Makes motions from sentences
+    /// Generates motions from sentences
+    #[command(
+        after_help = "Examples:\n  trainer generate \"a person walks in a circle\" --model quickstart@staging -o walk.gif\n  trainer generate \"a person jumps\" -n 4 --seconds 4s --model quickstart@staging -o jump.html -o json"
+    )]
     Generate(Box<generate::GenerateArgs>),
-    /// Recordings of motion
+    /// Inspects recordings of motion and writes samples
     #[command(subcommand)]
     Data(data::DataVerb),
-    /// Makes one page of what a run's models draw, side by side
+    /// Draws the motions of a run's models side by side on one page
+    #[command(after_help = "Example:\n  trainer gallery @last -n 2 -o gallery.html")]
     Gallery(Box<gallery::GalleryArgs>),
-    /// Turns a motion or a recording into another form: BVH, GLB, a page, a picture, an array
+    /// Converts a motion or a recording to another format: BVH, GLB, a page, a picture, an array
+    #[command(after_help = "Example:\n  trainer export walk.npy -o walk.glb -o walk.mp4")]
     Export(export::ExportArgs),
-    /// Makes a version of a model of weights that others have published
+    /// Makes a version of a model from published weights
+    #[command(
+        after_help = "Example:\n  trainer import motionlcm.ckpt --as motionlcm --part lcm --statistics deps/motionlcm/meta --text sentence-t5=data/sentence-t5-large"
+    )]
     Import(Box<import::ImportArgs>),
-    /// Measures how long models take for a sentence (AITS), side by side
+    /// Measures the time of models per sentence (AITS), side by side
+    #[command(after_help = "Example:\n  trainer time quickstart@staging --stage mld --steps 50,4,1")]
     Time(time::TimeArgs),
-    /// Lists what this build and machine can compute on
+    /// Lists the computing devices of this build and machine
+    #[command(after_help = "Example:\n  trainer devices")]
     Devices(config::DevicesArgs),
-    /// Pipeline files
+    /// Checks store, disk, devices and server, with advice for each problem
+    Doctor(doctor::DoctorArgs),
+    /// Prints a script with which a shell completes commands and options
+    Completions(shell::CompletionsArgs),
+    /// Writes manual pages, one for each command
+    Man(shell::ManArgs),
+    /// Checks and shows pipeline files
     #[command(subcommand)]
     Config(config::ConfigVerb),
     /// Prints the JSON Schema of pipelines, for editors
+    #[command(after_help = "Example:\n  trainer schema --markdown")]
     Schema(config::SchemaArgs),
-    /// Workers
+    /// Runs and lists workers
     #[command(subcommand)]
     Worker(WorkerVerb),
-    /// Models, their versions, and the aliases that point at them
+    /// Manages models, their versions, and the aliases that point at them
     Registry(RegistryArgs),
 }
 
@@ -106,7 +146,7 @@ enum WorkerVerb {
 struct RunArgs {
     #[command(flatten)]
     pipeline: PipelineArgs,
-    /// Worker processes [default: one a core on CPU, one on a GPU]
+    /// Number of worker processes [default: one per core on CPU, one on a GPU]
     #[arg(long, value_name = "N")]
     workers: Option<usize>,
     /// The store's folder
@@ -120,7 +160,10 @@ struct RunArgs {
     /// Trains nothing; runs N steps of each training stage again and compares them with what is stored [default N: 20]
     #[arg(long, value_name = "N", num_args = 0..=1, default_missing_value = "20", conflicts_with_all = ["workers", "until"])]
     verify: Option<std::num::NonZeroU64>,
-    /// How the result is printed
+    /// Print a link to a page that shows the run live
+    #[arg(long)]
+    ui: bool,
+    /// Format of the result
     #[arg(short, long, value_enum, default_value_t)]
     output: Output,
 }
@@ -129,13 +172,13 @@ struct RunArgs {
 struct PlanArgs {
     #[command(flatten)]
     pipeline: PipelineArgs,
-    /// Tries no stage, and so says nothing of parameters and times
+    /// Tries no stage, and so omits parameters and times
     #[arg(long)]
     no_time: bool,
     /// The store's folder
     #[arg(long, env = "STRIDE_STORE", default_value = ".stride", value_name = "DIR")]
     store: PathBuf,
-    /// How the plan is printed
+    /// Format of the plan
     #[arg(short, long, value_enum, default_value_t)]
     output: Output,
 }
@@ -147,10 +190,10 @@ struct ResumeArgs {
     run: String,
     #[command(flatten)]
     target: Target,
-    /// Worker processes, when no server is running
+    /// Number of worker processes, when no server is running
     #[arg(long, value_name = "N")]
     workers: Option<usize>,
-    /// How the result is printed
+    /// Format of the result
     #[arg(short, long, value_enum, default_value_t)]
     output: Output,
 }
@@ -162,17 +205,17 @@ struct RegistryArgs {
     store: PathBuf,
     #[command(flatten)]
     server: ServerOptions,
-    /// How the answer is printed; for `export`, the file of a bundle, FILE.tar.zst
+    /// Format of the answer; for `export`, the file of a bundle, FILE.tar.zst
     #[arg(short, long, default_value = "table", value_name = "table|json", global = true)]
     output: registry::cli::OutputArg,
     #[command(subcommand)]
     verb: registry::cli::Verb,
 }
 
-/// Does what was asked.
+/// Runs the command.
 pub(crate) fn main(cli: Cli) -> ExitCode {
     if let Verb::Worker(WorkerVerb::Join(args)) = cli.verb {
-        // Its own threads, its own logging: a worker is synchronous at heart.
+        // A worker is synchronous, with its own threads and its own logging.
         worker::init_logging();
         return match worker::Options::try_from(args).and_then(worker::join) {
             Ok(()) => ExitCode::SUCCESS,
@@ -183,6 +226,10 @@ pub(crate) fn main(cli: Cli) -> ExitCode {
         };
     }
     init_logging();
+    // A server's messages have many readers; those of other commands only their own user.
+    if !matches!(cli.verb, Verb::Serve(_)) {
+        protocol::show_excerpts();
+    }
     cli.verb.keep_to_oneself();
     let output = cli.verb.output();
     let runtime = match tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build() {
@@ -199,21 +246,23 @@ pub(crate) fn main(cli: Cli) -> ExitCode {
             problem.exit
         }
     };
-    // Whatever still blocks, such as a read of a blob, is of no use to anybody.
+    // Do not wait for blocking tasks; their results are no longer needed.
     runtime.shutdown_background();
     ExitCode::from(code)
 }
 
-/// Warnings on stderr, more by `RUST_LOG`. A log line that nobody reads any more is dropped: told of it, the subscriber would print that, fail
-/// again, and panic in the middle of what it logs for.
+/// Logs warnings to stderr, and more with `RUST_LOG`. A log line that cannot be written is dropped. Otherwise the
+/// subscriber would report that error, fail again, and panic.
 fn init_logging() {
+    // The database warns of each statement that waits for a slow disk, in lines of SQL.
     let filter = tracing_subscriber::EnvFilter::try_from_default_env()
-        .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("warn"));
-    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).log_internal_errors(false).init();
+        .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("warn,sqlx=error"));
+    let log = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr);
+    log.with_ansi(print::on_terminal()).log_internal_errors(false).init();
 }
 
 impl Verb {
-    /// What a store gets is its user's alone; what else a command writes, the user's umask decides.
+    /// Makes files of a store readable for its user only. For other files, the user's umask decides.
     fn keep_to_oneself(&self) {
         let store_only = match self {
             Self::Run(_) | Self::Serve(_) | Self::Resume(_) | Self::Cancel(_) | Self::Pause(_) | Self::Import(_) => {
@@ -234,6 +283,7 @@ impl Verb {
             Self::Submit(args) => args.output,
             Self::Status(args) => args.output,
             Self::Logs(args) => args.output,
+            Self::Metrics(args) => args.output,
             Self::Cancel(args) | Self::Pause(args) => args.output,
             Self::Sweep(verb) => verb.output(),
             Self::Data(verb) => verb.output(),
@@ -244,8 +294,11 @@ impl Verb {
             Self::Import(args) => args.output,
             Self::Time(args) => args.output,
             Self::Devices(args) => args.output,
+            Self::Doctor(args) => args.output,
             Self::Worker(WorkerVerb::List(args)) => args.output,
             Self::Serve(_)
+            | Self::Completions(_)
+            | Self::Man(_)
             | Self::Config(_)
             | Self::Schema(_)
             | Self::Worker(WorkerVerb::Join(_))
@@ -262,6 +315,7 @@ async fn perform(verb: Verb) -> Result<u8> {
         Verb::Serve(args) => serve::serve(args).await,
         Verb::Status(args) => remote::status(args).await,
         Verb::Logs(args) => remote::logs(args).await,
+        Verb::Metrics(args) => metrics::metrics(args).await,
         Verb::Sweep(verb) => sweep::sweep(verb).await,
         Verb::Cancel(args) => remote::control(args, "cancel").await,
         Verb::Pause(args) => remote::control(args, "pause").await,
@@ -273,6 +327,9 @@ async fn perform(verb: Verb) -> Result<u8> {
         Verb::Import(args) => import::import(*args, command_line()).await,
         Verb::Time(args) => time::time(args).await,
         Verb::Devices(args) => Ok(config::devices(&args)),
+        Verb::Doctor(args) => doctor::doctor(args).await,
+        Verb::Completions(args) => Ok(shell::completions(&args, Cli::command())),
+        Verb::Man(args) => shell::man(&args, Cli::command()),
         Verb::Config(verb) => config::config(&verb),
         Verb::Schema(args) => Ok(config::schema(&args)),
         Verb::Worker(WorkerVerb::List(args)) => remote::workers(args).await,
@@ -281,7 +338,7 @@ async fn perform(verb: Verb) -> Result<u8> {
     }
 }
 
-/// The command as typed, for messages that say how to go on.
+/// The command as typed, for messages that suggest how to continue.
 fn command_line() -> String {
     let quoted = std::env::args().skip(1).map(|argument| {
         let plain = |c: char| c.is_ascii_alphanumeric() || "-_./=@:,+".contains(c);
@@ -301,6 +358,7 @@ async fn run_pipeline(args: RunArgs) -> Result<u8> {
         blobs: args.blobs.blobs,
         workers: args.workers,
         output: args.output,
+        ui: args.ui,
         command: command_line(),
     };
     run::run(run::Request::Submit { file: Box::new(file), until }, options).await
@@ -320,6 +378,7 @@ async fn show_plan(args: PlanArgs) -> Result<u8> {
     if !args.no_time && plan.stages.iter().any(|step| step.action != "cached") {
         plan.estimate(&cost::estimates(&file.pipeline));
     }
+    advice(&file.pipeline).iter().for_each(|note| print::note(&format!("note: {note}")));
     match args.output {
         Output::Json => print::json(&plan),
         Output::Table => print::out(&plan.screen(&file.pipeline)),
@@ -328,19 +387,20 @@ async fn show_plan(args: PlanArgs) -> Result<u8> {
 }
 
 async fn resume(args: ResumeArgs) -> Result<u8> {
-    // Looked up first: nothing is started for a run that does not exist.
+    // Find the run first: nothing is started for a run that does not exist.
     let reader = Reader::open(&args.target).await?;
     let found = reader.find(&args.run).await?;
     let client = match reader {
         Reader::Server(client) => client,
         Reader::Store(records) => {
-            // Nobody holds it, so nobody would do the work: this process does.
+            // No server holds the store, so this process does the work.
             records.close().await;
             let options = run::Options {
                 store: args.target.store,
                 blobs: None,
                 workers: args.workers,
                 output: args.output,
+                ui: false,
                 command: command_line(),
             };
             return run::run(run::Request::Resume(found.run), options).await;
@@ -366,9 +426,31 @@ mod tests {
         }
     }
 
+    /// The examples in the `--help` of a command and its subcommands.
+    fn examples(command: &clap::Command) -> Vec<String> {
+        let help = command.get_after_help().map(ToString::to_string).unwrap_or_default();
+        let lines = help.lines().filter_map(|line| Some(line[line.find("trainer ")?..].to_owned()));
+        let own = lines.filter(|_| help.starts_with("Example")).collect::<Vec<_>>();
+        own.into_iter().chain(command.get_subcommands().flat_map(examples)).collect()
+    }
+
+    #[test]
+    fn the_examples_of_every_help_parse() {
+        let command = Cli::command();
+        let examples = examples(&command);
+        assert!(examples.len() >= 20, "{examples:#?}");
+        for example in examples {
+            let words = cluster_tests::documented::words(&example);
+            let words: Vec<&String> = words.iter().take_while(|word| *word != ">").collect();
+            if let Err(error) = Cli::try_parse_from(words) {
+                panic!("{example}: {error}");
+            }
+        }
+    }
+
     #[test]
     fn options_are_consistent() {
-        <Cli as clap::CommandFactory>::command().debug_assert();
+        Cli::command().debug_assert();
     }
 
     #[test]

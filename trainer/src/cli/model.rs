@@ -1,4 +1,4 @@
-//! Models to draw motions from: a registered version, or what a stage of a run gave.
+//! Models to generate from: a registered version, or the output of a run's stage.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -8,9 +8,10 @@ use burn::tensor::Device;
 use checkpoint::model::{Drawn, Model};
 use checkpoint::{BlobError, Blobs};
 use models::device::DeviceInfo;
+use motion::Dataset;
 use protocol::message::RunView;
 use protocol::stage::Sampler;
-use protocol::{Digest, Manifest};
+use protocol::{ArtifactKind, Digest, Manifest};
 use registry::cli::{Command, Data};
 use stages::context::StageError;
 use stages::kinds::REPORT_FILE;
@@ -18,22 +19,24 @@ use stages::kinds::REPORT_FILE;
 use crate::problem::{Problem, Result, exit};
 use crate::reader::Reader;
 
-/// A model with all that it needs.
+/// A model with its files.
 #[derive(Debug)]
 pub(super) struct Found {
     pub(super) manifest: Manifest,
     pub(super) blobs: Fetched,
     pub(super) label: Label,
-    /// Evaluations of it and how they drew, of what a stage gave. A version has its own sampler.
+    /// The model's manifest. If the model was trained here, the store has its lineage.
+    pub(super) artifact: Digest,
+    /// Evaluations of a stage's model and their samplers. A version has its own sampler.
     pub(super) measured: Vec<(String, Sampler)>,
 }
 
-/// What a name stood for.
+/// Name of a model for messages.
 #[derive(Debug)]
 pub(super) enum Label {
-    /// A name in the registry, and its version.
+    /// Name and version in the registry.
     Version(String, u64),
-    /// A run, and its stage.
+    /// Run and stage.
     Stage(String, String),
 }
 
@@ -62,13 +65,13 @@ impl Blobs for Fetched {
 }
 
 impl Fetched {
-    /// Those of `other` too.
+    /// Adds the blobs of `other`.
     pub(super) fn add(&self, other: Self) {
         let others = other.0.into_inner().unwrap_or_else(PoisonError::into_inner);
         self.0.lock().unwrap_or_else(PoisonError::into_inner).extend(others);
     }
 
-    /// The files of a manifest.
+    /// Fetches the files of a manifest.
     async fn files(reader: &Reader, manifest: &Manifest) -> Result<Self> {
         let blobs = Self::default();
         for file in manifest.files.values() {
@@ -89,7 +92,7 @@ async fn verified(reader: &Reader, name: Digest) -> Result<Vec<u8>> {
     Ok(bytes)
 }
 
-/// A version of the registry: MODEL@ALIAS, MODEL@best or MODEL:VERSION.
+/// Finds a version in the registry: MODEL@ALIAS, MODEL@best or MODEL:VERSION.
 pub(super) async fn version(reader: &Reader, name: &str) -> Result<Found> {
     let answer = reader.registry(&Command::Show { reference: name.to_owned() }).await?;
     if let Some(error) = answer.error {
@@ -112,10 +115,11 @@ pub(super) async fn version(reader: &Reader, name: &str) -> Result<Found> {
         }
     };
     let blobs = Fetched::files(reader, &manifest).await?;
-    Ok(Found { manifest, blobs, label: Label::Version(name.to_owned(), version.version), measured: Vec::new() })
+    let (artifact, label) = (version.artifact, Label::Version(name.to_owned(), version.version));
+    Ok(Found { manifest, blobs, label, artifact, measured: Vec::new() })
 }
 
-/// The model that a stage of `run` gave, and how the run's evaluations drew from it.
+/// Finds the model of a stage of `run`, and the samplers of the run's evaluations of it.
 pub(super) async fn stage(reader: &Reader, run: &RunView, name: &str) -> Result<Found> {
     let model = run.stages.iter().find(|stage| stage.name.as_str() == name).map(|stage| stage.outputs.get(MODEL));
     let Some(Some(model)) = model else {
@@ -138,16 +142,16 @@ pub(super) async fn stage(reader: &Reader, run: &RunView, name: &str) -> Result<
         }
     }
     let blobs = Fetched::files(reader, &manifest).await?;
-    Ok(Found { manifest, blobs, label: Label::Stage(run.run.to_string(), name.to_owned()), measured })
+    Ok(Found { manifest, blobs, label: Label::Stage(run.run.to_string(), name.to_owned()), artifact: *model, measured })
 }
 
-/// Stages of a run that gave a model so far, but for the trials of sweeps.
+/// Stages of a run that have a model so far, without the trials of sweeps.
 pub(super) fn stages(run: &RunView) -> Vec<&str> {
     let have = run.stages.iter().filter(|stage| stage.of.is_none() && stage.outputs.contains_key(MODEL));
     have.map(|stage| stage.name.as_str()).collect()
 }
 
-/// The report of an evaluation.
+/// Reads the report of an evaluation.
 pub(super) async fn report(reader: &Reader, digest: Digest) -> Result<serde_json::Value> {
     let manifest = manifest(reader, digest).await?;
     let file = manifest.files.get(REPORT_FILE).ok_or_else(|| Problem::failed(format!("{digest} is no report")))?;
@@ -165,12 +169,29 @@ async fn manifest(reader: &Reader, digest: Digest) -> Result<Manifest> {
     Ok(manifest)
 }
 
-/// The output of stages that give a model.
+/// The sentences of a dataset's training entries; `None` if its index is too long to read for a hint.
+///
+/// # Errors
+/// If the store does not answer, or the artifact is no dataset.
+pub(super) async fn training_captions(reader: &Reader, dataset: Digest) -> Result<Option<Vec<String>>> {
+    let manifest = manifest(reader, dataset).await?;
+    let index =
+        manifest.files.get(INDEX).filter(|file| manifest.kind == ArtifactKind::Dataset && file.bytes <= LONGEST_INDEX);
+    let Some(index) = index else { return Ok(None) };
+    let bytes = bytes::Bytes::from(verified(reader, index.digest).await?);
+    let captions = Dataset::training_captions_from_files(&|_| Ok(bytes.clone())).map_err(Problem::failed)?;
+    Ok(Some(captions.into_iter().map(|caption| caption.text).collect()))
+}
+
+/// The file of a dataset with its captions, and its largest size to read.
+const INDEX: &str = "dataset.json";
+const LONGEST_INDEX: u64 = 64 << 20;
+/// The output of stages that produce a model.
 const MODEL: &str = "model";
 /// The output of evaluations.
 const REPORT: &str = "report";
 
-/// The first device of a backend.
+/// Opens the first device of a backend.
 pub(super) fn device(backend: Option<&str>) -> Result<(Device, DeviceInfo)> {
     let all = models::device::available();
     let names: Vec<&str> = all.iter().map(|device| device.backend.name()).collect();
@@ -185,7 +206,7 @@ pub(super) fn device(backend: Option<&str>) -> Result<(Device, DeviceInfo)> {
     Ok((device, found.clone()))
 }
 
-/// A sampler or a length that the model does not have is the user's.
+/// Reports a sampler or a length that the model does not support as wrong usage.
 pub(super) fn refused(error: StageError) -> Problem {
     let exit = if matches!(error, StageError::Input(_)) { exit::USAGE } else { exit::FAILED };
     Problem::new(exit, error)

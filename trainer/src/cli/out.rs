@@ -8,40 +8,41 @@ use super::remote::check_parent;
 use crate::print::Output;
 use crate::problem::{Problem, Result, exit};
 
-/// The word that stands for a report on standard output in place of a file.
+/// The value of `-o` that requests a report on standard output instead of a file.
 const JSON: &str = "json";
 
-/// Files to write, and how to report.
+/// Files to write, and the format of the report.
 #[derive(Debug, clap::Args)]
 pub(super) struct OutArgs {
-    /// Where to write, may be repeated: `.html` to look at motions from all sides, `.gif`, `.mp4` (with an ffmpeg on this machine), `.png` for a sheet of poses, `.bvh` and
-    /// `.glb` for animation programs, `.npy` for features; `json` for a line of JSON a motion on stdout. Of several motions all are in one `.html` or `.png`, and
-    /// every other file gets their numbers
+    /// Output file, may be repeated: `.html` to view motions from all sides, `.gif`, `.mp4` (needs ffmpeg), `.png` for
+    /// a sheet of poses, `.bvh` and `.glb` for animation programs, `.npy` for features; `json` prints one line of JSON
+    /// per motion on stdout. One `.html` or `.png` holds all motions; other files are numbered
     #[arg(short = 'o', long = "out", value_name = "FILE", required = true)]
     out: Vec<PathBuf>,
-    /// Keeps feet that stand where they stand: moves them by 15 cm at most, the knees follow; an `.npy` then has positions
+    /// Keeps standing feet in place: moves them by at most 15 cm, and the knees follow; an `.npy` then has positions
     #[arg(long)]
     plant_feet: bool,
-    /// How the report is printed
+    /// Format of the report
     #[arg(long, value_enum, default_value_t)]
     report: Output,
 }
 
 impl OutArgs {
-    /// How the report is printed.
+    /// Format of the report.
     pub(super) fn report(&self) -> Output {
         if self.out.iter().any(|out| out.as_os_str() == JSON) { Output::Json } else { self.report }
     }
 
-    /// A motion as it is to be written.
+    /// Prepares a motion for writing.
     pub(super) fn prepared(&self, motion: Motion) -> Motion {
         if self.plant_feet { motion.planted() } else { motion }
     }
 
-    /// The files for `count` motions, before anything is drawn.
+    /// Checks the names of the files for `count` motions, before any is generated.
     ///
     /// # Errors
-    /// A name that says no form, a folder that is not there, more motions than a form holds, no encoder of video.
+    /// If a name has no known format, a folder does not exist, a format cannot hold so many motions, or there is no
+    /// video encoder.
     pub(super) fn files(&self, count: usize) -> Result<Outs> {
         let files: Vec<PathBuf> = self.out.iter().filter(|out| out.as_os_str() != JSON).cloned().collect();
         let outs = Outs::new(&files, count).map_err(refused)?;
@@ -50,7 +51,7 @@ impl OutArgs {
     }
 }
 
-/// What a user can do something about is wrong usage.
+/// Reports errors that a user can correct as wrong usage.
 pub(super) fn refused(error: ExportError) -> Problem {
     let code = match error {
         ExportError::Io { .. } | ExportError::Encoder { .. } => exit::FAILED,
@@ -59,12 +60,12 @@ pub(super) fn refused(error: ExportError) -> Problem {
     Problem::new(code, error)
 }
 
-/// Names of files for a report.
+/// Paths of written files for a report.
 pub(super) fn names(written: &[Written]) -> impl Iterator<Item = String> + '_ {
     written.iter().map(|written| written.path.display().to_string())
 }
 
-/// Metres by which the skeletons of some files are off the motion at most; `None` without such a file.
+/// Largest distance in metres of the written skeletons from the motion; `None` without such a file.
 pub(super) fn off_metres(written: &[Written]) -> Option<f64> {
     written.iter().filter_map(|written| written.off_metres).reduce(f64::max)
 }

@@ -1,4 +1,4 @@
-//! Verbs about runs: submit, status, logs, pause, cancel.
+//! Commands about runs: submit, status, logs, pause, cancel.
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -9,6 +9,7 @@ use protocol::message::{RunState, RunView, Submit};
 
 use super::args::PipelineArgs;
 use super::spectrum;
+use crate::advice::advice;
 use crate::client::{Client, Target};
 use crate::pipeline_file;
 use crate::print::{self, Output};
@@ -26,13 +27,13 @@ pub(crate) struct SubmitArgs {
     /// Stop after this stage
     #[arg(long, value_name = "STAGE")]
     until: Option<String>,
-    /// Submitting twice with one key gives one run
+    /// Submitting twice with the same key starts one run
     #[arg(long, value_name = "KEY")]
     idempotency_key: Option<String>,
     /// Watch the run to its end
     #[arg(short, long)]
     follow: bool,
-    /// How the answer is printed
+    /// Format of the answer
     #[arg(short, long, value_enum, default_value_t)]
     pub(super) output: Output,
 }
@@ -42,18 +43,19 @@ pub(crate) struct StatusArgs {
     /// The run, a unique beginning of its name, or `@last`
     #[arg(default_value = "@last")]
     run: String,
-    /// All runs, one a line
+    /// All runs, one per line
     #[arg(long)]
     all: bool,
-    /// Draws what the stage `evaluate.spectrum` found, energy by band of frequencies over the denoising steps, an SVG file
+    /// Draws the results of the stage `evaluate.spectrum`, energy by frequency band over the denoising steps, to an SVG
+    /// file
     #[arg(long, value_name = "FILE.svg", conflicts_with = "all")]
     spectrum: Option<PathBuf>,
-    /// The stage of --spectrum, where there are several
+    /// The stage of --spectrum, if there are several
     #[arg(long, value_name = "STAGE", requires = "spectrum")]
     stage: Option<String>,
     #[command(flatten)]
     target: Target,
-    /// How the answer is printed
+    /// Format of the answer
     #[arg(short, long, value_enum, default_value_t)]
     pub(super) output: Output,
 }
@@ -66,12 +68,12 @@ pub(crate) struct LogsArgs {
     /// Only this stage
     #[arg(long)]
     stage: Option<String>,
-    /// Go on until the run ends
+    /// Continue until the run ends
     #[arg(short, long)]
     follow: bool,
     #[command(flatten)]
     target: Target,
-    /// Lines, or one JSON object a line
+    /// Lines, or one JSON object per line
     #[arg(short, long, value_enum, default_value_t)]
     pub(super) output: Output,
 }
@@ -79,10 +81,11 @@ pub(crate) struct LogsArgs {
 #[derive(Debug, Args)]
 pub(crate) struct ControlArgs {
     /// The run, a unique beginning of its name, or `@last`
+    #[arg(default_value = "@last")]
     run: String,
     #[command(flatten)]
     target: Target,
-    /// How the answer is printed
+    /// Format of the answer
     #[arg(short, long, value_enum, default_value_t)]
     pub(super) output: Output,
 }
@@ -91,17 +94,17 @@ pub(crate) struct ControlArgs {
 pub(crate) struct WorkersArgs {
     #[command(flatten)]
     target: Target,
-    /// How the answer is printed
+    /// Format of the answer
     #[arg(short, long, value_enum, default_value_t)]
     pub(super) output: Output,
 }
 
-/// A run as a table or an object.
+/// Prints a run as a table or an object.
 pub(crate) fn show(view: &RunView, output: Output) {
     match output {
         Output::Json => print::json(&Summary::of(view, false)),
         Output::Table => {
-            print::out(&format!("run {}: {}\n", view.run, summary::run_state(view.state)));
+            print::out(&format!("run {}: {}\n", view.run, summary::run_state(view)));
             print::out(&format!("{}{}", summary::table(view), summary::evaluations(view)));
         }
     }
@@ -115,6 +118,7 @@ pub(crate) async fn submit(args: SubmitArgs) -> Result<u8> {
         let problem = Problem::usage("no server is running on this store, so nobody would do the work");
         return Err(problem.hint("`trainer serve` starts one, `trainer run` needs none; or name one with --server"));
     };
+    advice(&file.pipeline).iter().for_each(|note| print::note(&format!("note: {note}")));
     let pipeline = serde_json::to_value(&file.pipeline).map_err(|error| Problem::new(exit::FAULT, error))?;
     let submit = Submit { pipeline, source: file.source, idempotency_key: args.idempotency_key, until };
     let run = client.submit(&submit).await?;
@@ -125,7 +129,10 @@ pub(crate) async fn submit(args: SubmitArgs) -> Result<u8> {
         }
         return Ok(0);
     }
-    let mut progress = Progress::new(args.output == Output::Table && print::on_terminal());
+    let bars = args.output == Output::Table && print::on_terminal();
+    let for_workers =
+        "`trainer worker join` on a machine gives the server one, `trainer worker list` shows those it has";
+    let mut progress = Progress::new(bars, &file.pipeline, for_workers);
     let view = loop {
         let view = client.run(&run).await?;
         progress.update(&view);
@@ -160,14 +167,19 @@ pub(crate) async fn status(args: StatusArgs) -> Result<u8> {
                 let row = |run: &RunView| {
                     let asked = || run.stages.iter().filter(|stage| stage.of.is_none());
                     let done = asked().filter(|stage| !stage.outputs.is_empty()).count();
-                    let state = summary::run_state(run.state).to_owned();
-                    vec![run.run.to_string(), run.pipeline.clone(), state, format!("{done}/{}", asked().count())]
+                    let state = summary::run_state(run).to_owned();
+                    let stages = format!("{done}/{}", asked().count());
+                    vec![run.run.to_string(), run.pipeline.clone(), run.owner.to_string(), state, stages]
                 };
-                print::out(&print::table(&["RUN", "PIPELINE", "STATE", "STAGES"], runs.iter().map(row).collect()));
+                print::out(&print::table(
+                    &["RUN", "PIPELINE", "OWNER", "STATE", "STAGES"],
+                    runs.iter().map(row).collect(),
+                ));
             }
         }
     } else {
-        let view = reader.find(&args.run).await?;
+        // Read by itself, because a list omits the obstacles of a run.
+        let view = reader.run(&reader.find(&args.run).await?.run).await?;
         if let Some(path) = &args.spectrum {
             check_parent(path)?;
             spectrum::draw(&reader, &view, args.stage.as_deref(), path).await?;
@@ -183,7 +195,7 @@ pub(crate) async fn logs(args: LogsArgs) -> Result<u8> {
     let run = reader.find(&args.run).await?.run;
     let mut after = 0;
     loop {
-        // Asked first: what is logged before the end is then read after it.
+        // Read the state first, so that lines logged before the end are read after it.
         let state = reader.run(&run).await?.state;
         loop {
             let rows = reader.logs(&run, args.stage.as_deref(), after).await?;
@@ -209,7 +221,7 @@ pub(crate) async fn logs(args: LogsArgs) -> Result<u8> {
 }
 
 pub(crate) async fn control(args: ControlArgs, action: &str) -> Result<u8> {
-    // Looked up first: nothing is started for a run that does not exist.
+    // Find the run first: nothing is started for a run that does not exist.
     let reader = Reader::open(&args.target).await?;
     let run = reader.find(&args.run).await?.run;
     reader.close().await;
@@ -241,7 +253,7 @@ pub(crate) async fn workers(args: WorkersArgs) -> Result<u8> {
     Ok(0)
 }
 
-/// Where a file is to go must exist before anything is computed.
+/// Refuses a file whose folder does not exist, before anything is computed.
 pub(crate) fn check_parent(path: &Path) -> Result<()> {
     let parent = path.parent().filter(|parent| !parent.as_os_str().is_empty());
     match parent {

@@ -1,4 +1,4 @@
-//! How a command draws from a model: as the model was measured, but for what the user asks otherwise.
+//! Sampler of a command: the one of the model's evaluation, with the user's changes.
 
 use clap::Args;
 use protocol::stage::{Sampler, Solver, measured_with};
@@ -6,31 +6,40 @@ use protocol::stage::{Sampler, Solver, measured_with};
 /// Parts of a sampler, besides its steps.
 #[derive(Debug, Args)]
 pub(super) struct SamplerArgs {
-    /// Guidance: a teacher's scale g, a student's w = g - 1 [default: as the model was measured]
-    #[arg(long, value_name = "W")]
+    /// Guidance: a teacher's scale g, a student's w = g - 1 [default: as in the model's evaluation]
+    #[arg(long, value_name = "W", value_parser = guidance, allow_negative_numbers = true)]
     guidance: Option<f64>,
-    /// Timesteps of an LCM student, noisiest first, such as 999,499 [default: as the model was measured]
+    /// Timesteps of an LCM student, noisiest first, such as 999,499 [default: as in the model's evaluation]
     #[arg(long, value_name = "T", value_delimiter = ',')]
     timesteps: Vec<usize>,
-    /// What follows the predictions: ddpm, ddim, dpm-solver, dpm-solver++, sde-dpm-solver++ [default: as the model was measured]
+    /// Solver: ddpm, ddim, dpm-solver, dpm-solver++, sde-dpm-solver++ [default: as in the model's evaluation]
     #[arg(long, value_name = "SOLVER", value_parser = solver)]
     solver: Option<Solver>,
-    /// Whether the root goes where standing feet let it: true or false [default: as the model was measured]
+    /// Corrects foot sliding by moving the root: true or false [default: as in the model's evaluation]
     #[arg(long, value_name = "BOOL")]
     footing: Option<bool>,
 }
 
-/// A solver by its word in settings.
+/// Parses a scale of classifier-free guidance.
+fn guidance(text: &str) -> Result<f64, String> {
+    let scale: f64 = text.parse().map_err(|_| "expected a number, such as 2.5".to_owned())?;
+    if scale.is_finite() && scale >= 0.0 {
+        return Ok(scale);
+    }
+    Err("expected 0 or more; the larger it is, the closer a motion follows its sentence".to_owned())
+}
+
+/// Parses a solver by its word in settings.
 fn solver(word: &str) -> Result<Solver, String> {
     serde_json::from_value(word.into()).map_err(|e| e.to_string())
 }
 
 impl SamplerArgs {
-    /// The sampler to draw with. `own` is the model's; of what a stage gave, `measured` are the evaluations of it, and the one that draws
-    /// as it is asked for, if there is one only, takes its place.
+    /// Returns the sampler to use, with the options applied. It is that of the evaluations in `measured` that match the
+    /// options, else that of all evaluations if they agree, else `own`, the model's sampler.
     ///
     /// # Errors
-    /// The model was measured in several ways, and nobody says which is meant.
+    /// If the matching evaluations use several samplers.
     pub(super) fn sampler(
         &self,
         steps: Option<usize>,
@@ -51,12 +60,12 @@ impl SamplerArgs {
                 "it was measured in several ways: {differ}; say which with --steps, --guidance, --timesteps, --solver or --footing"
             )
         })?;
-        // What was measured in one way only is drawn that way but for what is asked.
+        // If all evaluations use one sampler, the options change that one.
         let all = measured_with(measured.iter().map(|(name, sampler)| (name.as_str(), sampler)));
         let base = meant.or(all.ok().flatten()).cloned().unwrap_or(own);
         let steps = steps.unwrap_or(base.steps);
         let timesteps = match self.timesteps.is_empty() {
-            // Another number of steps has other timesteps.
+            // Another number of steps needs other timesteps.
             true if steps == base.steps => base.timesteps,
             _ => self.timesteps.clone(),
         };

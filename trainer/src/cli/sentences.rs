@@ -7,41 +7,60 @@ use mocap::requests::{self, Length, Request};
 
 use crate::problem::{Problem, Result};
 
-/// Motions that one command draws.
+/// Limit of the motions of one command.
 const MOST: usize = 1_000;
 
-/// What to draw.
+/// Lengths, seeds and further sentences.
 #[derive(Debug, Args)]
 pub(super) struct SentenceArgs {
-    /// More sentences, of a file with one a line: text, with a length behind a `#` if wanted (`a person walks#120` frames, `a person walks#4.5s`), or JSON
-    /// lines, {"caption": "a person walks", "seconds": 4.5}; `-` is standard input
+    /// More sentences, from a file with one per line: text, optionally followed by `#` and a length
+    /// (`a person walks#120` frames, `a person walks#4.5s`), or JSON lines, {"caption": "a person walks", "seconds":
+    /// 4.5}; `-` is standard input
     #[arg(long, value_name = "FILE")]
     captions: Option<PathBuf>,
-    /// Length in frames: one for all sentences, or one for each [default: what the model's length estimator says, 120 without one]
-    #[arg(long, value_name = "N", value_delimiter = ',', value_parser = clap::value_parser!(u32).range(1..=3_600_000))]
+    /// Length in frames: one for all sentences, or one for each [default: the model's length estimate, 120 without an
+    /// estimator]
+    #[arg(long, value_name = "N", value_delimiter = ',', value_parser = clap::value_parser!(u32).range(1..=3_600_000), allow_negative_numbers = true)]
     frames: Vec<u32>,
     /// Length in seconds, likewise
-    #[arg(long, value_name = "S", value_delimiter = ',', conflicts_with = "frames", value_parser = seconds)]
+    #[arg(long, value_name = "S", value_delimiter = ',', conflicts_with = "frames", value_parser = seconds, allow_negative_numbers = true)]
     seconds: Vec<Length>,
-    /// Motions for each sentence, with seeds that follow one another
-    #[arg(short = 'n', long = "seeds", value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=1_000))]
+    /// Motions per sentence, with consecutive seeds
+    #[arg(short = 'n', long = "seeds", value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=1_000), allow_negative_numbers = true)]
     seeds: u16,
-    /// Other seeds give other motions
-    #[arg(long, default_value_t = 0)]
+    /// First seed; other seeds give other motions
+    #[arg(long, default_value_t = 0, allow_negative_numbers = true)]
     seed: u64,
 }
 
+/// Parses seconds with or without their unit: `4` and `4s`.
 fn seconds(text: &str) -> std::result::Result<Length, String> {
-    format!("{text}s").parse()
+    let number = text.strip_suffix('s').unwrap_or(text).trim_end();
+    format!("{number}s").parse()
+}
+
+/// Refuses several prompts of one word each. They are usually a sentence without quotes, which would give one motion
+/// per word.
+fn check_quotes(prompts: &[String]) -> Result<()> {
+    if prompts.len() < 2 || prompts.iter().any(|prompt| prompt.contains(char::is_whitespace)) {
+        return Ok(());
+    }
+    let sentence = prompts.join(" ");
+    let (count, lines) = (prompts.len(), prompts.join("\\n"));
+    Err(Problem::usage(format!("`{sentence}` without quotes is {count} sentences of one word each")).hint(format!(
+        "for one motion write \"{sentence}\"; for {count} motions give the words as lines: printf '{lines}\\n' | trainer generate --captions - ..."
+    )))
 }
 
 impl SentenceArgs {
-    /// The sentences of the command line, then those of the file, each with its length; those of `others` if there are none.
+    /// Returns the sentences of the command line, then those of the file, each with its length. Without any, returns
+    /// `others`.
     ///
     /// # Errors
-    /// A file that does not read, lengths for another number of sentences, too much.
+    /// If the file cannot be read, the lengths do not match the sentences, or there are too many motions.
     pub(super) fn requests(&self, prompts: &[String], others: &[&str]) -> Result<Vec<Request>> {
         let plain = |caption: String| Request { caption, length: None };
+        check_quotes(prompts)?;
         let mut requests: Vec<Request> = prompts.iter().cloned().map(plain).collect();
         if let Some(file) = &self.captions {
             requests.extend(requests::read(file).map_err(Problem::usage)?);
@@ -71,20 +90,20 @@ impl SentenceArgs {
         Ok(requests)
     }
 
-    /// The seeds that each sentence is drawn with.
+    /// The seeds for each sentence.
     pub(super) fn seeds(&self) -> Vec<u64> {
         (0..u64::from(self.seeds)).map(|k| self.seed.wrapping_add(k)).collect()
     }
 
-    /// The seed.
+    /// The first seed.
     pub(super) fn seed(&self) -> u64 {
         self.seed
     }
 
-    /// Frames after which a stream ends, if it does.
+    /// Frames after which a stream ends; `None` if it is endless.
     ///
     /// # Errors
-    /// Several lengths.
+    /// If there are several lengths.
     pub(super) fn bound(&self, fps: f64) -> Result<Option<u64>> {
         let frames = self.frames.iter().map(|frames| Length::Frames(*frames as usize));
         let lengths: Vec<Length> = frames.chain(self.seconds.iter().copied()).collect();
@@ -98,7 +117,7 @@ impl SentenceArgs {
         }
     }
 
-    /// Whether somebody says how long motions should be.
+    /// Returns true if a sentence has its own length.
     pub(super) fn have_length(requests: &[Request]) -> bool {
         requests.iter().any(|request| request.length.is_some())
     }
@@ -134,6 +153,30 @@ mod tests {
         assert!(two.contains("2 lengths for 3 sentences"), "{two}");
         let missing = lengths(SentenceArgs { captions: Some("none.txt".into()), ..args() }).unwrap_err();
         assert!(missing.contains("none.txt"), "{missing}");
+    }
+
+    #[test]
+    fn a_sentence_without_quotes_is_refused_with_both_readings() {
+        let requests = |prompts: &[&str]| {
+            let prompts: Vec<String> = prompts.iter().map(|prompt| (*prompt).to_owned()).collect();
+            args().requests(&prompts, &[])
+        };
+        let refused = requests(&["a", "person", "walks"]).unwrap_err();
+        assert_eq!(refused.error.to_string(), "`a person walks` without quotes is 3 sentences of one word each");
+        let hint = refused.hint.unwrap();
+        assert!(hint.contains("\"a person walks\"") && hint.contains("--captions -"), "{hint}");
+        for (prompts, motions) in [(&["jumps"][..], 1), (&["a person walks", "jumps"], 2), (&["a person walks"], 1)] {
+            assert_eq!(requests(prompts).unwrap().len(), motions, "{prompts:?}");
+        }
+    }
+
+    #[test]
+    fn seconds_may_have_their_unit() {
+        for text in ["4", "4s", "4 s"] {
+            assert_eq!(seconds(text), Ok(Length::Seconds(4.0)), "{text}");
+        }
+        assert!(seconds("-4").unwrap_err().contains("expected more than 0"));
+        assert!(seconds("4ss").unwrap_err().contains("no length"));
     }
 
     #[test]

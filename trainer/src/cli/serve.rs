@@ -1,34 +1,38 @@
 //! `trainer serve`: the coordinator as a server.
 
+use std::io::IsTerminal as _;
 use std::net::{Ipv4Addr, SocketAddr};
 use std::path::PathBuf;
 
 use access::{Scopes, TokenOptions, Tokens};
 use clap::Args;
-use coordinator::{Config, Coordinator};
+use coordinator::{Coordinator, Handle};
 use registry::{Holder, Store};
 use tokio::signal::unix::{SignalKind, signal};
 
-use super::door::DoorArgs;
+use super::allowance_args::AllowanceArgs;
+use super::endpoint_args::EndpointArgs;
 use crate::problem::{Problem, Result};
 use crate::{client, print};
 
 const TOKENS: &str = "\
 A token file has a line `NAME SCOPES TOKEN` for each caller, such as `alice submit,promote` and what `openssl rand -hex 32`
-prints. Scopes: read, submit, worker, promote, admin. A token alone, in a file or as --token, may do everything. Without
-any, one is made for this user at every start and lies in the store's folder; beyond this machine a token is required.";
+prints. Scopes: read, submit, worker, promote, admin. Behind the token may stand `workers=nodes-*`, `project=NAME` and
+`expires=2026-12-31`. A line `protect ALIAS=NAME,NAME` has an alias moved by these only. SIGHUP has the file read again.
+A token alone, in a file or as --token, may do everything. Without any, one is made for this user at every start and lies
+in the store's folder; beyond this machine a token is required.";
 
 #[derive(Debug, Args)]
 #[command(after_help = TOKENS)]
 pub(crate) struct ServeArgs {
-    /// Where to listen
+    /// Address to listen on
     #[arg(long, env = "STRIDE_BIND", default_value_t = SocketAddr::from((Ipv4Addr::LOCALHOST, access::PORT)), value_name = "HOST:PORT")]
     bind: SocketAddr,
     #[command(flatten)]
     token: TokenOptions,
     #[command(flatten)]
-    door: DoorArgs,
-    /// Listen beyond this machine without TLS: anybody who sees the traffic has the tokens
+    endpoint: EndpointArgs,
+    /// Listen beyond this machine without TLS: everyone who sees the traffic can read the tokens
     #[arg(long)]
     insecure: bool,
     /// The store's folder
@@ -36,10 +40,12 @@ pub(crate) struct ServeArgs {
     store: PathBuf,
     #[command(flatten)]
     blobs: super::args::BlobArgs,
+    #[command(flatten)]
+    allowances: AllowanceArgs,
 }
 
 impl ServeArgs {
-    fn config(&self) -> Result<Config> {
+    fn tokens(&self) -> Result<Tokens> {
         let mut tokens = match &self.token.token_file {
             Some(path) => Tokens::read(path)?,
             None => Tokens::default(),
@@ -47,7 +53,27 @@ impl ServeArgs {
         if let Some(token) = &self.token.token {
             tokens.add("admin", Scopes::all(), token);
         }
-        self.door.config(self.bind, tokens, self.insecure)
+        Ok(tokens)
+    }
+
+    /// Reads the token file again. A file with an error changes nothing.
+    fn reload(&self, handle: &Handle) {
+        match self.tokens() {
+            Ok(tokens) => {
+                handle.replace_tokens(tokens);
+                print::note("read the token file again");
+            }
+            Err(problem) => print::note(&format!("the tokens stay as they were: {:#}", problem.error)),
+        }
+    }
+}
+
+/// The address of the page. The key that signs this user in is shown on a terminal alone: a log may have other readers.
+fn page(handle: &Handle) -> String {
+    if std::io::stderr().is_terminal() {
+        handle.page_link()
+    } else {
+        format!("{}/ (sign in with a token)", handle.url())
     }
 }
 
@@ -55,9 +81,11 @@ pub(crate) async fn serve(args: ServeArgs) -> Result<u8> {
     let failed = |error| Problem::failed(format!("cannot listen for signals: {error}"));
     let mut interrupt = signal(SignalKind::interrupt()).map_err(failed)?;
     let mut terminate = signal(SignalKind::terminate()).map_err(failed)?;
+    let mut hangup = signal(SignalKind::hangup()).map_err(failed)?;
     coordinator::shell::raise_descriptor_limit();
-    let config = args.config()?;
-    // Said before the store is made.
+    let mut config = args.endpoint.config(args.bind, args.tokens()?, args.insecure)?;
+    args.allowances.set(&mut config);
+    // Report errors before the store is created.
     config.check()?;
     let open = config.tokens.is_empty();
     let store = Store::open_with(&args.store, args.blobs.blobs.as_ref(), Holder::this_process("trainer serve")).await?;
@@ -66,16 +94,20 @@ pub(crate) async fn serve(args: ServeArgs) -> Result<u8> {
     let token = if open { format!(" --token-file {}", args.store.join("token").display()) } else { String::new() };
     let url = handle.url();
     print::note(&format!(
-        "listening on {url} with the store {}\n  trainer worker join {url}{token}\n  trainer submit PIPELINE --server {url}{token}",
+        "listening on {url} with the store {}\n  page {}\n  trainer worker join {url}{token}\n  trainer submit PIPELINE --server {url}{token}",
         args.store.display(),
+        page(&handle),
     ));
-    let failure = tokio::select! {
-        _ = interrupt.recv() => None,
-        _ = terminate.recv() => None,
-        why = handle.failed() => Some(why),
+    let failure = loop {
+        tokio::select! {
+            _ = interrupt.recv() => break None,
+            _ = terminate.recv() => break None,
+            _ = hangup.recv() => args.reload(&handle),
+            why = handle.failed() => break Some(why),
+        }
     };
     drop(announced);
-    // Workers keep training without us and re-attach to the next server.
+    // Workers continue training and connect to the next server.
     handle.shutdown().await;
     match failure {
         None => Ok(0),

@@ -1,4 +1,4 @@
-//! A picture of what `evaluate.spectrum` found: Free-T2M's figure 4, as a mean over motions.
+//! A picture of the results of `evaluate.spectrum`: Free-T2M's figure 4, as a mean over motions.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -11,10 +11,10 @@ use crate::figure::{self, Panel};
 use crate::problem::{Problem, Result, exit};
 use crate::reader::Reader;
 
-/// The kind whose stages are drawn.
+/// Kind of the stages that are drawn.
 const KIND: &str = "evaluate.spectrum";
 
-/// Draws the stage `name` of a run, or the one that there is.
+/// Draws the stage `name` of a run, or its only stage of this kind.
 pub(super) async fn draw(reader: &Reader, run: &RunView, name: Option<&str>, path: &Path) -> Result<()> {
     if path.extension().is_none_or(|extension| extension != "svg") {
         return Err(Problem::usage(format!("cannot draw `{}`; expected a name that ends in .svg", path.display())));
@@ -36,7 +36,7 @@ pub(super) async fn draw(reader: &Reader, run: &RunView, name: Option<&str>, pat
         .map_err(|error| Problem::usage(format!("cannot write `{}`: {error}", path.display())))
 }
 
-/// A panel of energies and one of what has settled, by band, over the steps.
+/// Panels of energies and of settled shares, by band, over the steps.
 fn panels(metrics: &BTreeMap<String, f64>, details: &Value) -> Vec<Panel> {
     let panel = |metric: &str, y: &str| {
         let mut lines: BTreeMap<String, Vec<(f64, f64)>> = BTreeMap::new();
@@ -48,7 +48,7 @@ fn panels(metrics: &BTreeMap<String, f64>, details: &Value) -> Vec<Panel> {
             }
         }
         lines.values_mut().for_each(|points| points.sort_by(|a, b| a.0.total_cmp(&b.0)));
-        Panel { x: "denoising step".into(), y: y.into(), lines }
+        Panel { x: "denoising step".into(), y: y.into(), lines, ..Panel::default() }
     };
     vec![
         panel("energy", "energy, as a share of real motion's"),

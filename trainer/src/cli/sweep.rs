@@ -1,4 +1,4 @@
-//! `trainer sweep`: what was tried, what became of it, what is best.
+//! `trainer sweep`: the trials of a sweep, their results, and the best one.
 
 use std::path::{Path, PathBuf};
 
@@ -32,7 +32,7 @@ impl SweepVerb {
     }
 }
 
-/// Which sweep.
+/// Selection of a sweep.
 #[derive(Debug, Args)]
 pub(crate) struct Which {
     /// The run, a unique beginning of its name, `@last`, or a pipeline's file: its newest run
@@ -43,7 +43,7 @@ pub(crate) struct Which {
     stage: Option<String>,
     #[command(flatten)]
     target: Target,
-    /// How the answer is printed
+    /// Format of the answer
     #[arg(short, long, value_enum, default_value_t)]
     output: Output,
 }
@@ -55,10 +55,11 @@ pub(crate) struct StatusArgs {
     /// Draws the trials, an SVG file
     #[arg(long, value_name = "FILE.svg")]
     plot: Option<PathBuf>,
-    /// What they are drawn by: a searched setting, `seconds` of their evaluation, or `steps` [default: the one searched number, or the steps]
+    /// Horizontal axis: a searched setting, `seconds` of their evaluation, or `steps` [default: the only searched
+    /// number, or the steps]
     #[arg(long, value_name = "SETTING", requires = "plot")]
     by: Option<String>,
-    /// Metrics of the evaluation that are drawn, a panel for each [default: the one that decides]
+    /// Metrics of the evaluation to draw, one panel each [default: the one that decides]
     #[arg(long, value_name = "NAME", value_delimiter = ',', requires = "plot")]
     metric: Vec<String>,
 }
@@ -106,7 +107,7 @@ async fn status(args: StatusArgs) -> Result<u8> {
     }
     match args.which.output {
         Output::Json => {
-            let state = summary::run_state(run.state);
+            let state = summary::run_state(&run);
             print::json(&json!({"schema_version": 1, "run": run.run, "state": state, "sweeps": sweeps}));
         }
         Output::Table => {
@@ -151,7 +152,7 @@ async fn best(args: BestArgs) -> Result<u8> {
     Ok(0)
 }
 
-/// The run that is meant, and its sweeps.
+/// Finds the selected run and its sweeps.
 async fn find(which: &Which) -> Result<(RunView, Vec<SweepView>)> {
     let is_file = which.run.ends_with(".yaml") || which.run.ends_with(".yml");
     let pipeline = is_file.then(|| pipeline_file::read(Path::new(&which.run), &[])).transpose()?;
@@ -179,7 +180,7 @@ async fn find(which: &Which) -> Result<(RunView, Vec<SweepView>)> {
     Ok((run, sweeps))
 }
 
-/// The trials, best first: who got further is better than who was stopped.
+/// The trials, best first. A trial that got further ranks above one that was stopped earlier.
 fn table(sweep: &SweepView) -> String {
     let mut trials: Vec<&TrialView> = sweep.trials.iter().collect();
     let rank = |trial: &TrialView| {

@@ -1,4 +1,4 @@
-//! `trainer time`: how long models take for a sentence, side by side.
+//! `trainer time`: the time of models per sentence, side by side.
 
 use std::path::Path;
 
@@ -21,29 +21,29 @@ pub(crate) struct TimeArgs {
     /// MODEL@ALIAS, MODEL@best or MODEL:VERSION
     #[arg(required_unless_present = "stage")]
     model: Vec<String>,
-    /// What a stage of a run gave, such as the teacher; these come first in the table
+    /// The model of a run's stage, such as the teacher; these come first in the table
     #[arg(long, value_name = "STAGE")]
     stage: Vec<String>,
     /// The run of --stage: its name, a unique beginning of it, or `@last`
     #[arg(long, default_value = "@last", requires = "stage")]
     run: String,
-    /// Sampling steps, a row for each that the model has [default: as the model was measured]
+    /// Sampling steps, one row for each that the model supports [default: as in the model's evaluation]
     #[arg(long, value_name = "N", value_delimiter = ',')]
     steps: Vec<usize>,
     #[command(flatten)]
     sampler: SamplerArgs,
-    /// Sentences that are timed, after a warm-up
+    /// Number of timed sentences, after a warm-up
     #[arg(long, value_name = "N", default_value_t = 100, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     sentences: u32,
     /// Length of each motion in frames [default: 120]
     #[arg(long, value_name = "N")]
     frames: Option<usize>,
-    /// Where to compute: flex, ndarray, wgpu or cuda [default: the first that this build and machine have]
+    /// Computing backend: flex, ndarray, wgpu or cuda [default: the first that this build and machine have]
     #[arg(long)]
     backend: Option<String>,
     #[command(flatten)]
     target: Target,
-    /// How the table is printed
+    /// Format of the table
     #[arg(short, long, value_enum, default_value_t)]
     pub(super) output: Output,
 }
@@ -83,7 +83,7 @@ pub(crate) async fn time(args: TimeArgs) -> Result<u8> {
         timed.extend(samplers.into_iter().map(|sampler| (label.as_str(), generator, sampler)));
     }
 
-    // As many for all: the time of a model must not depend on what its length estimator says.
+    // The same length for all, so that a model's time does not depend on its length estimator.
     let frames = args.frames.unwrap_or(DEFAULT_FRAMES);
     let sentences = timing::sentences(args.sentences as usize);
     let progress = progress((sentences.len() + WARM_UP) * timed.len());
@@ -99,8 +99,8 @@ pub(crate) async fn time(args: TimeArgs) -> Result<u8> {
     Ok(0)
 }
 
-/// The samplers to time a model with: its own, or one for each of `--steps` that it has. Steps that only other models have are left out with a
-/// note; a model that has none of them is refused.
+/// The samplers for timing a model: its own, or one for each supported value of `--steps`. Values that only other
+/// models support are skipped with a note. A model that supports none is refused.
 fn samplers(
     label: &str,
     generator: &Generator,
@@ -127,7 +127,7 @@ fn samplers(
     Ok(fits)
 }
 
-/// What times depend on besides the models.
+/// Properties of the machine that affect times.
 struct Machine {
     backend: &'static str,
     device: String,
@@ -211,7 +211,7 @@ fn show(rows: &[Row], frames: usize, machine: &Machine, output: Output) {
     }
 }
 
-/// A bar, where somebody sees it.
+/// A progress bar, hidden without a terminal.
 fn progress(motions: usize) -> indicatif::ProgressBar {
     if print::on_terminal() { indicatif::ProgressBar::new(motions as u64) } else { indicatif::ProgressBar::hidden() }
 }

@@ -188,7 +188,8 @@ pub fn blob_error(error: BlobError) -> StageError {
         BlobError::NotFound(_) | BlobError::Corrupt { .. } | BlobError::Damaged(_) => ContextError::Damaged(text),
         BlobError::Refused(_) => ContextError::GrantEnded(text),
         BlobError::Storage(_) => ContextError::Storage(text),
-        BlobError::Unavailable(_) => ContextError::Unavailable(text),
+        BlobError::Unfit(_) => ContextError::Refused(text),
+        BlobError::Unreachable(_) | BlobError::Unavailable(_) => ContextError::Unavailable(text),
     })
 }
 

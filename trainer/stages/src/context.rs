@@ -8,8 +8,9 @@ use std::ops::Range;
 use std::sync::Arc;
 
 use checkpoint::Blobs;
+use motion::data_access::DataAccess;
 use protocol::message::{FailureClass, StageTask};
-use protocol::{Digest, Manifest};
+use protocol::{Digest, Manifest, limits};
 
 /// An error of the context.
 #[derive(Debug, thiserror::Error)]
@@ -20,6 +21,9 @@ pub enum ContextError {
     /// The store or the network failed after retries.
     #[error("{0}")]
     Unavailable(String),
+    /// The coordinator or the other members refuse it, and would do so each time.
+    #[error("{0}")]
+    Refused(String),
     /// The store is full or not writable.
     #[error("{0}")]
     Storage(String),
@@ -29,6 +33,9 @@ pub enum ContextError {
     /// A stored object is damaged or missing.
     #[error("{0}")]
     Damaged(String),
+    /// What was asked for makes no sense: a fault of ours.
+    #[error("{0}")]
+    Fault(String),
 }
 
 /// An error of a stage. The message does not name the stage; the caller adds the name.
@@ -61,11 +68,12 @@ impl StageError {
         match self {
             Self::Input(_) => FailureClass::Input,
             Self::Diverged { .. } => FailureClass::Diverged,
+            Self::Context(ContextError::Refused(_)) => FailureClass::Refused,
             Self::Context(ContextError::Storage(_)) => FailureClass::Storage,
             Self::Context(ContextError::Corrupt(_)) => FailureClass::Storage,
             Self::Context(ContextError::Damaged(_)) => FailureClass::Damaged,
-            Self::Context(_) => FailureClass::Infrastructure,
-            Self::Fault(_) => FailureClass::Fault,
+            Self::Fault(_) | Self::Context(ContextError::Fault(_)) => FailureClass::Fault,
+            Self::Context(ContextError::GrantEnded(_) | ContextError::Unavailable(_)) => FailureClass::Infrastructure,
         }
     }
 }
@@ -127,6 +135,8 @@ pub trait AttemptContext {
     fn task(&self) -> &StageTask;
     /// The device to compute on, without autodiff. Training uses its `.autodiff()`.
     fn device(&self) -> burn::tensor::Device;
+    /// Access to files outside the store, for [`external::read`](crate::external::read).
+    fn data(&self) -> Arc<DataAccess>;
     /// Reads and stages blobs; every blob read is verified against its digest.
     fn blobs(&self) -> Arc<dyn Blobs>;
     /// Reads a manifest by digest.
@@ -139,6 +149,10 @@ pub trait AttemptContext {
     fn record(&mut self, step: u64, metrics: &[(&str, f64)]);
     /// Writes a line to the user's log.
     fn log(&mut self, line: &str);
+    /// Bytes of the largest file that the store takes.
+    fn most_blob_bytes(&self) -> u64 {
+        limits::BLOB_BYTES as u64
+    }
     /// Returns true if the grant has ended or a stop was requested. Long loops without steps check it regularly.
     fn interrupted(&self) -> bool;
 }
@@ -179,6 +193,12 @@ pub trait GangContext: AttemptContext {
     /// saving later. So training does not wait at a due checkpoint for a coordinator that is away.
     fn can_save(&self) -> bool {
         true
+    }
+
+    /// Whether what is stored from here on is a checkpoint that may be made later: then an upload that cannot be taken now fails instead of
+    /// being waited for, and [`can_save`](Self::can_save) is `false` for a while.
+    fn may_postpone(&mut self, may: bool) {
+        let _ = may;
     }
 
     /// Commits an uploaded manifest as the newest checkpoint; returns once it is durable. Rank 0 only.

@@ -27,9 +27,9 @@ pub(crate) const TRAJECTORY_PREFIX: &str = "traj_encoder.";
 /// Prefix of the feedback network's weights.
 pub(crate) const FEEDBACK_PREFIX: &str = "feedback.";
 
-/// Strength of the steering towards given positions.
+/// Options of the steering towards given positions.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Heed {
+pub struct ControlOptions {
     /// Factor on the ControlNet's residuals and on the changes by feedback; 1 as trained, 0 for none.
     pub scale: f64,
     /// Rounds of feedback; `None` for the number used in training.
@@ -38,7 +38,7 @@ pub struct Heed {
     pub refine: usize,
 }
 
-impl Default for Heed {
+impl Default for ControlOptions {
     fn default() -> Self {
         Self { scale: 1.0, feedback: None, refine: 0 }
     }
@@ -158,12 +158,12 @@ impl TrainedControl {
         vae: &Autoencoder,
         z: Vec<f32>,
         lengths: &[usize],
-        (hints, heed): (&[Hint], Heed),
+        (hints, options): (&[Hint], ControlOptions),
     ) -> Vec<f32> {
         match &self.feedback {
             Some(network) => {
-                let rounds = heed.feedback.unwrap_or(self.meta.feedback);
-                feedback::correct(network, vae, z, (lengths, hints), rounds, heed.scale)
+                let rounds = options.feedback.unwrap_or(self.meta.feedback);
+                feedback::correct(network, vae, z, (lengths, hints), rounds, options.scale)
             }
             None => z,
         }

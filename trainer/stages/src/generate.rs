@@ -13,11 +13,11 @@ use checkpoint::model::Model;
 use motion::features::recover_joints;
 use motion::{Skeleton, Stream};
 use protocol::artifact::Role;
-use protocol::stage::{DataFormat, Sampler};
+use protocol::stage::{DataFormat, Family, Sampler};
 use protocol::{ArtifactKind, Manifest, Seed};
 
 use crate::context::StageError;
-use crate::control::{ControlMeta, Heed};
+use crate::control::{ControlMeta, ControlOptions};
 use crate::generator::{self, Batch, ControlRequest, Edit, Lap, MotionGenerator, Seeds, Text};
 use crate::hint::Hint;
 use crate::length::Lengths;
@@ -106,6 +106,11 @@ impl Generator {
     /// The default sampler: that of the model's evaluation, or that of the papers for its kind if it has none.
     pub fn sampler(&self) -> Sampler {
         self.sampler.clone().unwrap_or_else(|| self.model.family().published())
+    }
+
+    /// Returns the family of the model, which says what it was trained to do.
+    pub fn family(&self) -> &Family {
+        self.model.family()
     }
 
     /// Refuses a sampler that the model does not have.
@@ -211,9 +216,9 @@ impl Generator {
         prompt: &str,
         sampler: Option<&Sampler>,
         seed: Seed,
-        (hint, heed): (&Hint, Heed),
+        (hint, options): (&Hint, ControlOptions),
     ) -> Result<Generated, StageError> {
-        let control = ControlRequest { hints: std::slice::from_ref(hint), heed };
+        let control = ControlRequest { hints: std::slice::from_ref(hint), options };
         self.draw(prompt, Some(hint.frames()), sampler, seed, Some(control))
     }
 

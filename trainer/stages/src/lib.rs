@@ -8,6 +8,7 @@ pub mod control;
 pub mod estimate;
 pub mod evaluation;
 pub mod evaluator;
+pub mod external;
 mod feedback;
 pub mod flow_decoder;
 pub mod generate;

@@ -28,7 +28,7 @@ use protocol::Seed;
 use protocol::stage::{ControlSetting, Sampler};
 
 use crate::context::StageError;
-use crate::control::Heed;
+use crate::control::ControlOptions;
 use crate::generate::Generator;
 use crate::hint::{Hint, share};
 
@@ -45,7 +45,7 @@ pub struct Settings {
     /// Seed of the stream's draws.
     pub seed: Seed,
     /// Strength of the steering towards targets.
-    pub heed: Heed,
+    pub control: ControlOptions,
     /// Number of the last frames that the next segment gets as targets; `None` for a share of the segment.
     pub overlap: Option<usize>,
     /// Number of frames in which the difference at a junction fades.
@@ -318,7 +318,7 @@ impl MotionStream {
         let drawn = match self.joining {
             Joining::Control if overlap > 0 || !ask.waypoints.is_empty() => {
                 let hint = self.hint(ask, total, overlap, place);
-                generator.generate_controlled(&ask.caption, sampler, seed, (&hint, self.settings.heed))?
+                generator.generate_controlled(&ask.caption, sampler, seed, (&hint, self.settings.control))?
             }
             Joining::Infilling if overlap >= self.unit => {
                 let mut rows = self.tail.features[(self.tail.frames() - overlap) * width..].to_vec();

@@ -7,13 +7,12 @@
 
 use std::collections::{BTreeMap, HashMap};
 use std::io::Read as _;
-use std::path::Path;
 
 use checkpoint::Blobs;
 use motion::dataset::Caption;
 use motion::text::{MAX_TOKENS, POS_CLASSES, hashed_word, padded_tokens, pos_class, split_token};
-use motion::{Floats, files, npy};
-use protocol::{Digest, Manifest, limits};
+use motion::{DataPath, Floats, npy};
+use protocol::{Digest, Manifest, excerpt, limits};
 use pytorch_reader::{PickleValue, PytorchReader};
 use serde::{Deserialize, Serialize};
 
@@ -76,16 +75,13 @@ pub struct CaptionBatch {
 }
 
 impl Words {
-    /// Reads a folder with `our_vab_data.npy` and `our_vab_idx.pkl`; an empty path selects the built-in vectors.
+    /// Reads a folder with `our_vab_data.npy` and `our_vab_idx.pkl`; none is the built-in vectors.
     ///
     /// # Errors
     /// If a file is missing or invalid; the message names it.
-    pub fn open(folder: &str) -> Result<Self, StageError> {
-        if folder.is_empty() {
-            return Ok(Self::Hashed);
-        }
-        let folder = Path::new(folder);
-        let bad = |file: &Path, what: String| StageError::Input(format!("{}: {what}", file.display()));
+    pub fn open(folder: Option<&DataPath>) -> Result<Self, StageError> {
+        let Some(folder) = folder else { return Ok(Self::Hashed) };
+        let bad = |file: &DataPath, what: String| StageError::Input(format!("{}: {what}", file.display()));
         let data = folder.join("our_vab_data.npy");
         let array = npy::read_any_float(&data).map_err(|e| StageError::Input(e.to_string()))?;
         let [rows, WORD_WIDTH] = array.shape[..] else {
@@ -93,7 +89,7 @@ impl Words {
         };
         let file = folder.join("our_vab_idx.pkl");
         let wanted = "expected a pickled dict from word to row";
-        let (mut opened, length) = files::open(&file).map_err(|e| bad(&file, e.to_string()))?;
+        let (mut opened, length) = file.open().map_err(|e| bad(&file, e.to_string()))?;
         if length > limits::VOCABULARY_BYTES {
             return Err(bad(&file, format!("has {length} bytes; at most {} are read", limits::VOCABULARY_BYTES)));
         }
@@ -102,7 +98,9 @@ impl Words {
         if opened.read_exact(&mut magic).is_ok() && &magic == b"PK" {
             return Err(bad(&file, format!("is an archive; {wanted}")));
         }
-        let value = PytorchReader::read_pickle_data(&file, None).map_err(|e| bad(&file, format!("{e}; {wanted}")))?;
+        let held = file.hold().map_err(|e| bad(&file, e.to_string()))?;
+        let value = PytorchReader::read_pickle_data(held.path(), None)
+            .map_err(|e| bad(&file, format!("{}; {wanted}", text_models::no_torch(&e))))?;
         let PickleValue::Dict(dict) = value else { return Err(bad(&file, wanted.into())) };
         let mut index = HashMap::with_capacity(dict.len());
         for (word, row) in dict {
@@ -111,10 +109,10 @@ impl Words {
                     index.insert(word, row as usize);
                 }
                 PickleValue::Int(row) => {
-                    let word = word.escape_debug();
+                    let word = excerpt(&word);
                     return Err(bad(&file, format!("`{word}` has the row {row}, but there are {rows} vectors")));
                 }
-                _ => return Err(bad(&file, format!("`{}` has no row; {wanted}", word.escape_debug()))),
+                _ => return Err(bad(&file, format!("`{}` has no row; {wanted}", excerpt(&word)))),
             }
         }
         for word in ["sos", "eos", UNKNOWN] {

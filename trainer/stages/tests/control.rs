@@ -14,7 +14,7 @@ use protocol::stage::{
 };
 use protocol::{Digest, Manifest, Seed, Steps};
 use stages::context::Outcome;
-use stages::control::Heed;
+use stages::control::ControlOptions;
 use stages::generate::Generator;
 use stages::hint::{Hint, metres};
 use stages::testing::{Bench, Script};
@@ -216,7 +216,7 @@ fn a_control_part_learns_and_is_heeded() {
         let free = generator(&bench, &bench.manifest(outputs[base]).expect("stored"));
         let sampler = Sampler { steps: if base == "pcm" { 2 } else { 1 }, guidance: 2.0, ..Sampler::default() };
         let draw = |scale| {
-            let told = (&hint(60), Heed { scale, ..Heed::default() });
+            let told = (&hint(60), ControlOptions { scale, ..ControlOptions::default() });
             controlled.generate_controlled("a person walks", Some(&sampler), Seed(3), told).expect("a motion").features
         };
         let without = free.generate("a person walks", Some(60), Some(&sampler), Seed(3)).expect("a motion").features;
@@ -239,13 +239,13 @@ fn a_control_part_learns_and_is_heeded() {
                 "{base}: frame {t}"
             );
         }
-        let told = (&hint(60), Heed::default());
+        let told = (&hint(60), ControlOptions::default());
         let told = controlled.generate_controlled("a person walks", Some(&feet), Seed(3), told).expect("a motion");
         assert_eq!(told.features, draw(1.0), "{base}: it goes where it is told");
         let errors = hint(60).errors(&metres(&draw(1.0), skeleton), 0.5).expect("something is told");
         assert!(errors.average.is_finite());
         let refined = |steps| {
-            let told = (&hint(60), Heed { refine: steps, ..Heed::default() });
+            let told = (&hint(60), ControlOptions { refine: steps, ..ControlOptions::default() });
             let motion = controlled.generate_controlled("a person walks", Some(&sampler), Seed(3), told);
             hint(60)
                 .errors(&metres(&motion.expect("a motion").features, skeleton), 0.5)
@@ -258,11 +258,11 @@ fn a_control_part_learns_and_is_heeded() {
         assert!(few < errors.average && many < 0.9 * errors.average, "{base}: {} to {few} to {many}", errors.average);
         assert_eq!(refined(5), few);
         // A motion of one frame has no movement.
-        let told = (&hint(1), Heed { refine: 2, ..Heed::default() });
+        let told = (&hint(1), ControlOptions { refine: 2, ..ControlOptions::default() });
         let one = controlled.generate_controlled("a person walks", Some(&sampler), Seed(3), told).expect("a motion");
         assert_eq!(one.frames, 1);
 
-        let told = (&hint(60), Heed::default());
+        let told = (&hint(60), ControlOptions::default());
         let refused =
             free.generate_controlled("a person walks", Some(&sampler), Seed(3), told).unwrap_err().to_string();
         assert!(refused.contains("no control part"), "{refused}");
@@ -296,23 +296,26 @@ fn feedback_corrects_what_was_drawn() {
     let [plain, corrects] =
         [plain, ran.output()].map(|digest| generator(&bench, &bench.manifest(digest).expect("stored")));
     let sampler = Sampler { steps: 1, guidance: 2.0, ..Sampler::default() };
-    let draw = |of: &Generator, hint: &Hint, seed: u64, heed: Heed| {
-        of.generate_controlled("a person walks", Some(&sampler), Seed(seed), (hint, heed)).expect("a motion").features
+    let draw = |of: &Generator, hint: &Hint, seed: u64, options: ControlOptions| {
+        of.generate_controlled("a person walks", Some(&sampler), Seed(seed), (hint, options))
+            .expect("a motion")
+            .features
     };
-    let rounds = |feedback| Heed { feedback, ..Heed::default() };
+    let rounds = |feedback| ControlOptions { feedback, ..ControlOptions::default() };
     let skeleton = Skeleton::of(DataFormat::Humanml3d);
     // Targets from another motion of the same model, in all frames, as in training.
-    let other = metres(&draw(&plain, &Hint::none(60, skeleton.joints), 100, Heed::default()), skeleton);
+    let other = metres(&draw(&plain, &Hint::none(60, skeleton.joints), 100, ControlOptions::default()), skeleton);
     let told = Hint::of(&other, skeleton.joints, &[0, 10, 11, 15, 20, 21], &(0..60).collect::<Vec<_>>());
-    let off =
-        |hint: &Hint, seed: u64, heed: Heed| distance(hint, &metres(&draw(&corrects, hint, seed, heed), skeleton));
+    let off = |hint: &Hint, seed: u64, options: ControlOptions| {
+        distance(hint, &metres(&draw(&corrects, hint, seed, options), skeleton))
+    };
 
     let same = |a: Vec<f32>, b: Vec<f32>, why: &str| assert!(a == b, "{why}");
-    let of = |generator, heed| draw(generator, &told, 3, heed);
+    let of = |generator, options| draw(generator, &told, 3, options);
     same(of(&corrects, rounds(Some(0))), of(&plain, rounds(None)), "the other two networks learn alike");
     same(of(&plain, rounds(Some(3))), of(&plain, rounds(None)), "no network, no rounds");
     same(of(&corrects, rounds(Some(2))), of(&corrects, rounds(None)), "as many as in training");
-    let silent = Heed { scale: 0.0, ..Heed::default() };
+    let silent = ControlOptions { scale: 0.0, ..ControlOptions::default() };
     same(of(&corrects, silent), of(&plain, silent), "at scale 0 nothing is changed");
 
     let mean = |count: usize| (0..8).map(|seed| off(&told, seed, rounds(Some(count)))).sum::<f64>() / 8.0;
@@ -324,8 +327,9 @@ fn feedback_corrects_what_was_drawn() {
     // path, and when each change is many times larger than in training.
     for (hint, scale) in [(&told, 1.0), (&hint(60), 1.0), (&hint(60), 30.0)] {
         for seed in 0..4 {
-            let off =
-                [0, 1, 2, 4].map(|rounds| off(hint, seed, Heed { scale, feedback: Some(rounds), ..Heed::default() }));
+            let off = [0, 1, 2, 4].map(|rounds| {
+                off(hint, seed, ControlOptions { scale, feedback: Some(rounds), ..ControlOptions::default() })
+            });
             eprintln!("at scale {scale} {off:.3?} m off after none, one, two and four rounds");
             assert!(off.windows(2).all(|pair| pair[1] <= pair[0] + 1e-6), "scale {scale}: {off:?}");
         }

@@ -7,7 +7,7 @@ use std::path::Path;
 use cap::Cap;
 use hostile::named::Named;
 use hostile::targets::PICKLE_MEMORY;
-use hostile::{Target, fuzz, named, seeds};
+use hostile::{Target, canary, fuzz, named, seeds};
 use models::flat;
 use models::flat::layout;
 use models::names::to_bytes;
@@ -177,6 +177,12 @@ fn model() {
 #[test]
 fn vocabulary() {
     run("vocabulary");
+}
+
+#[test]
+fn no_error_quotes_a_file() {
+    assert_eq!(stages::testing::hostile::CANARY, canary::CANARY);
+    TARGETS.iter().for_each(|target| canary::run(target, 30));
 }
 
 /// A part whose files are all refused would not be tested.

@@ -75,7 +75,7 @@ fn broken_recordings_are_all_named_or_left_out() {
     // The user's settings take precedence: a map, splits, axis or captions that do not fit the recordings are refused.
     for (settings, part) in [
         (DataFeatures { map: "nobody".into(), ..base.clone() }, "no joint map `nobody` ships"),
-        (DataFeatures { map: "lafan1".into(), ..base.clone() }, "joint map `lafan1`"),
+        (DataFeatures { map: "lafan1".into(), ..base.clone() }, "`pelvis` is to be"),
         (
             DataFeatures { splits: Splits::Lists, skip_broken: true, up: UpAxis::Y, ..base.clone() },
             "no usable training clip",

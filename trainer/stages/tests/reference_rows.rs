@@ -1,6 +1,6 @@
 //! The definitions of the reconstruction metrics against rows of the reference table that need no network.
 
-use motion::Dataset;
+use motion::{DataPath, Dataset};
 use protocol::stage::{DataFormat, Split};
 use stages::evaluation::{joints, reconstruction};
 
@@ -10,7 +10,7 @@ type Row = (&'static str, fn(&[f32], usize) -> Vec<f32>, [f64; 4]);
 #[test]
 fn guesses_without_a_network_have_the_errors_of_the_reference_table() {
     let Some(folder) = fixtures::data("humanml3d-mini") else { return };
-    let (dataset, _) = Dataset::open(&folder, DataFormat::Humanml3d).expect("the folder opens");
+    let (dataset, _) = Dataset::open(&DataPath::local(&folder), DataFormat::Humanml3d).expect("the folder opens");
     let entries = dataset.entries_of(Split::Test);
     let rows: [Row; 3] = [
         ("zeros", |clip, _| vec![0.0; clip.len()], [1840.0, 117.1, 109.7, 0.378]),

@@ -14,6 +14,7 @@ use protocol::stage::{
 use protocol::{Digest, RunId, Seed, StageName, Steps};
 use serde_json::Value;
 use stages::artifacts::{Embeddings, Tensors};
+use stages::external;
 use stages::generate::Generator;
 use stages::testing::{Bench, MemoryAttempt, MemoryBlobs};
 use stages::text::{self, Named};
@@ -50,15 +51,8 @@ fn close(what: &str, found: &[f32], expected: &[f32]) {
     assert!(off <= GATE * largest, "{what}: off by {:e} of the largest", off / largest);
 }
 
-/// Opens the encoder in a folder.
-fn ready(settings: &TextEmbed) -> Box<dyn text::TextEncoder> {
-    let named = Named::open(settings).unwrap_or_else(|e| panic!("{e}"));
-    named.ready(settings, &Device::flex()).unwrap_or_else(|e| panic!("{e}"))
-}
-
-/// Opens the encoder of the artifact made from the folder.
-fn stored(settings: &TextEmbed) -> Box<dyn text::TextEncoder> {
-    let blobs = Arc::new(MemoryBlobs::default());
+/// The encoder in a folder, and an attempt at embedding with it.
+fn named(settings: &TextEmbed, blobs: &Arc<MemoryBlobs>) -> (Named, MemoryAttempt) {
     let task = StageTask {
         run: RunId::new("test-1"),
         name: StageName::new("text"),
@@ -67,8 +61,22 @@ fn stored(settings: &TextEmbed) -> Box<dyn text::TextEncoder> {
         seed: Seed(1),
         checkpoint: CheckpointPolicy::default(),
     };
-    let mut cx = MemoryAttempt::new(task, Device::flex(), Arc::clone(&blobs));
-    let manifest = Named::open(settings).and_then(|named| named.upload(&mut cx)).unwrap_or_else(|e| panic!("{e}"));
+    let mut cx = MemoryAttempt::new(task, Device::flex(), Arc::clone(blobs));
+    let named = external::read(&mut cx, |_, given| Named::open(settings, given)).unwrap_or_else(|e| panic!("{e}"));
+    (named, cx)
+}
+
+/// The encoder in a folder.
+fn ready(settings: &TextEmbed) -> Box<dyn text::TextEncoder> {
+    let (named, _) = named(settings, &Arc::default());
+    named.ready(settings, &Device::flex()).unwrap_or_else(|e| panic!("{e}"))
+}
+
+/// That of the artifact which is made of the folder.
+fn stored(settings: &TextEmbed) -> Box<dyn text::TextEncoder> {
+    let blobs = Arc::new(MemoryBlobs::default());
+    let (named, mut cx) = named(settings, &blobs);
+    let manifest = named.upload(&mut cx).unwrap_or_else(|e| panic!("{e}"));
     text::open(&manifest, &*blobs, &Device::flex()).unwrap_or_else(|e| panic!("{e}"))
 }
 

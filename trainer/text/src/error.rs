@@ -1,6 +1,6 @@
 //! Errors in the files of a published encoder.
 
-use std::path::Path;
+use motion::DataPath;
 
 /// Largest number of characters of a message, which may quote a file.
 const SHOWN: usize = 2_000;
@@ -18,7 +18,7 @@ pub struct EncoderError {
 impl EncoderError {
     pub(crate) fn new(place: impl ToString, what: impl Into<String>) -> Self {
         let mut what = what.into();
-        // The message may quote the file.
+        // It may list what is missing.
         if let Some((end, _)) = what.char_indices().nth(SHOWN) {
             what.truncate(end);
             what.push_str("...");
@@ -26,7 +26,7 @@ impl EncoderError {
         Self { place: place.to_string(), what }
     }
 
-    pub(crate) fn at(place: &Path, what: impl Into<String>) -> Self {
+    pub(crate) fn at(place: &DataPath, what: impl Into<String>) -> Self {
         Self::new(place.display(), what)
     }
 }

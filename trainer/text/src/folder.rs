@@ -6,10 +6,10 @@
 //! dense layer are read too. Everything else, such as CLIP's vision tower, is skipped.
 
 use std::collections::BTreeMap;
-use std::path::{Component, Path, PathBuf};
+use std::path::{Component, Path};
 
-use motion::files;
-use protocol::Digest;
+use motion::DataPath;
+use protocol::{Digest, excerpt, excerpts, json_mistake};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
@@ -114,7 +114,7 @@ impl Description {
 /// An encoder folder with its weights not yet read.
 #[derive(Debug)]
 pub struct EncoderFolder {
-    path: PathBuf,
+    path: DataPath,
     /// Description of the encoder.
     pub description: Description,
     /// The tokenizer in the form of `tokenizer.json`.
@@ -129,13 +129,13 @@ impl EncoderFolder {
     ///
     /// # Errors
     /// The missing or invalid file, with the remedy.
-    pub fn open(path: &Path, request: &Request) -> Result<Self, EncoderError> {
-        if !path.is_dir() {
+    pub fn open(path: &DataPath, request: &Request) -> Result<Self, EncoderError> {
+        if !path.is_folder() {
             let what = if path.exists() { "is no folder" } else { "no such folder" };
             return Err(EncoderError::at(path, format!("{what}; expected one with a published text encoder")));
         }
         let modules = Modules::read(path)?;
-        let root = modules.as_ref().map_or_else(|| path.to_owned(), |modules| modules.first.clone());
+        let root = modules.as_ref().map_or_else(|| path.clone(), |modules| modules.first.clone());
         let file = root.join("config.json");
         let config = json(&file)?;
         let network = match request.kind {
@@ -166,7 +166,7 @@ impl EncoderFolder {
             }
         };
         let description = Description { network, head, rules };
-        Ok(Self { path: path.to_owned(), description, tokenizer_json, tensors, skipped })
+        Ok(Self { path: path.clone(), description, tokenizer_json, tensors, skipped })
     }
 
     /// Creates the tokenizer under the description's rules.
@@ -193,43 +193,38 @@ impl EncoderFolder {
         protocol::canonical::digest(&(&self.description, parts))
     }
 
-    /// Summary of the skipped tensors: the first part of their names, and their number.
+    /// Says how many tensors were passed over, and the first parts of their names.
     pub fn skipped_line(&self) -> Option<String> {
         let mut parts: BTreeMap<&str, usize> = BTreeMap::new();
         for name in &self.skipped {
             *parts.entry(name.split('.').next().unwrap_or(name)).or_default() += 1;
         }
-        let parts: Vec<String> =
-            parts.iter().take(8).map(|(part, count)| format!("{}* ({count})", part.escape_debug())).collect();
+        let parts: Vec<String> = parts.iter().map(|(part, count)| format!("{part}* ({count})")).collect();
         (!parts.is_empty()).then(|| {
-            format!(
-                "{}: {} tensors are not of the text encoder: {}",
-                self.path.display(),
-                self.skipped.len(),
-                parts.join(", ")
-            )
+            let (count, names) = (self.skipped.len(), excerpts(parts.iter().map(String::as_str), 8));
+            format!("{}: {count} tensors are not of the text encoder: {names}", self.path.display())
         })
     }
 }
 
-fn json(file: &Path) -> Result<Value, EncoderError> {
+fn json(file: &DataPath) -> Result<Value, EncoderError> {
     let refuse = |what: String| EncoderError::at(file, what);
-    let bytes = files::read(file, CONFIG_BYTES).map_err(|e| refuse(e.to_string()))?;
-    serde_json::from_slice(&bytes).map_err(|e| refuse(format!("{e}; expected JSON")))
+    let bytes = file.read(CONFIG_BYTES).map_err(|e| refuse(e.to_string()))?;
+    serde_json::from_slice(&bytes).map_err(|e| refuse(json_mistake(&e)))
 }
 
 /// Reads a JSON file, or returns null if it does not exist.
-fn json_if_there(file: &Path) -> Result<Value, EncoderError> {
-    if file.symlink_metadata().is_ok() { json(file) } else { Ok(Value::Null) }
+fn json_if_there(file: &DataPath) -> Result<Value, EncoderError> {
+    if file.has_entry() { json(file) } else { Ok(Value::Null) }
 }
 
 /// The bytes of a `tokenizer.json`, and the file's name for errors.
-fn tokenizer(root: &Path, kind: Kind) -> Result<(String, Vec<u8>), EncoderError> {
+fn tokenizer(root: &DataPath, kind: Kind) -> Result<(String, Vec<u8>), EncoderError> {
     let read = |name: &str| {
         let file = root.join(name);
-        files::read(&file, TOKENIZER_BYTES).map_err(|e| EncoderError::at(&file, e.to_string()))
+        file.read(TOKENIZER_BYTES).map_err(|e| EncoderError::at(&file, e.to_string()))
     };
-    let is_there = |name: &str| root.join(name).symlink_metadata().is_ok();
+    let is_there = |name: &str| root.join(name).has_entry();
     let shown = |name: &str| root.join(name).display().to_string();
     if is_there("tokenizer.json") {
         return Ok((shown("tokenizer.json"), read("tokenizer.json")?));
@@ -254,7 +249,12 @@ fn tokenizer(root: &Path, kind: Kind) -> Result<(String, Vec<u8>), EncoderError>
 }
 
 /// The rules by which published models convert captions to ids.
-fn rules(root: &Path, request: &Request, network: &Network, tokenizer: (&str, &[u8])) -> Result<Rules, EncoderError> {
+fn rules(
+    root: &DataPath,
+    request: &Request,
+    network: &Network,
+    tokenizer: (&str, &[u8]),
+) -> Result<Rules, EncoderError> {
     let config = json_if_there(&root.join("tokenizer_config.json"))?;
     let special = json_if_there(&root.join("special_tokens_map.json"))?;
     let word = |key: &str, fallback: &str| {
@@ -276,7 +276,7 @@ fn rules(root: &Path, request: &Request, network: &Network, tokenizer: (&str, &[
             let end_word = word("eos_token", "<|endoftext|>");
             let (first, end) = (id(&word("bos_token", "<|startoftext|>"))?, id(&end_word)?);
             if ![2, end as usize].contains(&sizes.eos_token_id) {
-                let (said, is) = (sizes.eos_token_id, end_word.escape_debug());
+                let (said, is) = (sizes.eos_token_id, excerpt(&end_word));
                 let what = format!("`eos_token_id` is {said}; expected 2, or {end}, which is `{is}` of the tokenizer");
                 return Err(EncoderError::at(&root.join("config.json"), what));
             }
@@ -317,16 +317,16 @@ struct Behind {
 /// The modules in `modules.json`.
 #[derive(Debug)]
 struct Modules {
-    file: PathBuf,
+    file: DataPath,
     /// Folder of the network.
-    first: PathBuf,
+    first: DataPath,
     /// The later modules, as class and folder.
-    others: Vec<(String, PathBuf)>,
+    others: Vec<(String, DataPath)>,
 }
 
 impl Modules {
     /// Reads `modules.json`; `None` if the folder has none.
-    fn read(path: &Path) -> Result<Option<Self>, EncoderError> {
+    fn read(path: &DataPath) -> Result<Option<Self>, EncoderError> {
         #[derive(Deserialize)]
         struct Module {
             path: String,
@@ -340,14 +340,14 @@ impl Modules {
         }
         let refuse = |what: String| EncoderError::at(&file, what);
         let listed: Vec<Module> = serde_json::from_value(value)
-            .map_err(|e| refuse(format!("{e}; expected a list of modules with `path` and `type`")))?;
+            .map_err(|e| refuse(format!("{}; expected a list of modules with `path` and `type`", json_mistake(&e))))?;
         let mut all = Vec::new();
         for Module { path: below, class } in listed {
             if !Path::new(&below).components().all(|part| matches!(part, Component::Normal(_))) {
-                return Err(refuse(format!("`{}` is not a folder below it", below.escape_debug())));
+                return Err(refuse(format!("`{}` is not a folder below it", excerpt(&below))));
             }
             let class = class.rsplit('.').next().unwrap_or_default().to_owned();
-            all.push((class, path.join(below)));
+            all.push((class, path.join_quoted(&below)));
         }
         if all.is_empty() || all.len() > 16 {
             return Err(refuse(format!("lists {} modules; expected 1 to 16", all.len())));
@@ -368,7 +368,7 @@ impl Modules {
             let found = classes.join(", ");
             return Err(refuse(format!(
                 "lists {} behind the network; expected Pooling, then maybe Dense, then maybe Normalize",
-                found.escape_debug()
+                excerpt(&found)
             )));
         }
         for (class, folder) in &self.others {
@@ -391,7 +391,7 @@ impl Modules {
 }
 
 /// Refuses any pooling except the mean over tokens.
-fn check_pooling(file: &Path, width: usize) -> Result<(), EncoderError> {
+fn check_pooling(file: &DataPath, width: usize) -> Result<(), EncoderError> {
     let config = json(file)?;
     let refuse = |what: String| EncoderError::at(file, what);
     let modes = config.as_object().into_iter().flatten().filter(|(key, _)| key.starts_with("pooling_mode"));
@@ -401,7 +401,7 @@ fn check_pooling(file: &Path, width: usize) -> Result<(), EncoderError> {
         .collect();
     if on != ["pooling_mode_mean_tokens"] && on != ["mean"] {
         let on = on.join(", ");
-        return Err(refuse(format!("pools by `{}`; expected the mean of the tokens", on.escape_debug())));
+        return Err(refuse(format!("pools by `{}`; expected the mean of the tokens", excerpt(&on))));
     }
     match config["word_embedding_dimension"].as_u64() {
         Some(said) if said != width as u64 => Err(refuse(format!("pools {said} numbers, the network gives {width}"))),
@@ -414,12 +414,15 @@ fn dense(config: &Value, width: usize) -> Result<(usize, bool), String> {
     let number =
         |key: &str| config[key].as_u64().and_then(|n| usize::try_from(n).ok()).filter(|n| (1..=WIDEST).contains(n));
     if number("in_features") != Some(width) {
-        return Err(format!("`in_features` is {}; expected {width}, the width of the network", config["in_features"]));
+        return Err(format!(
+            "`in_features` is {}; expected {width}, the width of the network",
+            excerpt(&config["in_features"].to_string())
+        ));
     }
     let out = number("out_features").ok_or("`out_features` is missing; expected 1 to 65536")?;
     let activation = config["activation_function"].as_str().unwrap_or("Identity");
     if !activation.ends_with("Identity") {
-        let found = activation.escape_debug();
+        let found = excerpt(activation);
         return Err(format!("`activation_function` is `{found}`; expected `torch.nn.modules.linear.Identity`"));
     }
     Ok((out, config["bias"].as_bool().unwrap_or(true)))

@@ -23,4 +23,4 @@ pub use repair::repaired;
 pub use rules::Rules;
 pub use tensor_file::{Element, ReadAt, TensorFile, WeightsFile, widen};
 pub use tokenizer::Tokenizer;
-pub use weights::{StoredTensor, Weights, archive_length};
+pub use weights::{StoredTensor, Weights, archive_length, no_torch};

@@ -3,6 +3,7 @@
 //! Sources: the configurations of `CLIPTextModel` and `T5EncoderModel` in Hugging Face's transformers, whose defaults
 //! replace keys that a file leaves out.
 
+use protocol::{excerpt, json_mistake};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
@@ -135,7 +136,7 @@ fn small(key: &str, value: f64) -> Result<(), String> {
 
 /// The value of `model_type`, or an empty string.
 fn model_type(config: &Value) -> &str {
-    config["model_type"].as_str().unwrap_or("not named")
+    config["model_type"].as_str().unwrap_or_default()
 }
 
 impl Network {
@@ -150,14 +151,15 @@ impl Network {
             "clip_text_model" => config.clone(),
             _ => {
                 return Err(format!(
-                    "`model_type` is {found}; expected `clip` with `text_config`, or `clip_text_model`"
+                    "`model_type` is `{}`; expected `clip` with `text_config`, or `clip_text_model`",
+                    excerpt(found)
                 ));
             }
         };
         if let Some(width) = config.get("projection_dim") {
             text["projection_dim"] = width.clone();
         }
-        let sizes: ClipSizes = serde_json::from_value(text).map_err(|e| e.to_string())?;
+        let sizes: ClipSizes = serde_json::from_value(text).map_err(|e| json_mistake(&e))?;
         let network = Self::Clip(sizes);
         network.check()?;
         Ok(network)
@@ -170,9 +172,9 @@ impl Network {
     pub fn t5(config: &Value) -> Result<Self, String> {
         let found = model_type(config);
         if found != "t5" {
-            return Err(format!("`model_type` is {found}; expected `t5`"));
+            return Err(format!("`model_type` is `{}`; expected `t5`", excerpt(found)));
         }
-        let network = Self::T5(serde_json::from_value(config.clone()).map_err(|e| e.to_string())?);
+        let network = Self::T5(serde_json::from_value(config.clone()).map_err(|e| json_mistake(&e))?);
         network.check()?;
         Ok(network)
     }
@@ -198,9 +200,7 @@ impl Network {
                 }
                 match of.hidden_act.as_str() {
                     "quick_gelu" | "gelu" => Ok(()),
-                    other => {
-                        Err(format!("`hidden_act` is `{}`; expected `quick_gelu` or `gelu`", other.escape_debug()))
-                    }
+                    other => Err(format!("`hidden_act` is `{}`; expected `quick_gelu` or `gelu`", excerpt(other))),
                 }
             }
             Self::T5(of) => {
@@ -221,10 +221,9 @@ impl Network {
                 }
                 match of.feed_forward_proj.as_str() {
                     "relu" | "gated-gelu" => Ok(()),
-                    other => Err(format!(
-                        "`feed_forward_proj` is `{}`; expected `relu` or `gated-gelu`",
-                        other.escape_debug()
-                    )),
+                    other => {
+                        Err(format!("`feed_forward_proj` is `{}`; expected `relu` or `gated-gelu`", excerpt(other)))
+                    }
                 }
             }
         }
@@ -319,6 +318,7 @@ mod tests {
     /// The published numbers of parameters of the papers' encoders.
     #[test]
     fn published_sizes_have_their_published_parameters() {
+        protocol::show_excerpts();
         let count = |network: &Network| -> usize {
             network.tensors().iter().map(|tensor| tensor.shape.iter().product::<usize>()).sum()
         };
@@ -331,6 +331,7 @@ mod tests {
 
     #[test]
     fn sizes_that_no_network_has_are_refused_by_name() {
+        protocol::show_excerpts();
         let clip =
             |key: &str, value: Value| Network::clip(&json!({"model_type": "clip_text_model", key: value})).unwrap_err();
         assert!(clip("vocab_size", json!(1_u64 << 40)).contains("`vocab_size` is 1099511627776; expected 1 to"));
@@ -339,10 +340,10 @@ mod tests {
         assert!(clip("hidden_act", json!("relu")).contains("expected `quick_gelu` or `gelu`"));
         assert!(clip("layer_norm_eps", json!(-1)).contains("above 0"));
         assert!(clip("hidden_size", json!("wide")).contains("expected usize"));
-        assert!(Network::clip(&json!({"model_type": "bert"})).unwrap_err().contains("`model_type` is bert"));
+        assert!(Network::clip(&json!({"model_type": "bert"})).unwrap_err().contains("`model_type` is `bert`"));
         let t5 = |key: &str, value: Value| Network::t5(&json!({"model_type": "t5", key: value})).unwrap_err();
         assert!(t5("relative_attention_num_buckets", json!(3)).contains("3 buckets"));
         assert!(t5("feed_forward_proj", json!("gated-silu")).contains("gated-gelu"));
-        assert!(Network::t5(&json!([])).unwrap_err().contains("not named"));
+        assert!(Network::t5(&json!([])).unwrap_err().contains("expected `t5`"));
     }
 }

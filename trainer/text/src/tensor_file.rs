@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use protocol::json_mistake;
 use safetensors::tensor::{Dtype, Metadata, TensorInfo};
 
 use crate::network::TensorSpec;
@@ -153,7 +154,8 @@ impl<R: ReadAt> WeightsFile<R> {
         }
         let mut json = vec![0; usize::try_from(length).unwrap_or_default()];
         source.read_at(8, &mut json)?;
-        let header: Metadata = serde_json::from_slice(&json).map_err(|e| bad(&e.to_string()))?;
+        let header: Metadata =
+            serde_json::from_slice(&json).map_err(|e| bad(&format!("has a header that is {}", json_mistake(&e))))?;
         if header.data_len() as u64 != bytes - 8 - length {
             let said = header.data_len();
             return Err(bad(&format!("says that its tensors take {said} bytes, and has {}", bytes - 8 - length)));

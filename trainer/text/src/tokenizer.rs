@@ -6,7 +6,7 @@
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
-use protocol::limits;
+use protocol::{excerpt, json_mistake, limits};
 use serde::de::{MapAccess, SeqAccess, Visitor};
 use serde::{Deserialize, Deserializer};
 use serde_json::{Value, json};
@@ -143,7 +143,7 @@ impl Tokenizer {
         let inner = parsed(place, json)?;
         let known = inner.get_vocab(true);
         if let Some((word, id)) = known.iter().filter(|(_, id)| **id as usize >= rows).min() {
-            let word = word.escape_debug();
+            let word = excerpt(word);
             return Err(refuse(format!(
                 "the token `{word}` has the id {id}, but the table of the weights has {rows} rows; take both from one model"
             )));
@@ -164,7 +164,7 @@ impl Tokenizer {
         let mut inner = inner;
         inner.with_padding(None);
         let cut = TruncationParams { max_length: rules.most, ..TruncationParams::default() };
-        inner.with_truncation(Some(cut)).map_err(|e| refuse(e.to_string()))?;
+        inner.with_truncation(Some(cut)).map_err(|e| refuse(excerpt(&e.to_string())))?;
         Ok(Self { inner, rules: rules.clone(), rows })
     }
 
@@ -175,7 +175,7 @@ impl Tokenizer {
     pub(crate) fn id(place: &str, json: &[u8], token: &str) -> Result<u32, EncoderError> {
         let tokenizer = parsed(place, json)?;
         tokenizer.token_to_id(token).ok_or_else(|| {
-            EncoderError::new(place, format!("no token `{}`, which every caption needs", token.escape_debug()))
+            EncoderError::new(place, format!("no token `{}`, which every caption needs", excerpt(token)))
         })
     }
 
@@ -189,8 +189,7 @@ impl Tokenizer {
     /// # Errors
     /// If the caption exceeds the limit, or the tokenizer fails.
     pub fn ids(&self, caption: &str) -> Result<Vec<u32>, EncoderError> {
-        let shown: String = caption.chars().take(40).collect();
-        let refuse = |what: String| EncoderError::new(format!("the caption `{}`", shown.escape_debug()), what);
+        let refuse = |what: String| EncoderError::new(format!("the caption `{}`", excerpt(caption)), what);
         if caption.len() > limits::CAPTION_BYTES {
             let (found, most) = (caption.len(), limits::CAPTION_BYTES);
             return Err(refuse(format!("has {found} bytes; expected at most {most}")));
@@ -198,7 +197,7 @@ impl Tokenizer {
         let text = self.rules.prepared(caption);
         let encoded = catch_unwind(AssertUnwindSafe(|| self.inner.encode_fast(text.as_str(), true)))
             .map_err(|_| refuse("the tokenizer broke; its file is damaged".into()))?
-            .map_err(|e| refuse(format!("the tokenizer says: {e}")))?;
+            .map_err(|e| refuse(format!("the tokenizer says: {}", excerpt(&e.to_string()))))?;
         let ids = encoded.get_ids().to_vec();
         let sound = ids.len() <= self.rules.most
             && ids.iter().all(|id| (*id as usize) < self.rows)
@@ -226,7 +225,8 @@ impl Tokenizer {
 fn parsed(place: &str, json: &[u8]) -> Result<tokenizers::Tokenizer, EncoderError> {
     let refuse = |what: String| EncoderError::new(place, what);
     let expected = "expected a `tokenizer.json` as Hugging Face's tokenizers write it";
-    let looked: Looked = serde_json::from_slice(json).map_err(|e| refuse(format!("{e}; {expected}")))?;
+    let looked: Looked =
+        serde_json::from_slice(json).map_err(|e| refuse(format!("{}; {expected}", json_mistake(&e))))?;
     let counted = [("model.vocab", &looked.model.vocab), ("model.merges", &looked.model.merges)];
     for (what, Count { entries, longest }) in counted.into_iter().chain([("added_tokens", &looked.added_tokens)]) {
         if *entries > ENTRIES {
@@ -243,7 +243,7 @@ fn parsed(place: &str, json: &[u8]) -> Result<tokenizers::Tokenizer, EncoderErro
     check_normalizer(&looked.normalizer, &mut steps).map_err(refuse)?;
     catch_unwind(|| tokenizers::Tokenizer::from_bytes(json))
         .map_err(|_| refuse(format!("cannot be read; {expected}")))?
-        .map_err(|e| refuse(format!("{e}; {expected}")))
+        .map_err(|e| refuse(format!("{}; {expected}", excerpt(&e.to_string()))))
 }
 
 /// Refuses steps that would expand text; `met` counts steps, and those of them that replace.
@@ -324,8 +324,9 @@ fn from_base64(text: &str) -> Option<Vec<u8>> {
 /// # Errors
 /// The invalid file.
 pub(crate) fn clip_from_parts(vocab: (&str, &[u8]), merges: (&str, &[u8])) -> Result<Vec<u8>, EncoderError> {
-    let table: serde_json::Map<String, Value> = serde_json::from_slice(vocab.1)
-        .map_err(|e| EncoderError::new(vocab.0, format!("{e}; expected a mapping from tokens to ids")))?;
+    let table: serde_json::Map<String, Value> = serde_json::from_slice(vocab.1).map_err(|e| {
+        EncoderError::new(vocab.0, format!("{}; expected a mapping from tokens to ids", json_mistake(&e)))
+    })?;
     let id = |token: &str| {
         table
             .get(token)
@@ -340,8 +341,7 @@ pub(crate) fn clip_from_parts(vocab: (&str, &[u8]), merges: (&str, &[u8])) -> Re
     let mut pairs = Vec::new();
     for line in lines {
         let Some((left, right)) = line.split_once(' ').filter(|(_, right)| !right.contains(' ')) else {
-            let line = line.chars().take(40).collect::<String>();
-            let what = format!("the line `{}` is no merge; expected two tokens", line.escape_debug());
+            let what = format!("the line `{}` is no merge; expected two tokens", excerpt(line));
             return Err(EncoderError::new(merges.0, what));
         };
         pairs.push(json!([left, right]));
@@ -396,6 +396,7 @@ mod tests {
 
     #[test]
     fn captions_are_cut_between_their_ends() {
+        protocol::show_excerpts();
         let tokenizer = Tokenizer::new("t", clip().to_string().as_bytes(), &rules(), 7).unwrap();
         let ids = |caption: &str| tokenizer.ids(caption).unwrap();
         assert_eq!(ids("AB  a"), [4, 3, 2, 5]);
@@ -408,6 +409,7 @@ mod tests {
 
     #[test]
     fn files_that_would_break_what_follows_are_refused() {
+        protocol::show_excerpts();
         let with = |change: &dyn Fn(&mut Value)| {
             let mut file = clip();
             change(&mut file);
@@ -450,6 +452,7 @@ mod tests {
     /// Overwritten, cut and doubled bytes must not cause a panic, nor an id outside the table.
     #[test]
     fn no_bytes_break_it() {
+        protocol::show_excerpts();
         let whole = clip().to_string().into_bytes();
         let mut state = 0x9e37_79b9_7f4a_7c15_u64;
         let mut next = move |bound: usize| {

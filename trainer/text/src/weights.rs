@@ -7,11 +7,10 @@ use std::cell::RefCell;
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{Read as _, Seek as _, SeekFrom};
-use std::path::Path;
 use std::rc::Rc;
 
-use motion::files;
-use protocol::limits;
+use motion::DataPath;
+use protocol::{excerpt, json_mistake, limits};
 use pytorch_reader::{DType, PytorchReader};
 use safetensors::tensor::{Metadata, TensorInfo};
 use serde::Deserialize;
@@ -93,7 +92,7 @@ impl StoredTensor {
                 Ok(bytes)
             }
             Place::Torch(tensor) => {
-                let mut bytes = tensor.read().map_err(|e| e.to_string())?;
+                let mut bytes = tensor.read().map_err(|e| no_torch(&e))?;
                 if cfg!(target_endian = "big") {
                     bytes.chunks_exact_mut(self.element.bytes()).for_each(<[u8]>::reverse);
                 }
@@ -117,14 +116,14 @@ impl Weights {
     ///
     /// # Errors
     /// The invalid file.
-    pub fn open(folder: &Path) -> Result<Self, EncoderError> {
-        let is_there = |name: &str| folder.join(name).symlink_metadata().is_ok();
+    pub fn open(folder: &DataPath) -> Result<Self, EncoderError> {
+        let is_there = |name: &str| folder.join(name).has_entry();
         let mut weights = Self::default();
         if is_there("model.safetensors") {
             weights.add_safetensors(&folder.join("model.safetensors"))?;
         } else if is_there("model.safetensors.index.json") {
             for shard in shards(&folder.join("model.safetensors.index.json"))? {
-                weights.add_safetensors(&folder.join(shard))?;
+                weights.add_safetensors(&folder.join_quoted(&shard))?;
             }
         } else if is_there("pytorch_model.bin") {
             weights.add_torch(&folder.join("pytorch_model.bin"))?;
@@ -140,9 +139,9 @@ impl Weights {
     ///
     /// # Errors
     /// If the file is neither, or declares more data than it holds.
-    pub fn open_file(path: &Path) -> Result<Self, EncoderError> {
+    pub fn open_file(path: &DataPath) -> Result<Self, EncoderError> {
         let refuse = |what: String| EncoderError::at(path, what);
-        let (file, bytes) = files::open(path).map_err(|e| refuse(e.to_string()))?;
+        let (file, bytes) = path.open().map_err(|e| refuse(e.to_string()))?;
         if bytes > limits::WEIGHTS_BYTES {
             return Err(refuse(format!("has {bytes} bytes; at most {} are read", limits::WEIGHTS_BYTES)));
         }
@@ -168,9 +167,9 @@ impl Weights {
         &self.others
     }
 
-    fn add_safetensors(&mut self, path: &Path) -> Result<(), EncoderError> {
+    fn add_safetensors(&mut self, path: &DataPath) -> Result<(), EncoderError> {
         let refuse = |what: String| EncoderError::at(path, what);
-        let (file, bytes) = files::open(path).map_err(|e| refuse(e.to_string()))?;
+        let (file, bytes) = path.open().map_err(|e| refuse(e.to_string()))?;
         let file = WeightsFile::open(OnDisk { file: file.into(), bytes }).map_err(refuse)?;
         let source = Rc::new(file.source);
         for (name, TensorFile { element, shape, offset }) in file.tensors {
@@ -178,7 +177,7 @@ impl Weights {
                 Some(element) => {
                     let tensor = StoredTensor { element, shape, place: Place::Safe(Rc::clone(&source), offset) };
                     if self.tensors.insert(name.clone(), tensor).is_some() {
-                        let name = name.escape_debug();
+                        let name = excerpt(&name);
                         return Err(refuse(format!("the tensor `{name}` is in another file too")));
                     }
                 }
@@ -190,10 +189,11 @@ impl Weights {
         Ok(())
     }
 
-    fn add_torch(&mut self, path: &Path) -> Result<(), EncoderError> {
+    fn add_torch(&mut self, path: &DataPath) -> Result<(), EncoderError> {
         let refuse = |what: String| EncoderError::at(path, what);
         let length = archive_length(path).map_err(refuse)?;
-        let reader = PytorchReader::new(path).map_err(|e| refuse(e.to_string()))?;
+        let held = path.hold().map_err(|e| refuse(e.to_string()))?;
+        let reader = PytorchReader::new(held.path()).map_err(|e| refuse(no_torch(&e)))?;
         let mut declared = 0_u64;
         for (name, tensor) in reader.into_tensors() {
             let element = match tensor.dtype() {
@@ -231,7 +231,7 @@ impl Weights {
     /// The missing names and shapes, and the file's shapes under those names.
     pub(crate) fn take(
         &mut self,
-        place: &Path,
+        place: &DataPath,
         specs: &[TensorSpec],
         prefix: &str,
     ) -> Result<BTreeMap<String, StoredTensor>, EncoderError> {
@@ -268,15 +268,21 @@ impl Weights {
     }
 }
 
+/// The reader's message about a pickle, as an excerpt, since it may quote the file.
+pub fn no_torch(error: &dyn std::fmt::Display) -> String {
+    format!("it cannot be read as a file of torch: {}", excerpt(&error.to_string()))
+}
+
 /// Reads the names of the files in a list of shards, each once.
-fn shards(path: &Path) -> Result<Vec<String>, EncoderError> {
+fn shards(path: &DataPath) -> Result<Vec<String>, EncoderError> {
     #[derive(Deserialize)]
     struct Index {
         weight_map: BTreeMap<String, String>,
     }
     let refuse = |what: String| EncoderError::at(path, what);
-    let bytes = files::read(path, INDEX_BYTES).map_err(|e| refuse(e.to_string()))?;
-    let index: Index = serde_json::from_slice(&bytes).map_err(|e| refuse(format!("{e}; expected `weight_map`")))?;
+    let bytes = path.read(INDEX_BYTES).map_err(|e| refuse(e.to_string()))?;
+    let index: Index =
+        serde_json::from_slice(&bytes).map_err(|e| refuse(format!("{}; expected `weight_map`", json_mistake(&e))))?;
     let mut names: Vec<String> = index.weight_map.into_values().collect();
     names.sort();
     names.dedup();
@@ -284,7 +290,7 @@ fn shards(path: &Path) -> Result<Vec<String>, EncoderError> {
     if let Some(name) =
         names.iter().find(|name| name.is_empty() || name.contains(['/', '\\', '\0']) || name.starts_with('.'))
     {
-        return Err(refuse(format!("`{}` is not the name of a file beside it", name.escape_debug())));
+        return Err(refuse(format!("`{}` is not the name of a file beside it", excerpt(name))));
     }
     if names.is_empty() || names.len() > SHARDS {
         return Err(refuse(format!("names {} files; expected 1 to {SHARDS}", names.len())));
@@ -297,8 +303,8 @@ fn shards(path: &Path) -> Result<Vec<String>, EncoderError> {
 ///
 /// # Errors
 /// The reason for refusing it, without its path.
-pub fn archive_length(path: &Path) -> Result<u64, String> {
-    let (mut file, length) = files::open(path).map_err(|e| e.to_string())?;
+pub fn archive_length(path: &DataPath) -> Result<u64, String> {
+    let (mut file, length) = path.open().map_err(|e| e.to_string())?;
     if length > limits::WEIGHTS_BYTES {
         return Err(format!("has {length} bytes; at most {} are read", limits::WEIGHTS_BYTES));
     }
@@ -306,10 +312,11 @@ pub fn archive_length(path: &Path) -> Result<u64, String> {
     if file.read_exact(&mut magic).is_err() || &magic != b"PK" {
         return Ok(length);
     }
-    let mut archive = zip::ZipArchive::new(file).map_err(|e| e.to_string())?;
+    let no_archive = |e: &dyn std::fmt::Display| format!("its archive cannot be read: {}", excerpt(&e.to_string()));
+    let mut archive = zip::ZipArchive::new(file).map_err(|e| no_archive(&e))?;
     let mut unpacked = 0_u64;
     for i in 0..archive.len() {
-        unpacked = unpacked.saturating_add(archive.by_index_raw(i).map_err(|e| e.to_string())?.size());
+        unpacked = unpacked.saturating_add(archive.by_index_raw(i).map_err(|e| no_archive(&e))?.size());
     }
     if unpacked > length {
         return Err(format!(
@@ -320,7 +327,7 @@ pub fn archive_length(path: &Path) -> Result<u64, String> {
 }
 
 /// Serialises tensors as the pieces of one safetensors file, in the order of their names.
-pub(crate) fn packed(place: &Path, tensors: &BTreeMap<String, StoredTensor>) -> Result<Vec<Vec<u8>>, EncoderError> {
+pub(crate) fn packed(place: &DataPath, tensors: &BTreeMap<String, StoredTensor>) -> Result<Vec<Vec<u8>>, EncoderError> {
     let mut end = 0;
     let info = |(name, tensor): (&String, &StoredTensor)| {
         let begin = end;
@@ -347,6 +354,7 @@ mod tests {
 
     #[test]
     fn a_list_of_shards_names_files_beside_it() {
+        protocol::show_excerpts();
         let folder = tempfile::tempdir().unwrap();
         let index = folder.path().join("model.safetensors.index.json");
         for (text, part) in [
@@ -357,7 +365,7 @@ mod tests {
             ("", "expected `weight_map`"),
         ] {
             std::fs::write(&index, text).unwrap();
-            let said = Weights::open(folder.path()).unwrap_err().to_string();
+            let said = Weights::open(&DataPath::local(folder.path())).unwrap_err().to_string();
             assert!(said.contains(part), "{said}");
         }
         std::fs::write(&index, r#"{"weight_map": {"a": "one", "b": "two"}}"#).unwrap();
@@ -365,17 +373,17 @@ mod tests {
             let header = format!(r#"{{"{tensor}":{{"dtype":"BF16","shape":[1],"data_offsets":[0,2]}}}}"#);
             std::fs::write(folder.path().join(name), file(&header, &[0x80, 0x3f])).unwrap();
         }
-        let said = Weights::open(folder.path()).unwrap_err().to_string();
+        let said = Weights::open(&DataPath::local(folder.path())).unwrap_err().to_string();
         assert!(said.contains("`a` is in another file too"), "{said}");
         let header = r#"{"b":{"dtype":"I64","shape":[1],"data_offsets":[0,8]}}"#;
         std::fs::write(folder.path().join("two"), file(header, &[0; 8])).unwrap();
-        let mut weights = Weights::open(folder.path()).unwrap();
+        let mut weights = Weights::open(&DataPath::local(folder.path())).unwrap();
         let spec = |name: &str| TensorSpec { name: name.into(), shape: vec![1] };
-        let said = weights.take(folder.path(), &[spec("b")], "").unwrap_err().to_string();
+        let said = weights.take(&DataPath::local(folder.path()), &[spec("b")], "").unwrap_err().to_string();
         assert!(said.contains("missing: `b` [1] (there as no float"), "{said}");
-        let taken = weights.take(folder.path(), &[spec("a")], "x.").unwrap();
+        let taken = weights.take(&DataPath::local(folder.path()), &[spec("a")], "x.").unwrap();
         assert_eq!(taken.keys().collect::<Vec<_>>(), ["x.a"]);
-        let pieces = packed(folder.path(), &taken).unwrap().concat();
+        let pieces = packed(&DataPath::local(folder.path()), &taken).unwrap().concat();
         let mut out = [0.0];
         WeightsFile::open(Bytes(pieces)).unwrap().read("x.a", &mut out).unwrap();
         assert_eq!(out, [1.0]);

@@ -4,6 +4,7 @@
 //! The fixtures drive the tests: every folder with these prefixes, every set of ids that its arrays name, with lengths
 //! and padding from their shapes.
 
+use motion::DataPath;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
@@ -44,12 +45,14 @@ fn cut_at(case: &str) -> usize {
 
 #[test]
 fn captions_become_clips_ids() {
+    protocol::show_excerpts();
     for folder in fixtures::parity(&["09_text_clip"]) {
         let captions = captions(&folder);
         let mut tried = 0;
         for (case, expected) in ids(&folder) {
             let way = if case.starts_with("hf") { TokenIds::HuggingFace } else { TokenIds::OpenAi };
-            let opened = EncoderFolder::open(&folder, &clip(way, cut_at(&case))).unwrap_or_else(|e| panic!("{e}"));
+            let opened = EncoderFolder::open(&DataPath::local(&folder), &clip(way, cut_at(&case)))
+                .unwrap_or_else(|e| panic!("{e}"));
             let tokenizer = opened.tokenizer().expect("it was opened");
             for (i, (caption, expected)) in captions.iter().zip(&expected).enumerate() {
                 let (found, own) = tokenizer.padded(caption, expected.len()).unwrap_or_else(|e| panic!("{e}"));
@@ -65,10 +68,14 @@ fn captions_become_clips_ids() {
 
 #[test]
 fn a_folder_without_its_tokenizer_file_is_read_from_vocabulary_and_merges() {
+    protocol::show_excerpts();
     for folder in fixtures::parity(&["09_text_clip"]) {
         let copy = copy_of(&folder, &["tokenizer.json"]);
         let request = clip(TokenIds::HuggingFace, 0);
-        let (whole, parts) = (EncoderFolder::open(&folder, &request), EncoderFolder::open(copy.path(), &request));
+        let (whole, parts) = (
+            EncoderFolder::open(&DataPath::local(&folder), &request),
+            EncoderFolder::open(&DataPath::local(copy.path()), &request),
+        );
         let (whole, parts) = (whole.expect("a fixture"), parts.unwrap_or_else(|e| panic!("{e}")));
         assert_eq!(whole.description, parts.description);
         let (whole, parts) = (whole.tokenizer().unwrap(), parts.tokenizer().unwrap());
@@ -77,20 +84,24 @@ fn a_folder_without_its_tokenizer_file_is_read_from_vocabulary_and_merges() {
         }
         // The limit is the folder's own `model_max_length`, 77 in published folders.
         assert_eq!(whole.rules().most, json(&folder.join("tokenizer_config.json"))["model_max_length"]);
-        let said = EncoderFolder::open(&folder, &clip(TokenIds::OpenAi, 10_000)).unwrap_err().to_string();
+        let said =
+            EncoderFolder::open(&DataPath::local(&folder), &clip(TokenIds::OpenAi, 10_000)).unwrap_err().to_string();
         assert!(said.contains("10000 tokens are asked for"), "{said}");
-        let said = EncoderFolder::open(&folder, &Request { kind: Kind::T5, ..request }).unwrap_err().to_string();
-        assert!(said.contains("`model_type` is clip; expected `t5`"), "{said}");
+        let said = EncoderFolder::open(&DataPath::local(&folder), &Request { kind: Kind::T5, ..request })
+            .unwrap_err()
+            .to_string();
+        assert!(said.contains("`model_type` is `clip`; expected `t5`"), "{said}");
         std::fs::remove_file(copy.path().join("merges.txt")).unwrap();
-        let said = EncoderFolder::open(copy.path(), &request).unwrap_err().to_string();
+        let said = EncoderFolder::open(&DataPath::local(copy.path()), &request).unwrap_err().to_string();
         assert!(said.contains("no `tokenizer.json`, and no `vocab.json` with `merges.txt`"), "{said}");
     }
 }
 
 #[test]
 fn the_vision_tower_is_passed_over() {
+    protocol::show_excerpts();
     for folder in fixtures::parity(&["09_text_clip"]) {
-        let opened = EncoderFolder::open(&folder, &clip(TokenIds::OpenAi, 0)).expect("a fixture");
+        let opened = EncoderFolder::open(&DataPath::local(&folder), &clip(TokenIds::OpenAi, 0)).expect("a fixture");
         let said = opened.skipped_line().expect("a vision tower");
         assert!(
             said.contains("vision_model*") && said.contains("logit_scale*") && said.contains("text_model* (1)"),
@@ -105,10 +116,11 @@ fn the_vision_tower_is_passed_over() {
 
 #[test]
 fn captions_become_t5s_ids() {
+    protocol::show_excerpts();
     for folder in fixtures::parity(&["09_text_t5"]) {
         let captions = captions(&folder);
         let request = Request { kind: Kind::SentenceT5, ids: TokenIds::HuggingFace, most: 0 };
-        let opened = EncoderFolder::open(&folder, &request).unwrap_or_else(|e| panic!("{e}"));
+        let opened = EncoderFolder::open(&DataPath::local(&folder), &request).unwrap_or_else(|e| panic!("{e}"));
         let tokenizer = opened.tokenizer().expect("it was opened");
         let sentence = json(&folder.join("sentence_bert_config.json"));
         assert_eq!(tokenizer.rules().most, sentence["max_seq_length"]);
@@ -131,11 +143,12 @@ fn captions_become_t5s_ids() {
 /// The dense layer is the same from safetensors and from torch's pickle.
 #[test]
 fn a_dense_layer_is_read_from_either_file() {
+    protocol::show_excerpts();
     for folder in fixtures::parity(&["09_text_t5"]) {
         let request = Request { kind: Kind::SentenceT5, ids: TokenIds::HuggingFace, most: 0 };
         let pickled = copy_of(&folder, &["2_Dense/model.safetensors"]);
         let values = |path: &Path| {
-            let opened = EncoderFolder::open(path, &request).unwrap_or_else(|e| panic!("{e}"));
+            let opened = EncoderFolder::open(&DataPath::local(path), &request).unwrap_or_else(|e| panic!("{e}"));
             let (Network::T5(sizes), Some(head)) = (&opened.description.network, &opened.description.head) else {
                 panic!("{:?}", opened.description)
             };
@@ -151,6 +164,7 @@ fn a_dense_layer_is_read_from_either_file() {
 /// The older layout, with the network in its own folder and sharded weights, is the same encoder.
 #[test]
 fn shards_in_a_folder_below_are_the_same_encoder() {
+    protocol::show_excerpts();
     for folder in fixtures::parity(&["09_text_t5"]) {
         let request = Request { kind: Kind::SentenceT5, ids: TokenIds::HuggingFace, most: 0 };
         let copy = copy_of(&folder, &["model.safetensors", "modules.json"]);
@@ -180,7 +194,8 @@ fn shards_in_a_folder_below_are_the_same_encoder() {
         let index = serde_json::json!({"metadata": {}, "weight_map": places});
         std::fs::write(below.join("model.safetensors.index.json"), index.to_string()).expect("a file");
 
-        let opened = |path: &Path| EncoderFolder::open(path, &request).unwrap_or_else(|e| panic!("{e}"));
+        let opened =
+            |path: &Path| EncoderFolder::open(&DataPath::local(path), &request).unwrap_or_else(|e| panic!("{e}"));
         let (whole, parts) = (opened(&folder), opened(copy.path()));
         assert_eq!(whole.digest(&whole.weights().unwrap()), parts.digest(&parts.weights().unwrap()));
     }
@@ -188,12 +203,13 @@ fn shards_in_a_folder_below_are_the_same_encoder() {
 
 #[test]
 fn folders_that_lack_something_say_what() {
+    protocol::show_excerpts();
     for folder in fixtures::parity(&["09_text_t5"]) {
         let request = Request { kind: Kind::SentenceT5, ids: TokenIds::HuggingFace, most: 0 };
         let refused = |without: &[&str], change: &dyn Fn(&Path)| {
             let copy = copy_of(&folder, without);
             change(copy.path());
-            EncoderFolder::open(copy.path(), &request).unwrap_err().to_string()
+            EncoderFolder::open(&DataPath::local(copy.path()), &request).unwrap_err().to_string()
         };
         let with =
             |file: &'static str, text: &'static str| move |path: &Path| std::fs::write(path.join(file), text).unwrap();

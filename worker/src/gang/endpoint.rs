@@ -1,8 +1,8 @@
-//! Where peers dial this process: one listener for all gangs that it was ever in.
+//! The address at which peers dial this process: one listener for all of its gangs, past and present.
 //!
-//! Anybody may connect; until a handshake is over a connection is a stranger's. There is room for [`Endpoint::STRANGERS`] of them, a
-//! newcomer takes the place of the oldest, and none stays longer than a handshake may take. So strangers, however many and however
-//! slow, keep no peer out for longer than it takes to dial again.
+//! Anyone may connect; until its handshake is over, a connection counts as a stranger. There is room for
+//! [`Endpoint::STRANGERS`] of them. A newcomer replaces the oldest, and none stays longer than the time limit of a
+//! handshake. So strangers, however many and slow, delay a peer only until it dials again.
 
 use std::collections::{HashMap, VecDeque};
 use std::io;
@@ -17,17 +17,17 @@ use super::handshake::{self, HandshakeError, Hurried, Session};
 use super::member::{MeshConfig, Timing, spawn};
 use crate::event_count::lock;
 
-/// A gang of this process, as those see it who dial.
+/// A gang of this process, from the view of an incoming connection.
 pub(super) trait Gang: std::fmt::Debug + Send + Sync {
-    /// Which gang it is, and who belongs to it.
+    /// Identity and members of the gang.
     fn config(&self) -> &MeshConfig;
-    /// Whether nobody is let in any more.
+    /// Returns true if the gang accepts no more connections.
     fn is_closed(&self) -> bool;
-    /// Takes in a peer that has proved itself.
+    /// Accepts a peer that has authenticated.
     fn attach(self: Arc<Self>, rank: usize, stream: TcpStream, session: Session);
 }
 
-/// Where this process is dialled, for all its gangs.
+/// The listener of this process, for all its gangs.
 #[derive(Debug)]
 pub(crate) struct Endpoint {
     address: SocketAddr,
@@ -36,7 +36,7 @@ pub(crate) struct Endpoint {
     strangers: Mutex<Strangers>,
 }
 
-/// Connections that have not proved themselves, oldest first.
+/// Connections before the end of their handshake, oldest first.
 #[derive(Debug, Default)]
 struct Strangers {
     next: u64,
@@ -44,12 +44,12 @@ struct Strangers {
 }
 
 impl Strangers {
-    /// Takes in a connection and gives its number; the oldest is ended if there is no room.
+    /// Adds a connection and returns its number. Ends the oldest one if there is no room.
     fn admit(&mut self, stream: &TcpStream) -> io::Result<u64> {
         if self.connections.len() >= Endpoint::STRANGERS
             && let Some((_, oldest)) = self.connections.pop_front()
         {
-            // Its thread finds the connection ended.
+            // Its thread sees that the connection has ended.
             let _ = oldest.shutdown(Shutdown::Both);
         }
         let number = self.next;
@@ -58,7 +58,7 @@ impl Strangers {
         Ok(number)
     }
 
-    /// Forgets a connection; false if it was ended to make room.
+    /// Forgets a connection. Returns false if it was ended to make room.
     fn dismiss(&mut self, number: u64) -> bool {
         let before = self.connections.len();
         self.connections.retain(|(other, _)| *other != number);
@@ -67,7 +67,7 @@ impl Strangers {
 }
 
 impl Endpoint {
-    /// Handshakes under way at once.
+    /// Limit of concurrent handshakes.
     pub(super) const STRANGERS: usize = 64;
 
     /// Listens and serves in the background, as long as the process lives.
@@ -80,7 +80,7 @@ impl Endpoint {
         Ok(endpoint)
     }
 
-    /// Where it listens.
+    /// Address of the listener.
     pub(crate) fn address(&self) -> SocketAddr {
         self.address
     }
@@ -93,7 +93,7 @@ impl Endpoint {
 
     fn welcome(&self, number: u64, stream: TcpStream, since: Instant) -> Result<(), HandshakeError> {
         let hurried = &mut Hurried::new(&stream, since)?;
-        let dial = handshake::wanted(hurried)?;
+        let Some(dial) = handshake::wanted(hurried)? else { return Ok(()) };
         let unknown = || HandshakeError::Unknown { task: dial.task.clone(), generation: dial.generation };
         let key = (dial.task.clone(), dial.generation);
         let gang = lock(&self.gangs).get(&key).and_then(Weak::upgrade);
@@ -103,7 +103,7 @@ impl Endpoint {
             return Err(HandshakeError::Ranks { from: dial.from, to: dial.to });
         }
         let session = handshake::accept(hurried, &dial, &config.secret)?;
-        // From here on it is a peer's, and stays when there are too many strangers.
+        // From here on the connection belongs to a peer and no longer makes room for strangers.
         if !lock(&self.strangers).dismiss(number) {
             return Err(HandshakeError::Crowded);
         }
@@ -134,7 +134,8 @@ fn accept(endpoint: &Weak<Endpoint>, listener: &TcpListener) {
                 Err(error @ (HandshakeError::Secret(_) | HandshakeError::Ranks { .. })) => {
                     tracing::warn!("turned a peer away: {error}");
                 }
-                // A peer that heard of the generation before we did will dial again; what strangers do is not news.
+                // A peer that learned of the generation before this member will dial again; failed strangers are not
+                // worth a warning.
                 Err(error) => tracing::debug!("turned a connection away: {error}"),
             }
         });

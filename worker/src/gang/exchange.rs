@@ -1,44 +1,45 @@
-//! What members do together: agree on whose state is newest, and sum gradients.
+//! Operations of all members together: agreeing on the newest state, and summing gradients.
 //!
-//! **Rendezvous.** Everybody tells everybody how many updates its state has seen. A member that is behind the largest number
-//! takes the state of the lowest rank that has it. Members differ by one step at most: a sum is complete for nobody
-//! before everybody has sent its part, so the one that applied it last is at most one ahead of the one that lost a peer
-//! before it had the whole sum. If all have only initialised themselves there is nothing to take: they are equal.
+//! **Rendezvous.** Every member sends all others the number of updates of its state. A member that is behind the
+//! largest number takes the state of the lowest rank that has it. Members differ by at most one step. A sum is complete
+//! for no member before every member has sent its part. So a member with the whole sum is at most one step ahead of one
+//! that lost a peer before that. If all states are freshly initialised, none is taken: they are equal.
 //!
-//! **Exchange.** A reduce-scatter and an all-gather. A member's contiguous slices are a few nodes of the summation tree.
-//! The buffer is cut into one chunk per member; member m receives every node's partial sum of chunk m, follows the tree to
-//! the root, and sends the result to all. Nothing is added in order of arrival. Partial sums are made piece by piece
-//! while they are sent, so the buffer exists once per slice and once for the sum.
+//! **Exchange.** A reduce-scatter and an all-gather. A member's contiguous slices are a few nodes of the summation
+//! tree. The buffer is cut into one chunk per member. Member m receives every node's partial sum of chunk m, follows
+//! the tree to the root, and sends the result to all. No addition depends on the order of arrival. Partial sums are
+//! computed in pieces during sending, so the buffer exists once per slice and once for the sum.
 //!
-//! The wish to drain travels in front of the parts and is ORed by everybody over the same messages, so that all
-//! members stop after the same step.
+//! Drain requests precede the parts. All members OR them over the same messages, so that all stop after the same step.
 
 use std::ops::Range;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use bytemuck::cast_slice;
+use protocol::message::LossCause;
 
 use super::frame::{Frame, Head, Kind, MAX_PAYLOAD, PIECE, Payload};
 use super::mesh::{Halt, Mesh};
 use super::tree::{self, Node};
 
 const DRAIN: u32 = 1;
+const SAVED: u32 = 2;
 
-/// What travels behind a state, namely recorded values that are not known to be stored, is refused if it is larger than this.
+/// Limit of the data that follows a state, namely recorded values that may not be stored yet; larger data is refused.
 const MAX_BEHIND_STATE: u64 = 256 << 20;
 
-/// Whether to give up, asked often.
-pub(crate) type Interrupt<'a> = &'a dyn Fn() -> Option<Halt>;
+/// Returns a reason to give up, if there is one; called often.
+pub(crate) type Interrupt<'a> = &'a (dyn Fn() -> Option<Halt> + Sync);
 
-/// What a rendezvous says to this member.
+/// Result of a rendezvous for this member.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Met {
     Keep,
-    /// This rank sends its state now.
-    Behind(usize),
+    /// This rank now sends its state of this many steps.
+    Behind(usize, u64),
 }
 
-/// Finds the newest state among members and brings everybody to it.
+/// Finds the newest state among the members. Sends it to those behind, or names the rank that sends it to this one.
 pub(crate) fn rendezvous(
     mesh: &Mesh,
     applied: Option<u64>,
@@ -66,15 +67,21 @@ pub(crate) fn rendezvous(
         tracing::info!(step = newest, bytes, receivers = behind.len(), "sending the state to members behind");
         for peer in behind {
             mesh.send(peer, &barrier, Head::new(Kind::StateLength, bytes as u64, 0, 0), &[], interrupt)?;
-            let begun = Instant::now();
+            let (begun, mut sent) = (Instant::now(), 0);
             for piece in state.iter().flat_map(|piece| piece.chunks(MAX_PAYLOAD)) {
-                if begun.elapsed() > mesh.timing.start {
-                    // All others wait for this one.
-                    let limit = mesh.timing.start.as_secs_f32();
-                    mesh.lose(peer, format!("{barrier}: it has not taken the state of {bytes} bytes after {limit} s"));
+                // All other members wait for this one.
+                let (elapsed, limit) = (begun.elapsed(), mesh.timing.start);
+                let is_slow =
+                    elapsed > mesh.timing.slow && elapsed.mul_f64(bytes as f64 / sent.max(1) as f64) > limit / 5;
+                if elapsed > limit || is_slow {
+                    let elapsed = elapsed.as_secs_f32();
+                    let reason =
+                        format!("{barrier}: it has taken {sent} of the state's {bytes} bytes after {elapsed:.0} s");
+                    mesh.lose(peer, LossCause::Slow, reason);
                     return Err(Halt::Peer);
                 }
                 mesh.send(peer, &barrier, Head::new(Kind::State, newest, 0, 0), piece, interrupt)?;
+                sent += piece.len();
             }
         }
         return Ok(Met::Keep);
@@ -82,12 +89,13 @@ pub(crate) fn rendezvous(
     if applied == Some(newest) {
         return Ok(Met::Keep);
     }
-    Ok(Met::Behind(source))
+    Ok(Met::Behind(source, newest))
 }
 
-/// Receives the state that `source` sends after a rendezvous, into `room`. What follows the state is returned.
+/// Receives into `room` the state that `source` sends after a rendezvous. Returns the data that follows the state.
 ///
-/// `directly` it arrives in the room itself, and what is there when it is cut short is of no use; otherwise all of it is received first.
+/// With `directly`, the bytes arrive in `room` itself, which is left unusable by an interrupted transfer. Otherwise all
+/// bytes are received first.
 pub(crate) fn adopt(
     mesh: &Mesh,
     source: usize,
@@ -99,10 +107,8 @@ pub(crate) fn adopt(
     let length = expect(mesh.next(source, &barrier, interrupt)?, Kind::StateLength, mesh, source)?.step;
     let wanted: u64 = room.iter().map(|piece| piece.len() as u64).sum();
     if length < wanted || length - wanted > MAX_BEHIND_STATE {
-        return Err(Halt::Disagree(format!(
-            "{barrier}: `{}` offers a state of {length} bytes, expected {wanted} and at most {MAX_BEHIND_STATE} more; is it the same build?",
-            mesh.config.members[source].worker
-        )));
+        let what = format!("offers a state of {length} bytes, expected {wanted} and at most {MAX_BEHIND_STATE} more");
+        return Err(disagree(mesh, &barrier, source, &what));
     }
     let mut room = Room::new(room);
     let (mut pieces, mut there) = (Vec::new(), 0);
@@ -111,14 +117,13 @@ pub(crate) fn adopt(
         there += frame.bytes().len() as u64;
         let Payload::Bytes(piece) = frame.payload else { unreachable!("a state's frames carry bytes") };
         if piece.is_empty() || there > length {
-            return Err(Halt::Disagree(format!(
-                "{barrier}: a state of {length} bytes arrives in pieces of another length"
-            )));
+            let what = format!("sends a state of {length} bytes in pieces of another length");
+            return Err(disagree(mesh, &barrier, source, &what));
         }
         if directly {
             room.fill(&piece);
         } else {
-            // To put a large state together would take memory for it once more.
+            // Assembling a large state would need its memory a second time.
             pieces.push(piece);
         }
     }
@@ -126,11 +131,11 @@ pub(crate) fn adopt(
     Ok(room.behind)
 }
 
-/// Pieces of memory that are filled one after the other.
+/// Pieces of memory that are filled in order.
 struct Room<'a, 'b> {
     rest: std::slice::IterMut<'a, &'b mut [u8]>,
     now: &'a mut [u8],
-    /// What came when all was full.
+    /// Bytes that arrived after all pieces were full.
     behind: Vec<u8>,
 }
 
@@ -161,7 +166,7 @@ fn rendezvous_barrier(mesh: &Mesh) -> String {
     format!("barrier `rendezvous` of generation {}", mesh.config.generation)
 }
 
-/// What a member brings to an exchange.
+/// Input of a member to an exchange.
 #[derive(Debug)]
 pub(crate) struct Contribution<'a> {
     pub(crate) step: u64,
@@ -169,20 +174,24 @@ pub(crate) struct Contribution<'a> {
     /// The gradients of this member's share, slice by slice; all of one length.
     pub(crate) parts: Vec<(Node, &'a [f32])>,
     pub(crate) drain: bool,
-    /// The last step of which the lead knows that everything recorded is stored.
+    /// True if the member has saved since the last step.
+    pub(crate) saved: bool,
+    /// Time that its share took to compute.
+    pub(crate) computed: Duration,
+    /// The last step up to which rank 0 knows that all rows are stored.
     pub(crate) durable: u64,
 }
 
-/// What an exchange gives.
+/// Result of an exchange.
 #[derive(Debug)]
 pub(crate) struct Total {
     pub(crate) sum: Vec<f32>,
     pub(crate) drain: bool,
-    /// The lead's [`Contribution::durable`].
+    /// [`Contribution::durable`] of rank 0.
     pub(crate) durable: u64,
 }
 
-/// Sums over all slices of a step.
+/// Sums the gradients of all slices of a step.
 pub(crate) fn exchange(mesh: &Mesh, contribution: &Contribution<'_>, interrupt: Interrupt<'_>) -> Result<Total, Halt> {
     let (own, size) = (mesh.config.rank, mesh.size());
     let root = 0..contribution.slices;
@@ -193,41 +202,41 @@ pub(crate) fn exchange(mesh: &Mesh, contribution: &Contribution<'_>, interrupt: 
         return Ok(Total { sum, drain: contribution.drain, durable: contribution.durable });
     }
     let barrier = format!("barrier `exchange` of step {} in generation {}", contribution.step, mesh.config.generation);
-    let disagree = |peer: usize, what: String| {
-        Halt::Disagree(format!("{barrier}: `{}` {what}; is it the same build?", mesh.config.members[peer].worker))
-    };
+    let disagree = |peer: usize, what: String| disagree(mesh, &barrier, peer, &what);
 
-    // Reduce-scatter, our half: everybody's chunk of our nodes.
-    let flags = if contribution.drain { DRAIN } else { 0 };
-    let own_nodes = tree::cover(contribution.slices, &tree::share(contribution.slices, own, size));
-    let mut piece = vec![0.0f32; PIECE];
-    for peer in mesh.others() {
-        let mut greeting = [0u8; 16];
-        greeting[..8].copy_from_slice(&(length.unwrap_or(0) as u64).to_le_bytes());
-        greeting[8..].copy_from_slice(&contribution.durable.to_le_bytes());
-        let head = Head::new(Kind::Begin, contribution.step, number(contribution.slices), flags);
-        mesh.send(peer, &barrier, head, &greeting, interrupt)?;
-        let chunk = length.map_or(0..0, |length| tree::share(length, peer, size));
-        for (n, node) in own_nodes.iter().enumerate() {
-            for (p, range) in pieces(&chunk).enumerate() {
-                let leaves: Vec<(Node, &[f32])> = contribution.parts[within(&contribution.parts, node)]
-                    .iter()
-                    .map(|(slice, part)| (slice.clone(), &part[range.clone()]))
-                    .collect();
-                let out = &mut piece[..range.len()];
-                tree::sum(node, &leaves, out);
-                let head = Head::new(Kind::Part, contribution.step, number(n), number(p));
-                mesh.send(peer, &barrier, head, cast_slice(out), interrupt)?;
-            }
-        }
+    let halt = interrupt;
+    let interrupt: Interrupt<'_> = &|| {
+        mesh.watch_pace();
+        halt()
+    };
+    let own_slices = tree::share(contribution.slices, own, size);
+    mesh.pace.begin(contribution.computed, own_slices.len(), contribution.slices);
+    if contribution.saved {
+        mesh.pace.excuse();
     }
 
-    // Reduce-scatter, their half: our chunk of their nodes.
+    // Reduce-scatter, sending: each peer's chunk of our nodes. All sends run at once, so that a slow peer does not
+    // delay the others.
+    let nodes = tree::cover(contribution.slices, &own_slices);
+    let peers: Vec<usize> = mesh.others().collect();
+    let send = |peer: usize| send_parts(mesh, &barrier, contribution, peer, &nodes, interrupt);
+    if let [peer] = peers[..] {
+        send(peer)?;
+    } else {
+        std::thread::scope(|scope| {
+            let sends: Vec<_> = peers.iter().map(|peer| scope.spawn(|| send(*peer))).collect();
+            let sent = sends.into_iter().map(|thread| thread.join().expect("sending does not panic"));
+            sent.collect::<Vec<_>>().into_iter().collect::<Result<(), Halt>>()
+        })?;
+    }
+
+    // Reduce-scatter, receiving: our chunk of the peers' nodes.
     let mut drain = contribution.drain;
     let mut durable = if own == 0 { contribution.durable } else { 0 };
     let mut theirs: Vec<(Node, Vec<f32>)> = Vec::new();
     for peer in mesh.others() {
-        let begin = expect(mesh.next(peer, &barrier, interrupt)?, Kind::Begin, mesh, peer)?;
+        let (mut came, begin) = mesh.next_timed(peer, &barrier, interrupt)?;
+        let begin = expect(begin, Kind::Begin, mesh, peer)?;
         if begin.step != contribution.step || begin.a != number(contribution.slices) {
             return Err(disagree(
                 peer,
@@ -236,11 +245,15 @@ pub(crate) fn exchange(mesh: &Mesh, contribution: &Contribution<'_>, interrupt: 
         }
         let (at, stored) = numbers(&begin).ok_or_else(|| disagree(peer, "sends a malformed greeting".to_owned()))?;
         drain |= begin.b & DRAIN != 0;
+        if begin.b & SAVED != 0 {
+            mesh.pace.excuse();
+        }
         if peer == 0 {
             durable = stored;
         }
         let nodes = tree::cover(contribution.slices, &tree::share(contribution.slices, peer, size));
         if nodes.is_empty() {
+            mesh.pace.received(peer, came);
             continue;
         }
         let at = usize::try_from(at).map_err(|_| disagree(peer, format!("has a buffer of {at} numbers")))?;
@@ -252,7 +265,9 @@ pub(crate) fn exchange(mesh: &Mesh, contribution: &Contribution<'_>, interrupt: 
         for (n, node) in nodes.into_iter().enumerate() {
             let mut numbers = Vec::with_capacity(chunk.len());
             for (p, range) in pieces(&chunk).enumerate() {
-                let frame = expect(mesh.next(peer, &barrier, interrupt)?, Kind::Part, mesh, peer)?;
+                let (at, frame) = mesh.next_timed(peer, &barrier, interrupt)?;
+                let frame = expect(frame, Kind::Part, mesh, peer)?;
+                came = at;
                 let place = (frame.a, frame.b) == (number(n), number(p));
                 let Some(part) = floats(frame).filter(|part| place && part.len() == range.len()) else {
                     return Err(disagree(peer, format!("sends parts out of place at node {n}, piece {p}")));
@@ -261,10 +276,11 @@ pub(crate) fn exchange(mesh: &Mesh, contribution: &Contribution<'_>, interrupt: 
             }
             theirs.push((node, numbers));
         }
+        mesh.pace.received(peer, came);
     }
-    let length = length.ok_or_else(|| Halt::Disagree(format!("{barrier}: no member has a slice")))?;
+    let length = length.ok_or_else(|| Halt::Fault(format!("{barrier}: no member has a slice")))?;
 
-    // Our chunk, to the root of the tree.
+    // Sum our chunk up to the root of the tree.
     let chunk = tree::share(length, own, size);
     let mut known: Vec<(Node, &[f32])> =
         contribution.parts.iter().map(|(slice, part)| (slice.clone(), &part[chunk.clone()])).collect();
@@ -273,7 +289,7 @@ pub(crate) fn exchange(mesh: &Mesh, contribution: &Contribution<'_>, interrupt: 
     let mut sum = vec![0.0; length];
     tree::sum(&root, &known, &mut sum[chunk.clone()]);
 
-    // All-gather.
+    // All-gather: send our chunk of the sum and receive the others'.
     for peer in mesh.others() {
         for (p, range) in pieces(&chunk).enumerate() {
             let head = Head::new(Kind::Sum, contribution.step, 0, number(p));
@@ -290,7 +306,43 @@ pub(crate) fn exchange(mesh: &Mesh, contribution: &Contribution<'_>, interrupt: 
             sum[range].copy_from_slice(&part);
         }
     }
+    if let Some(slow) = mesh.pace.end(mesh.others()) {
+        mesh.complain(slow);
+    }
     Ok(Total { sum, drain, durable })
+}
+
+/// Sends a peer its chunk of this member's nodes.
+fn send_parts(
+    mesh: &Mesh,
+    barrier: &str,
+    contribution: &Contribution<'_>,
+    peer: usize,
+    nodes: &[Node],
+    interrupt: Interrupt<'_>,
+) -> Result<(), Halt> {
+    let flags = (if contribution.drain { DRAIN } else { 0 }) | (if contribution.saved { SAVED } else { 0 });
+    let length = contribution.parts.first().map(|(_, part)| part.len());
+    let mut greeting = [0u8; 16];
+    greeting[..8].copy_from_slice(&(length.unwrap_or(0) as u64).to_le_bytes());
+    greeting[8..].copy_from_slice(&contribution.durable.to_le_bytes());
+    let head = Head::new(Kind::Begin, contribution.step, number(contribution.slices), flags);
+    mesh.send(peer, barrier, head, &greeting, interrupt)?;
+    let chunk = length.map_or(0..0, |length| tree::share(length, peer, mesh.size()));
+    let mut piece = vec![0.0f32; PIECE.min(chunk.len())];
+    for (n, node) in nodes.iter().enumerate() {
+        for (p, range) in pieces(&chunk).enumerate() {
+            let parts = &contribution.parts[within(&contribution.parts, node)];
+            let leaves: Vec<(Node, &[f32])> =
+                parts.iter().map(|(slice, part)| (slice.clone(), &part[range.clone()])).collect();
+            let out = &mut piece[..range.len()];
+            tree::sum(node, &leaves, out);
+            let head = Head::new(Kind::Part, contribution.step, number(n), number(p));
+            mesh.send(peer, barrier, head, cast_slice(out), interrupt)?;
+        }
+    }
+    mesh.pace.sent(peer);
+    Ok(())
 }
 
 fn number(n: usize) -> u32 {
@@ -309,13 +361,13 @@ fn floats(frame: Frame) -> Option<Vec<f32>> {
     }
 }
 
-/// The pieces in which a chunk travels.
+/// Splits a chunk into the pieces that are sent.
 fn pieces(chunk: &Range<usize>) -> impl Iterator<Item = Range<usize>> + use<> {
     let chunk = chunk.clone();
     chunk.clone().step_by(PIECE).map(move |start| start..(start + PIECE).min(chunk.end))
 }
 
-/// Where in `parts` (slices in order) those of `node` are.
+/// The range in `parts` (slices in order) that belongs to `node`.
 fn within(parts: &[(Node, &[f32])], node: &Node) -> Range<usize> {
     let first = parts.partition_point(|(slice, _)| slice.start < node.start);
     first..first + node.len()
@@ -325,6 +377,13 @@ fn expect(frame: Frame, kind: Kind, mesh: &Mesh, peer: usize) -> Result<Frame, H
     if frame.kind == kind {
         return Ok(frame);
     }
-    let (who, found) = (&mesh.config.members[peer].worker, frame.kind);
-    Err(Halt::Disagree(format!("`{who}` sent a frame of kind {found:?} where {kind:?} was due; is it the same build?")))
+    let what = format!("sent a frame of kind {:?} where {kind:?} was due", frame.kind);
+    Err(disagree(mesh, &format!("generation {}", mesh.config.generation), peer, &what))
+}
+
+/// Gives up a peer whose messages do not match ours.
+pub(crate) fn disagree(mesh: &Mesh, barrier: &str, peer: usize, what: &str) -> Halt {
+    let reason = format!("{barrier}: `{}` {what}; is it the same build?", mesh.config.members[peer].worker);
+    mesh.lose(peer, LossCause::Disagrees, reason.clone());
+    Halt::Disagree(reason)
 }

@@ -2,57 +2,57 @@
 //!
 //! A header of 44 bytes, little-endian, and a payload:
 //!
-//! | at | bytes | what |
+//! | at | bytes | content |
 //! |---|---|---|
-//! | 0 | 4 | magic `STR3`: its last byte is the version of these frames and of what travels in them |
+//! | 0 | 4 | magic `STR4`: its last byte is the version of these frames and of their contents |
 //! | 4 | 1 | kind |
 //! | 5 | 3 | zero |
-//! | 8 | 8 | `step`: the training step, or what the kind says |
+//! | 8 | 8 | `step`: the training step, or another number by kind |
 //! | 16 | 4 | `a`, by kind |
 //! | 20 | 4 | `b`, by kind |
 //! | 24 | 4 | payload length in bytes |
 //! | 28 | 16 | tag: of the frame's number, bytes 0..28 and the payload ([`seal`](super::seal)) |
 //!
-//! A payload is at most [`MAX_PAYLOAD`] long, which is checked before anything is allocated; what is longer travels in
-//! pieces. The payload is encrypted where the connection leaves the machine; the tag has the number of the frame in it, so a frame that
-//! was changed, left out, repeated, reordered or recorded elsewhere ends the connection. Frames of the handshake come before there is a key: their tag
-//! is a checksum, and the handshake proves the rest.
+//! A payload is at most [`MAX_PAYLOAD`] long, which is checked before allocation; longer data is sent in pieces. The
+//! payload is encrypted if the connection leaves the machine. The tag covers the number of the frame. So a frame that
+//! is changed, missing, repeated, reordered or recorded elsewhere ends the connection. Frames of the handshake come
+//! before there is a key: their tag is a checksum, and the handshake proves the rest.
 
 use std::io::{self, Read, Write};
 
 use super::seal::{Seal, TAG};
 
-const MAGIC: [u8; 4] = *b"STR3";
-/// What the tag vouches for, of a header.
+const MAGIC: [u8; 4] = *b"STR4";
+/// Bytes of the header that the tag covers.
 const SIGNED: usize = 28;
 const HEADER: usize = SIGNED + TAG;
 
-/// Longest payload. Small enough that on a slow network too every frame is a timely sign of life.
-pub(crate) const MAX_PAYLOAD: usize = 1 << 20;
+/// Longest payload. At 30 KB/s it takes two seconds, so a sign of life does not wait for long behind it.
+pub(crate) const MAX_PAYLOAD: usize = 64 << 10;
 
-/// Longest payload before a peer has proved who it is.
+/// Longest payload before a peer has authenticated.
 pub(crate) const MAX_HANDSHAKE: usize = 4096;
 
 /// Floats in a full piece of a buffer.
 pub(crate) const PIECE: usize = MAX_PAYLOAD / 4;
 
-/// What a frame is for.
+/// Kind of a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(u8)]
 pub(crate) enum Kind {
-    /// Handshake: a dialer says who it is and whom it wants.
+    /// Handshake: the dialer's identity and the member that it wants.
     Dial = 1,
-    /// Handshake: the one dialled proves itself and asks for a proof.
+    /// Handshake: the dialled member proves itself and asks for a proof.
     Challenge = 2,
     /// Handshake: the dialer's proof.
     Proof = 3,
     /// Handshake: the proof is accepted.
     Welcome = 4,
-    /// Nothing new, but alive; `a` is what the sender is busy with ([`Phase`](super::member::Phase)).
+    /// Keep-alive without news; `a` is the sender's current activity ([`Phase`](super::member::Phase)).
     KeepAlive = 5,
-    /// The sender is done with this generation; `step` is the generation it moves on to, 0 if it leaves the gang.
+    /// The sender has finished this generation; `step` is the generation it moves to, or 0 if it leaves the gang.
     Bye = 6,
-    /// Rendezvous: `step` updates applied, if `a` is 1; nothing but an initialised state if it is 0.
+    /// Rendezvous: if `a` is 1, `step` updates are applied; if `a` is 0, the state is only initialised.
     Applied = 7,
     /// Rendezvous: the length of a state in bytes, in `step`.
     StateLength = 8,
@@ -64,6 +64,8 @@ pub(crate) enum Kind {
     Part = 11,
     /// Exchange: piece `b` of the sender's chunk of the sum.
     Sum = 12,
+    /// A probe from a stranger, answered with the same frame.
+    Probe = 13,
 }
 
 impl Kind {
@@ -81,17 +83,18 @@ impl Kind {
             10 => Self::Begin,
             11 => Self::Part,
             12 => Self::Sum,
+            13 => Self::Probe,
             _ => return None,
         })
     }
 
-    /// Whether the payload is f32 numbers.
+    /// Returns true if the payload consists of f32 numbers.
     fn is_floats(self) -> bool {
         matches!(self, Self::Part | Self::Sum)
     }
 }
 
-/// What a frame carries.
+/// Payload of a received frame.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum Payload {
     Bytes(Vec<u8>),
@@ -107,7 +110,7 @@ impl Payload {
     }
 }
 
-/// A frame as it was received.
+/// A received frame.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Frame {
     pub(crate) kind: Kind,
@@ -118,7 +121,7 @@ pub(crate) struct Frame {
 }
 
 impl Frame {
-    /// The payload of a kind that carries bytes.
+    /// The payload as bytes.
     pub(crate) fn bytes(&self) -> &[u8] {
         match &self.payload {
             Payload::Bytes(bytes) => bytes,
@@ -127,7 +130,7 @@ impl Frame {
     }
 }
 
-/// The part of a frame that is not payload.
+/// The fields of a frame's header that the sender chooses.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Head {
     pub(crate) kind: Kind,
@@ -142,14 +145,14 @@ impl Head {
     }
 }
 
-/// Why no frame could be read.
+/// Failure to read a frame.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum FrameError {
     #[error("the connection was closed")]
     Closed,
     #[error("the connection failed: {0}")]
     Io(#[source] io::Error),
-    #[error("not a frame of this build: it begins with `{}`, expected `STR3`; do both sides run the same build?", .0.escape_ascii())]
+    #[error("not a frame of this build: it begins with `{}`, expected `STR4`; do both sides run the same build?", .0.escape_ascii())]
     Magic([u8; 4]),
     #[error("a frame of unknown kind {0}; do both sides run the same build?")]
     Kind(u8),
@@ -161,7 +164,7 @@ pub(crate) enum FrameError {
     Forged(u64),
 }
 
-/// The bytes of the next frame under `seal`: its header, and its payload as it is sent. A payload that stays readable is not copied.
+/// Encodes the next frame under `seal`: its header and the payload to send. An unencrypted payload is not copied.
 pub(crate) fn sealed<'a>(head: Head, payload: &'a [u8], seal: &'a mut Seal) -> ([u8; HEADER], &'a [u8]) {
     let mut bytes = [0; HEADER];
     let length = u32::try_from(payload.len()).expect("a payload is cut into pieces before");
@@ -181,7 +184,7 @@ pub(crate) fn write(out: &mut impl Write, head: Head, payload: &[u8]) -> io::Res
     write_sealed(out, head, payload, &mut Seal::checksum())
 }
 
-/// Writes a frame at once. For handshakes and tests; a running link interleaves checks (`Link::send`).
+/// Writes a whole frame without waiting. For handshakes and tests; a running link interleaves checks (`Link::send`).
 pub(crate) fn write_sealed(out: &mut impl Write, head: Head, payload: &[u8], seal: &mut Seal) -> io::Result<()> {
     let (header, payload) = sealed(head, payload, seal);
     out.write_all(&header)?;
@@ -193,7 +196,7 @@ pub(crate) fn read(from: &mut impl Read) -> Result<Frame, FrameError> {
     read_sealed(from, MAX_HANDSHAKE, &mut Seal::checksum())
 }
 
-/// Reads the next frame under `seal`, whose payload has at most `limit` bytes.
+/// Reads the next frame under `seal`, with a payload of at most `limit` bytes.
 pub(crate) fn read_sealed(from: &mut impl Read, limit: usize, seal: &mut Seal) -> Result<Frame, FrameError> {
     let mut bytes = [0; HEADER];
     read_all(from, &mut bytes)?;
@@ -230,7 +233,7 @@ fn read_all(from: &mut impl Read, into: &mut [u8]) -> Result<(), FrameError> {
     })
 }
 
-// Floats travel as they lie in memory.
+// Floats are sent in their memory layout.
 #[cfg(target_endian = "big")]
 compile_error!("the collective's wire format is little-endian and is not converted");
 
@@ -306,7 +309,7 @@ mod tests {
     fn an_oversized_frame_is_refused_by_its_header_alone() {
         let mut bytes = sealed(Head::new(Kind::State, 0, 0, 0), &[], &mut seal()).0.to_vec();
         bytes[24..28].copy_from_slice(&u32::MAX.to_le_bytes());
-        // No payload follows: a reader that allocated or waited for it first would answer `Closed`.
+        // No payload follows. A reader that allocated or waited for it first would return `Closed`.
         let error = read_one(&bytes).expect_err("too long");
         assert!(matches!(error, FrameError::TooLong { found: u32::MAX, limit: MAX_PAYLOAD }), "{error}");
     }

@@ -1,13 +1,18 @@
-//! Who may connect: a peer proves that it knows the generation's secret before it can send anything else.
+//! Authentication of connections: a peer proves that it has the generation's secret before it can send anything else.
 //!
-//! Four frames: the dialer names task, generation, ranks and a nonce; the one dialled answers with its own nonce and
-//! `HMAC-SHA256(secret, "accept" .. names .. nonces)`; the dialer checks it and answers with the same under `"dial"`; the
-//! one dialled checks that and welcomes it. Both nonces are fresh, so no recorded proof is of use; the two words differ,
-//! so that a proof cannot be sent back to who made it. The secret itself never travels. The frames that follow are encrypted if one of
-//! the two sees the connection leave its machine; the dialer's view is among the names, so nobody on the way can change it.
+//! The handshake has four frames:
+//!
+//! 1. The dialer sends task, generation, ranks and a nonce.
+//! 2. The dialled side answers with its own nonce and `HMAC-SHA256(secret, "accept" .. names .. nonces)`.
+//! 3. The dialer checks it and answers with the same under `"dial"`.
+//! 4. The dialled side checks that and welcomes the dialer.
+//!
+//! Both nonces are fresh, so a recorded proof is useless. The two words differ, so a proof cannot be reflected to its
+//! author. The secret itself is never sent. The frames that follow are encrypted if one of the two sees the connection
+//! leave its machine. The HMAC covers the dialer's view of this, so an attacker on the path cannot change it.
 
 use std::io::{self, Read, Write};
-use std::net::TcpStream;
+use std::net::{TcpStream, ToSocketAddrs};
 use std::time::{Duration, Instant};
 
 use hmac::{Hmac, Mac};
@@ -19,10 +24,10 @@ use sha2::Sha256;
 use super::frame::{self, FrameError, Head, Kind};
 use super::seal::{Seal, leaves_the_machine};
 
-/// How long a handshake may take, all frames together.
+/// Time limit of a handshake, all frames together.
 pub(super) const PATIENCE: Duration = Duration::from_secs(5);
 
-/// Why a connection did not come about.
+/// Failure to establish a connection.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum HandshakeError {
     #[error(transparent)]
@@ -46,27 +51,27 @@ pub(crate) enum HandshakeError {
 }
 
 impl HandshakeError {
-    /// Whether nothing listens at the address: a process that is gone, not a slow one.
+    /// Returns true if no process listens at the address, so that the peer is gone and not merely slow.
     pub(crate) fn is_refused(&self) -> bool {
         matches!(self, Self::Io(error) if error.kind() == std::io::ErrorKind::ConnectionRefused)
     }
 }
 
-/// What a dialer says first.
+/// The dialer's first message.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub(crate) struct Dial {
     pub(crate) task: TaskId,
     pub(crate) generation: Generation,
     pub(crate) from: usize,
     pub(crate) to: usize,
-    /// Whether the dialer sees the connection leave its machine.
+    /// True if the dialer sees the connection leave its machine.
     leaves: bool,
     nonce: [u8; 16],
 }
 
 #[derive(Serialize, Deserialize)]
 struct Challenge {
-    /// Whether what follows is encrypted.
+    /// True if the frames that follow are encrypted.
     encrypts: bool,
     nonce: [u8; 16],
     proof: [u8; 32],
@@ -83,7 +88,7 @@ fn nonce() -> Result<[u8; 16], HandshakeError> {
     Ok(bytes)
 }
 
-/// What the one dialled adds to what the dialer said.
+/// Fields of the dialled side's answer, beside the dialer's.
 #[derive(Clone, Copy)]
 struct Answer {
     encrypts: bool,
@@ -92,7 +97,7 @@ struct Answer {
 
 fn mac(secret: &str, word: &str, dial: &Dial, answer: &Answer) -> Hmac<Sha256> {
     let mut mac = Hmac::<Sha256>::new_from_slice(secret.as_bytes()).expect("HMAC takes a key of any length");
-    // Lengths in front, so that no two different lists of fields are the same bytes.
+    // Length prefixes, so that two different lists of fields never encode to the same bytes.
     for field in [word.as_bytes(), dial.task.as_str().as_bytes(), &dial.nonce, &answer.nonce] {
         mac.update(&(field.len() as u64).to_le_bytes());
         mac.update(field);
@@ -112,12 +117,12 @@ fn check(secret: &str, word: &str, dial: &Dial, answer: &Answer, proof: &[u8; 32
     mac(secret, word, dial, answer).verify_slice(proof).map_err(|_| HandshakeError::Secret(dial.generation))
 }
 
-/// What vouches for the frames after a handshake.
+/// Seals of the frames after a handshake.
 #[derive(Debug)]
 pub(crate) struct Session {
-    /// For what this side sends.
+    /// Seal of the frames that this side sends.
     pub(crate) sends: Seal,
-    /// For what it receives.
+    /// Seal of the frames that this side receives.
     pub(crate) receives: Seal,
 }
 
@@ -129,7 +134,7 @@ fn session(secret: &str, dial: &Dial, answer: &Answer, dialed: bool) -> Session 
     Session { sends, receives }
 }
 
-/// A connection on which everything has to be over at one moment.
+/// A connection with one deadline for all reads and writes.
 #[derive(Debug)]
 pub(super) struct Hurried<'a> {
     stream: &'a TcpStream,
@@ -137,7 +142,7 @@ pub(super) struct Hurried<'a> {
 }
 
 impl<'a> Hurried<'a> {
-    /// Until [`PATIENCE`] after `since`.
+    /// Sets the deadline to [`PATIENCE`] after `since`.
     pub(super) fn new(stream: &'a TcpStream, since: Instant) -> io::Result<Self> {
         stream.set_nodelay(true)?;
         Ok(Self { stream, until: since + PATIENCE })
@@ -179,7 +184,7 @@ fn receive<T: DeserializeOwned>(stream: &mut Hurried<'_>, expected: Kind) -> Res
     Ok(serde_json::from_slice(frame.bytes())?)
 }
 
-/// The dialer's side.
+/// Performs the dialer's side of a handshake.
 pub(crate) fn dial(
     stream: &TcpStream,
     task: &TaskId,
@@ -200,12 +205,40 @@ pub(crate) fn dial(
     Ok(session(secret, &dial, &answer, true))
 }
 
-/// The first frame of the side that was dialled: what the dialer wants.
-pub(super) fn wanted(stream: &mut Hurried<'_>) -> Result<Dial, HandshakeError> {
-    receive(stream, Kind::Dial)
+/// Reads the first frame on the dialled side and returns the dialer's request. Answers a [`probe`] and returns `None`.
+pub(super) fn wanted(stream: &mut Hurried<'_>) -> Result<Option<Dial>, HandshakeError> {
+    let frame = frame::read(stream)?;
+    match frame.kind {
+        Kind::Dial => Ok(Some(serde_json::from_slice(frame.bytes())?)),
+        Kind::Probe => {
+            send(stream, Kind::Probe, &())?;
+            Ok(None)
+        }
+        found => Err(HandshakeError::Unexpected { expected: Kind::Dial, found }),
+    }
 }
 
-/// The rest of that side. After it the dialer is known to be of the generation.
+/// Checks that a worker listens at `address` and its answers arrive. Does not authenticate it.
+pub(crate) fn probe(address: &str) -> Result<(), HandshakeError> {
+    let stream = connect(address)?;
+    let stream = &mut Hurried::new(&stream, Instant::now())?;
+    send(stream, Kind::Probe, &())?;
+    receive::<()>(stream, Kind::Probe)
+}
+
+/// Connects to the first IP address of `address` that accepts.
+pub(crate) fn connect(address: &str) -> Result<TcpStream, HandshakeError> {
+    let mut last = io::Error::new(io::ErrorKind::AddrNotAvailable, format!("`{address}` names no address"));
+    for socket in address.to_socket_addrs()? {
+        match TcpStream::connect_timeout(&socket, PATIENCE) {
+            Ok(stream) => return Ok(stream),
+            Err(error) => last = error,
+        }
+    }
+    Err(last.into())
+}
+
+/// Performs the rest of the dialled side. On success the dialer is authenticated as a member of the generation.
 pub(super) fn accept(stream: &mut Hurried<'_>, dial: &Dial, secret: &str) -> Result<Session, HandshakeError> {
     let answer = Answer { encrypts: dial.leaves || leaves_the_machine(stream.stream)?, nonce: nonce()? };
     let Answer { encrypts, nonce } = answer;
@@ -240,10 +273,10 @@ mod tests {
         let (stream, _) = listener.accept()?;
         let stream = &mut Hurried::new(&stream, Instant::now())?;
         let dial = wanted(stream)?;
-        accept(stream, &dial, secret)
+        accept(stream, &dial.expect("a dialer"), secret)
     }
 
-    /// Whether what one side sends is what the other receives.
+    /// Returns true if the receiver accepts the sender's frames.
     fn agree(sends: &mut Seal, receives: &mut Seal) -> bool {
         let mut bytes = Vec::new();
         frame::write_sealed(&mut bytes, Head::new(Kind::State, 1, 2, 3), b"payload", sends).expect("memory");
@@ -283,7 +316,7 @@ mod tests {
         assert!(matches!(again, Err(HandshakeError::Secret(_))), "who has only heard it is not: {again:?}");
     }
 
-    /// Somebody on the way who says in the dialer's place that the connection stays on its machine.
+    /// An attacker who claims in the dialer's place that the connection stays on its machine.
     #[test]
     fn encryption_cannot_be_talked_away() {
         let listener = TcpListener::bind("127.0.0.1:0").expect("loopback");
@@ -320,7 +353,7 @@ mod tests {
             Dial { task: TaskId::from("t"), generation: Generation(1), from: 1, to: 0, leaves: false, nonce: [0; 16] };
         send(stream, Kind::Dial, &dial).expect("sent");
         let challenge: Challenge = receive(stream, Kind::Challenge).expect("challenged");
-        // The best a stranger can do: send the other's proof back.
+        // The best option of a stranger: send the other side's proof back.
         send(stream, Kind::Proof, &Proof { proof: challenge.proof }).expect("sent");
         let refused = server.join().expect("no panic");
         assert!(matches!(refused, Err(HandshakeError::Secret(_))), "{refused:?}");
@@ -333,7 +366,7 @@ mod tests {
         let begun = Instant::now();
         let server = thread::spawn(move || answer(&listener, "s"));
         while !server.is_finished() {
-            // A byte at a time: each one alone is in time.
+            // One byte at a time; each read alone is in time.
             let _ = stream.write_all(b"S");
             thread::sleep(PATIENCE / 20);
             assert!(begun.elapsed() < PATIENCE * 2, "it goes on for as long as bytes come");

@@ -1,10 +1,12 @@
-//! Writing to a peer without waiting for it forever.
+//! Writes to a peer that never block forever.
 //!
-//! A socket's write times out after [`BLINK`]; between two tries the writer asks whether the write is still wanted.
+//! A socket's write times out after [`BLINK`], and between two tries the writer checks if the write is still wanted.
+//! The link is given up after a long time without a byte in either direction, so a slow link survives.
 
-use std::io::{self, Write};
+use std::io::{self, Read, Write};
 use std::net::TcpStream;
-use std::sync::Mutex;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use super::frame::{self, Head};
@@ -14,36 +16,102 @@ use crate::event_count::lock;
 /// The write timeout of a link's socket.
 pub(super) const BLINK: Duration = Duration::from_millis(200);
 
-/// Our direction of a connection. Frames of the stage and signs of life take turns.
+/// The outgoing direction of a connection. Frames of the stage and keep-alives take turns.
 #[derive(Debug)]
 pub(super) struct Link {
-    /// To end the connection while somebody writes.
+    /// A clone of the socket, to end the connection during a write.
     pub(super) socket: TcpStream,
     pub(super) writer: Mutex<Writer>,
 }
 
-/// The socket, and what vouches for the frames that go into it.
+/// The socket with the seal of its outgoing frames.
 #[derive(Debug)]
 pub(super) struct Writer {
     pub(super) stream: TcpStream,
     pub(super) seal: Seal,
+    /// Pulse of the incoming direction.
+    pub(super) pulse: Pulse,
+    /// Time of the last keep-alive.
+    pub(super) signed: Instant,
 }
 
 impl Link {
-    /// Writes a frame. `abort` is asked while the socket takes nothing, for up to `patience`.
+    /// Writes a frame, preceded by a keep-alive if that is due. While the socket accepts nothing, calls `abort` between
+    /// tries, for up to `patience` after the last byte in either direction.
     pub(super) fn send(
         &self,
         head: Head,
         payload: &[u8],
+        sign: &Sign,
         patience: Duration,
         abort: &dyn Fn() -> bool,
     ) -> io::Result<()> {
-        lock(&self.writer).send(head, payload, patience, abort)
+        let mut writer = lock(&self.writer);
+        writer.sign(sign, patience, abort)?;
+        writer.send(head, payload, patience, abort)
+    }
+}
+
+/// A keep-alive frame and its interval.
+#[derive(Debug)]
+pub(super) struct Sign {
+    pub(super) head: Head,
+    pub(super) every: Duration,
+}
+
+/// Time of the last byte from a peer.
+#[derive(Debug, Clone)]
+pub(super) struct Pulse {
+    begun: Instant,
+    milliseconds: Arc<AtomicU64>,
+}
+
+impl Pulse {
+    /// Starts now, before any byte of the peer.
+    pub(super) fn new() -> Self {
+        Self { begun: Instant::now(), milliseconds: Arc::default() }
+    }
+
+    /// Records a byte of the peer, or excuses its silence.
+    pub(super) fn beat(&self) {
+        let now = u64::try_from(self.begun.elapsed().as_millis()).unwrap_or(u64::MAX);
+        self.milliseconds.fetch_max(now, Ordering::SeqCst);
+    }
+
+    pub(super) fn last(&self) -> Instant {
+        self.begun + Duration::from_millis(self.milliseconds.load(Ordering::SeqCst))
+    }
+}
+
+/// The incoming direction of a connection. Each byte counts as a sign of life.
+#[derive(Debug)]
+pub(super) struct Heard<'a> {
+    pub(super) stream: &'a TcpStream,
+    pub(super) pulse: Pulse,
+}
+
+impl Read for Heard<'_> {
+    fn read(&mut self, into: &mut [u8]) -> io::Result<usize> {
+        let count = self.stream.read(into)?;
+        if count > 0 {
+            self.pulse.beat();
+        }
+        Ok(count)
     }
 }
 
 impl Writer {
-    /// Writes a whole frame, or an error. After an error the peer takes no more frames: part of one may be on its way.
+    /// Writes a keep-alive if it is due.
+    pub(super) fn sign(&mut self, sign: &Sign, patience: Duration, abort: &dyn Fn() -> bool) -> io::Result<()> {
+        if self.signed.elapsed() < sign.every {
+            return Ok(());
+        }
+        self.signed = Instant::now();
+        self.send(sign.head, &[], patience, abort)
+    }
+
+    /// Writes a whole frame or returns an error. After an error the link is unusable, because part of the frame may
+    /// have been sent.
     pub(super) fn send(
         &mut self,
         head: Head,
@@ -66,7 +134,7 @@ impl Writer {
                         if abort() {
                             return Err(io::ErrorKind::Interrupted.into());
                         }
-                        if moved.elapsed() > patience {
+                        if moved.max(self.pulse.last()).elapsed() > patience {
                             return Err(io::ErrorKind::TimedOut.into());
                         }
                     }

@@ -1,4 +1,4 @@
-//! A member of a gang: whom it belongs with, how patient it is, and what it is busy with.
+//! A member of a gang: its peers, its time limits and its current activity.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU8, Ordering};
@@ -8,19 +8,21 @@ use std::time::Duration;
 use protocol::message::Member;
 use protocol::{Generation, TaskId};
 
-/// How patient members are with each other.
+/// Time limits between members.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Timing {
-    /// A peer that is waited for and silent for so long is lost.
+    /// A peer that is waited for and silent for this long is lost.
     pub(crate) patience: Duration,
-    /// A sign of life goes out so often.
+    /// Interval between keep-alives.
     pub(crate) keep_alive: Duration,
-    /// A peer that shows signs of life but does not take its turn for so long is lost.
+    /// A peer that sends keep-alives but not its part for this long is lost.
     pub(crate) stall: Duration,
-    /// The same for a peer that has only begun: so long it may take to read its inputs, which it fetched before it became a member,
-    /// to initialise itself, and to take over a state.
+    /// Like `stall`, for a peer that has just started. In this time it reads its prefetched inputs, initialises itself
+    /// and takes over a state.
     pub(crate) start: Duration,
-    /// A peer at whose address nothing listens for so long is lost.
+    /// A gang must be slower than one of its members alone for at least this long before a peer is named.
+    pub(crate) slow: Duration,
+    /// A peer whose address refuses connections for this long is lost.
     pub(crate) refused: Duration,
 }
 
@@ -31,19 +33,20 @@ impl Default for Timing {
             keep_alive: Duration::from_secs(3),
             stall: Duration::from_secs(30 * 60),
             start: Duration::from_secs(5 * 60),
+            slow: Duration::from_secs(10),
             refused: Duration::from_secs(3),
         }
     }
 }
 
-/// What a member is busy with. It says so with its signs of life, for the others to know how long to wait for it.
+/// Activity of a member. Its keep-alives carry it, so that the others know how long to wait.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Phase {
-    /// Reads its inputs; was at no rendezvous of this attempt yet.
+    /// Reads its inputs; has not reached a rendezvous of this attempt.
     Starting,
-    /// Computes, or waits for others.
+    /// Computes or waits for others.
     Working,
-    /// Saves or reports: as long as the coordinator takes.
+    /// Saves or reports; lasts as long as the coordinator takes.
     Saving,
 }
 
@@ -57,7 +60,7 @@ impl Phase {
     }
 }
 
-/// The phase of a member, which the stage sets and all meshes of the attempt tell.
+/// The phase of a member. The stage sets it, and all meshes of the attempt report it.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Busy(Arc<AtomicU8>);
 
@@ -71,7 +74,7 @@ impl Busy {
     }
 }
 
-/// All that a mesh needs to know.
+/// Settings of a mesh.
 #[derive(Debug, Clone)]
 pub(crate) struct MeshConfig {
     pub(crate) task: TaskId,
@@ -79,12 +82,12 @@ pub(crate) struct MeshConfig {
     pub(crate) rank: usize,
     pub(crate) members: Vec<Member>,
     pub(crate) secret: String,
-    /// What this member tells the others about itself.
+    /// Activity of this member, reported to the others.
     pub(crate) busy: Busy,
 }
 
 /// Starts a thread of the gang's connections.
 pub(super) fn spawn(name: &str, serve: impl FnOnce() + Send + 'static) {
-    // Without threads there is no worker either.
+    // A worker is useless without threads.
     thread::Builder::new().name(name.to_owned()).stack_size(512 << 10).spawn(serve).expect("a thread can be started");
 }

@@ -1,65 +1,69 @@
 //! The connections of one generation of a gang: rank i dials every rank below it.
 //!
-//! A mesh is opened the moment a generation is known, by threads of its own, so that a member whose stage is deep in a
-//! slice still answers its peers. Each link has a reader thread that queues frames, and one thread sends a sign of life
-//! over every idle link: a peer that computes for minutes is told from one that is gone. Whether a peer is lost is said
-//! when its connection ends without a farewell, or when somebody waits for it and it was silent for too long.
+//! A mesh opens as soon as a generation is known, on threads of its own. So a member whose stage is in the middle of a
+//! slice still answers its peers. Each link has a reader thread that queues frames. One thread sends keep-alives over
+//! all idle links, so that a peer that computes for minutes differs from one that is gone. A peer is lost if its
+//! connection ends without a goodbye, or if a member waits for it and receives no byte for too long.
 //!
-//! Not its job: what the frames mean (`exchange`), and what follows from a loss (the coordinator's decision).
+//! Not its job: the meaning of the frames (`exchange`), and the consequences of a loss (the coordinator's decision).
 
-use std::collections::{BTreeSet, VecDeque};
+use std::collections::VecDeque;
 use std::io;
-use std::net::{Shutdown, TcpStream, ToSocketAddrs};
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::net::{Shutdown, TcpStream};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, Weak};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use protocol::message::Member;
+use protocol::message::{LossCause, LostPeer, Member};
 use protocol::{Generation, WorkerId};
 use tokio::sync::Notify;
 
 use super::endpoint::{Endpoint, Gang};
 use super::frame::{self, Frame, FrameError, Head, Kind, MAX_PAYLOAD};
 use super::handshake::{self, HandshakeError, Session};
-use super::link::{BLINK, Link, Writer};
+use super::link::{BLINK, Heard, Link, Pulse, Sign, Writer};
 use super::member::{MeshConfig, Phase, Timing, spawn};
+use super::pace::Pace;
 use super::seal::Seal;
 use crate::event_count::{EventCount, lock};
 
-/// Frames of a state that are queued for a member that takes them more slowly than they come, each of a megabyte at most.
-const STATE_FRAMES: usize = 16;
+/// Limit of queued frames of a state, for a member that reads slower than they arrive: 16 MiB.
+pub(super) const STATE_FRAMES: usize = (16 << 20) / MAX_PAYLOAD;
 
-/// Why a wait ended without what was waited for.
+/// Reason for the early end of a wait.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum Halt {
-    /// A newer generation has come.
+    /// There is a newer generation.
     Regroup,
     /// The grant has ended.
     Ended(String),
-    /// A peer is gone or has moved on; a newer generation will come.
+    /// A peer is gone or has moved on; a newer generation will follow.
     Peer,
-    /// Peers do not speak of the same thing; a fault.
+    /// A peer's messages do not match; it is given up.
     Disagree(String),
+    /// A fault of this member.
+    Fault(String),
 }
 
 #[derive(Debug, Clone, PartialEq)]
 enum Standing {
-    /// Not connected yet; why the last try failed.
+    /// Not connected yet, with the reason of the last failure.
     Unmet(Option<String>),
     Up,
-    /// It left the gang in good order.
+    /// Has left the gang in good order.
     Left,
-    /// It is at a newer generation.
+    /// Has moved to a newer generation.
     Moved,
-    Lost(String),
+    Lost(LossCause, String),
 }
 
 #[derive(Debug)]
 struct Peer {
     link: Option<Arc<Link>>,
-    inbox: VecDeque<Frame>,
-    heard: Instant,
+    /// Received frames with their times of arrival.
+    inbox: VecDeque<(Instant, Frame)>,
+    pulse: Pulse,
     standing: Standing,
     phase: Phase,
 }
@@ -71,13 +75,16 @@ pub(crate) struct Mesh {
     pub(super) timing: Timing,
     peers: Mutex<Vec<Peer>>,
     event_count: Arc<EventCount>,
-    /// Wakes the poll, which reports what is lost.
+    /// Wakes the poll, which reports lost peers.
     wake: Arc<Notify>,
+    /// The rank that the stage waits for, plus one; 0 if it waits for none.
+    waits_for: AtomicUsize,
+    pub(super) pace: Pace,
     closed: AtomicBool,
 }
 
 impl Mesh {
-    /// Begins to connect, in the background.
+    /// Creates the mesh and connects in the background.
     pub(crate) fn open(
         config: MeshConfig,
         endpoint: &Arc<Endpoint>,
@@ -87,13 +94,15 @@ impl Mesh {
         let peer = |_: &Member| Peer {
             link: None,
             inbox: VecDeque::new(),
-            heard: Instant::now(),
+            pulse: Pulse::new(),
             standing: Standing::Unmet(None),
             phase: Phase::Working,
         };
         let peers = Mutex::new(config.members.iter().map(peer).collect());
         let timing = endpoint.timing;
-        let mesh = Arc::new(Self { config, timing, peers, event_count, wake, closed: AtomicBool::new(false) });
+        let (waits_for, closed) = (AtomicUsize::new(0), AtomicBool::new(false));
+        let pace = Pace::new(config.members.len(), timing.slow);
+        let mesh = Arc::new(Self { config, timing, peers, event_count, wake, waits_for, pace, closed });
         if mesh.size() > 1 {
             let gang: Arc<dyn Gang> = mesh.clone();
             endpoint.announce(&mesh.config, Arc::downgrade(&gang));
@@ -107,53 +116,88 @@ impl Mesh {
         mesh
     }
 
-    /// How many members.
+    /// Number of members.
     pub(crate) fn size(&self) -> usize {
         self.config.members.len()
     }
 
-    /// Ranks of the others, beginning after ours, so that not all send to the same one first.
+    /// Ranks of the others, starting after this one, so that not all members send to the same one first.
     pub(crate) fn others(&self) -> impl Iterator<Item = usize> + use<> {
         let (rank, size) = (self.config.rank, self.size());
         (1..size).map(move |i| (rank + i) % size)
     }
 
-    /// Who could not be reached in this generation.
-    pub(crate) fn lost(&self) -> BTreeSet<WorkerId> {
+    /// The members with which this one cannot continue in this generation.
+    pub(crate) fn lost(&self) -> Vec<LostPeer> {
         let peers = lock(&self.peers);
-        let lost =
-            peers.iter().zip(&self.config.members).filter(|(peer, _)| matches!(peer.standing, Standing::Lost(_)));
-        lost.map(|(_, member)| member.worker.clone()).collect()
+        let lost = peers.iter().zip(&self.config.members).filter_map(|(peer, member)| match &peer.standing {
+            Standing::Lost(cause, _) => Some(LostPeer { worker: member.worker.clone(), cause: *cause }),
+            Standing::Unmet(_) | Standing::Up | Standing::Left | Standing::Moved => None,
+        });
+        let slow = self.pace.slow().into_iter().filter(|rank| !matches!(peers[*rank].standing, Standing::Lost(..)));
+        let slow = slow.map(|rank| LostPeer { worker: self.name(rank).clone(), cause: LossCause::Slow });
+        lost.chain(slow).collect()
     }
 
-    /// Who is missing, each with the barrier at which and the reason for which it was given up.
+    fn sign(&self) -> Sign {
+        let head = Head::new(Kind::KeepAlive, 0, self.config.busy.phase() as u32, 0);
+        // A thread that wakes just before a keep-alive is due would delay it by a whole interval.
+        Sign { head, every: self.timing.keep_alive * 3 / 4 }
+    }
+
+    /// Names the peers that delay the current exchange for too long. None is named while a member saves.
+    pub(super) fn watch_pace(&self) {
+        if lock(&self.peers).iter().any(|peer| peer.phase != Phase::Working) {
+            return self.pace.excuse();
+        }
+        let waits_for = self.waits_for.load(Ordering::SeqCst).checked_sub(1);
+        self.pace.overdue(self.others(), waits_for).into_iter().for_each(|peer| self.complain(peer));
+    }
+
+    /// Makes the next poll report that this gang is slower than its member alone, because of `rank`. The connection
+    /// stays.
+    pub(super) fn complain(&self, rank: usize) {
+        let (task, generation) = (&self.config.task, self.config.generation);
+        tracing::warn!(%task, %generation, peer = %self.name(rank), "the gang is slower than this member alone; it waits for this peer");
+        self.wake.notify_one();
+    }
+
+    /// The member that the stage is waiting for.
+    pub(crate) fn waits_for(&self) -> Option<WorkerId> {
+        let rank = self.waits_for.load(Ordering::SeqCst).checked_sub(1)?;
+        Some(self.name(rank).clone())
+    }
+
+    /// The lost members, each with the barrier and the reason.
     pub(crate) fn missing(&self) -> Vec<String> {
         let peers = lock(&self.peers);
         let missing = peers.iter().enumerate().filter_map(|(rank, peer)| match &peer.standing {
-            Standing::Lost(reason) => Some(format!("{} (rank {rank}): {reason}", self.name(rank))),
+            Standing::Lost(_, reason) => Some(format!("{} (rank {rank}): {reason}", self.name(rank))),
             Standing::Unmet(_) | Standing::Up | Standing::Left | Standing::Moved => None,
         });
         missing.collect()
     }
 
-    /// Gives up everybody else who is as silent as the one just given up, so that all who are missing are named at once.
+    /// Gives up all other peers that are as silent as the one just given up, so that all missing members are named at
+    /// once.
     fn lose_the_silent(&self, barrier: &str, awake: Instant) {
         let now = Instant::now();
         let silent: Vec<usize> = {
             let peers = lock(&self.peers);
             let silent = |(rank, peer): (usize, &Peer)| {
                 let waits = matches!(peer.standing, Standing::Unmet(_) | Standing::Up) && rank != self.config.rank;
-                (waits && now.duration_since(peer.heard.max(awake)) > self.timing.patience).then_some(rank)
+                (waits && now.duration_since(peer.pulse.last().max(awake)) > self.timing.patience).then_some(rank)
             };
             peers.iter().enumerate().filter_map(silent).collect()
         };
         for rank in silent {
-            self.lose(rank, format!("{barrier}: no sign of life for {} s", self.timing.patience.as_secs_f32()));
+            let reason = format!("{barrier}: no sign of life for {} s", self.timing.patience.as_secs_f32());
+            self.lose(rank, LossCause::Unreachable, reason);
         }
     }
 
-    /// Says goodbye and lets go. What was sent still arrives: only our direction of each connection is closed, and the
-    /// readers drain the other until the peer does the same.
+    /// Says goodbye and closes. Frames already sent still arrive: only our direction of each connection is closed, and
+    /// the readers drain the other until the peer closes it.
     pub(crate) fn close(&self, next: Option<Generation>) {
         if self.closed.swap(true, Ordering::SeqCst) {
             return;
@@ -162,7 +206,7 @@ impl Mesh {
         for link in links {
             if let Ok(mut writer) = link.writer.try_lock() {
                 let head = Head::new(Kind::Bye, next.map_or(0, |g| g.0), 0, 0);
-                // A farewell is a courtesy: a peer that does not get it finds the connection closed.
+                // A goodbye is optional: a peer that does not receive it sees the connection close.
                 let _ = writer.send(head, &[], Duration::ZERO, &|| true);
                 let _ = writer.stream.shutdown(Shutdown::Write);
             }
@@ -173,19 +217,19 @@ impl Mesh {
         self.closed.load(Ordering::SeqCst)
     }
 
-    /// Frames from `rank` that nobody has taken.
+    /// Number of unread frames from `rank`.
     #[cfg(test)]
     pub(crate) fn queued(&self, rank: usize) -> usize {
         lock(&self.peers)[rank].inbox.len()
     }
 
-    /// Ends every connection without a word, as the death of the process would.
+    /// Ends every connection without a goodbye, as the death of the process would.
     #[cfg(test)]
     pub(crate) fn sever(&self) {
         self.closed.store(true, Ordering::SeqCst);
         for peer in lock(&self.peers).iter_mut() {
             if let Some(link) = peer.link.take() {
-                // The writer may be held by a thread that is blocked on it; a clone of the socket ends that too.
+                // A blocked thread may hold the writer; shutting down a clone of the socket ends that write too.
                 let _ = link.socket.shutdown(Shutdown::Both);
             }
         }
@@ -196,17 +240,17 @@ impl Mesh {
         &self.config.members[rank].worker
     }
 
-    /// Gives a peer up and has the next poll say so.
-    pub(super) fn lose(&self, rank: usize, reason: String) {
+    /// Gives a peer up and makes the next poll report it.
+    pub(super) fn lose(&self, rank: usize, cause: LossCause, reason: String) {
         if self.is_closed() {
             return;
         }
         {
             let peer = &mut lock(&self.peers)[rank];
-            if matches!(peer.standing, Standing::Lost(_) | Standing::Moved) {
+            if matches!(peer.standing, Standing::Lost(..) | Standing::Moved) {
                 return;
             }
-            peer.standing = Standing::Lost(reason.clone());
+            peer.standing = Standing::Lost(cause, reason.clone());
             if let Some(link) = peer.link.take() {
                 let _ = link.socket.shutdown(Shutdown::Write);
             }
@@ -230,7 +274,8 @@ impl Mesh {
                     let since =
                         if error.is_refused() { *refused.get_or_insert_with(Instant::now) } else { Instant::now() };
                     if since.elapsed() > self.timing.refused {
-                        self.lose(rank, format!("nothing listens at {}", self.config.members[rank].peer_address));
+                        let reason = format!("nothing listens at {}", self.config.members[rank].peer_address);
+                        self.lose(rank, LossCause::Unreachable, reason);
                         return;
                     }
                     if !error.is_refused() {
@@ -247,33 +292,32 @@ impl Mesh {
     }
 
     fn connect(&self, rank: usize) -> Result<(TcpStream, Session), HandshakeError> {
-        let address = &self.config.members[rank].peer_address;
-        let mut last = io::Error::new(io::ErrorKind::AddrNotAvailable, format!("`{address}` names no address"));
-        for socket in address.to_socket_addrs()? {
-            match TcpStream::connect_timeout(&socket, Duration::from_secs(5)) {
-                Ok(stream) => {
-                    let MeshConfig { task, generation, rank: from, secret, .. } = &self.config;
-                    let session = handshake::dial(&stream, task, *generation, *from, rank, secret)?;
-                    return Ok((stream, session));
-                }
-                Err(error) => last = error,
-            }
-        }
-        Err(last.into())
+        let stream = handshake::connect(&self.config.members[rank].peer_address)?;
+        let MeshConfig { task, generation, rank: from, secret, .. } = &self.config;
+        let session = handshake::dial(&stream, task, *generation, *from, rank, secret)?;
+        Ok((stream, session))
     }
 
-    /// Takes a connection whose other side has proved to be `rank`.
+    /// Adds a connection whose other side has authenticated as `rank`.
     fn attach(self: &Arc<Self>, rank: usize, stream: TcpStream, session: Session) {
         let Session { sends, receives } = session;
+        let pulse = lock(&self.peers)[rank].pulse.clone();
         let both = stream.try_clone().and_then(|reader| {
-            // Signs of life come far more often than this; it only keeps a reader from outliving everything.
+            // Keep-alives arrive far more often than this; the timeout only bounds the life of a reader.
             reader.set_read_timeout(Some(self.timing.patience * 3))?;
             stream.set_write_timeout(Some(BLINK))?;
-            Ok((reader, Link { socket: stream.try_clone()?, writer: Mutex::new(Writer { stream, seal: sends }) }))
+            let socket = stream.try_clone()?;
+            Ok((
+                reader,
+                Link {
+                    socket,
+                    writer: Mutex::new(Writer { stream, seal: sends, pulse: pulse.clone(), signed: Instant::now() }),
+                },
+            ))
         });
         let (reader, link) = match both {
             Ok(both) => both,
-            Err(error) => return self.lose(rank, error.to_string()),
+            Err(error) => return self.lose(rank, LossCause::Unreachable, error.to_string()),
         };
         {
             let mut peers = lock(&self.peers);
@@ -282,22 +326,23 @@ impl Mesh {
             }
             let peer = &mut peers[rank];
             peer.link = Some(Arc::new(link));
-            peer.heard = Instant::now();
+            peer.pulse.beat();
             peer.standing = Standing::Up;
         }
         self.event_count.notify();
         let mesh = Arc::downgrade(self);
-        spawn("gang-read", move || read(&mesh, rank, reader, receives));
+        spawn("gang-read", move || read(&mesh, rank, &reader, receives, pulse));
     }
 
-    /// Waits while as much of a state is queued as may be: the rest stays with its sender, who sends nothing else meanwhile. Parts of a sum
-    /// are queued without bound, for all members send theirs before they take others'.
+    /// Waits while the queue holds its limit of a state's frames. The rest stays with its sender, who sends nothing
+    /// else meanwhile. Parts of a sum are queued without a limit, because all members send theirs before they read the
+    /// others'.
     fn await_room(&self, rank: usize) {
         loop {
             let ticket = self.event_count.ticket();
             {
                 let peer = &mut lock(&self.peers)[rank];
-                peer.heard = Instant::now();
+                peer.pulse.beat();
                 if self.is_closed() || peer.standing != Standing::Up || peer.inbox.len() < STATE_FRAMES {
                     return;
                 }
@@ -306,7 +351,7 @@ impl Mesh {
         }
     }
 
-    /// What a frame means for the connection; those of the exchange are queued.
+    /// Handles a received frame; frames of the exchange are queued.
     fn receive(&self, rank: usize, frame: Frame) {
         if frame.kind == Kind::State {
             self.await_room(rank);
@@ -316,20 +361,19 @@ impl Mesh {
         }
         {
             let peer = &mut lock(&self.peers)[rank];
-            peer.heard = Instant::now();
             match frame.kind {
                 Kind::KeepAlive => {
                     peer.phase = Phase::read(frame.a);
                     return;
                 }
                 Kind::Bye => peer.standing = if frame.step == 0 { Standing::Left } else { Standing::Moved },
-                _ => peer.inbox.push_back(frame),
+                _ => peer.inbox.push_back((Instant::now(), frame)),
             }
         }
         self.event_count.notify();
     }
 
-    /// Waits for a link to `rank` and sends over it. `interrupt` says whether to give up.
+    /// Waits for a link to `rank` and sends over it. `interrupt` returns a reason to give up.
     pub(crate) fn send(
         &self,
         rank: usize,
@@ -339,25 +383,35 @@ impl Mesh {
         interrupt: &dyn Fn() -> Option<Halt>,
     ) -> Result<(), Halt> {
         let link = self.wait(rank, barrier, interrupt, |peer| peer.link.clone())?;
-        link.send(head, payload, self.timing.patience, &|| interrupt().is_some()).map_err(|error| {
+        link.send(head, payload, &self.sign(), self.timing.patience, &|| interrupt().is_some()).map_err(|error| {
             if let Some(halt) = interrupt() {
                 return halt;
             }
-            self.lose(rank, format!("{barrier}: sending failed: {error}"));
+            self.lose(rank, LossCause::Unreachable, format!("{barrier}: sending failed: {error}"));
             Halt::Peer
         })
     }
 
-    /// The next frame from `rank`. What came before a connection ended is still handed out.
+    /// Returns the next frame from `rank`. Frames that arrived before a connection ended are still returned.
     pub(crate) fn next(&self, rank: usize, barrier: &str, interrupt: &dyn Fn() -> Option<Halt>) -> Result<Frame, Halt> {
-        let frame = self.wait(rank, barrier, interrupt, |peer| peer.inbox.pop_front())?;
+        self.next_timed(rank, barrier, interrupt).map(|(_, frame)| frame)
+    }
+
+    /// Like [`Self::next`], with the time of arrival.
+    pub(super) fn next_timed(
+        &self,
+        rank: usize,
+        barrier: &str,
+        interrupt: &dyn Fn() -> Option<Halt>,
+    ) -> Result<(Instant, Frame), Halt> {
+        let (at, frame) = self.wait(rank, barrier, interrupt, |peer| peer.inbox.pop_front())?;
         if frame.kind == Kind::State {
             self.event_count.notify();
         }
-        Ok(frame)
+        Ok((at, frame))
     }
 
-    /// Waits for as long as `rank` lives, and after it has left in good order for what the coordinator says about that.
+    /// Waits as long as `rank` lives. If it leaves in good order, waits for the coordinator's response to that.
     pub(crate) fn watch(&self, rank: usize, barrier: &str, interrupt: &dyn Fn() -> Option<Halt>) -> Halt {
         let Err(halt) = self.look_at(rank, barrier, interrupt, Patience::WhileItLives, |_| None::<Frame>) else {
             unreachable!("nothing is taken")
@@ -383,18 +437,23 @@ impl Mesh {
         patience: Patience,
         mut take: impl FnMut(&mut Peer) -> Option<T>,
     ) -> Result<T, Halt> {
-        const GLANCE: Duration = Duration::from_millis(250);
+        const CHECK_INTERVAL: Duration = Duration::from_millis(250);
+        if let Some(taken) = take(&mut lock(&self.peers)[rank]) {
+            return Ok(taken);
+        }
+        let _waiting = Waiting::on(self, rank);
         let mut begun = Instant::now();
-        // If we were stopped ourselves, the peers were not silent: we were deaf.
+        // If this process was stopped itself, the silence was its own and not the peers'.
         let mut awake = begun;
         let mut looked = begun;
         loop {
             let ticket = self.event_count.ticket();
             let now = Instant::now();
-            if now.duration_since(looked) > GLANCE * 8 {
+            if now.duration_since(looked) > CHECK_INTERVAL * 8 {
                 awake = now;
             }
             looked = now;
+            // The end of the wait, with the reason to give the peer up if it is not lost already.
             let verdict = {
                 let peer = &mut lock(&self.peers)[rank];
                 if let Some(taken) = take(peer) {
@@ -403,20 +462,20 @@ impl Mesh {
                 if patience == Patience::WhileItLives || peer.phase == Phase::Saving {
                     begun = now;
                 }
-                let (silent, waited) = (now.duration_since(peer.heard.max(awake)), now.duration_since(begun));
+                let (silent, waited) = (now.duration_since(peer.pulse.last().max(awake)), now.duration_since(begun));
                 let too_late = |limit: Duration, how: &str| {
-                    (waited > limit).then(|| format!("{barrier}: {how} after {} s", limit.as_secs_f32()))
+                    (waited > limit).then(|| Some(format!("{barrier}: {how} after {} s", limit.as_secs_f32())))
                 };
                 match &peer.standing {
-                    Standing::Lost(_) | Standing::Moved => return Err(interrupt().unwrap_or(Halt::Peer)),
+                    Standing::Lost(..) | Standing::Moved => Some(None),
                     Standing::Left if patience == Patience::WhileItLives => None,
-                    Standing::Left => Some(format!("{barrier}: it has left")),
+                    Standing::Left => Some(Some(format!("{barrier}: it has left"))),
                     Standing::Unmet(why) if silent > self.timing.patience => {
                         let why = why.as_deref().unwrap_or("it did not call");
-                        Some(format!("{barrier}: not met within {} s: {why}", self.timing.patience.as_secs_f32()))
+                        Some(Some(format!("{barrier}: not met within {} s: {why}", self.timing.patience.as_secs_f32())))
                     }
                     Standing::Up if silent > self.timing.patience => {
-                        Some(format!("{barrier}: no sign of life for {} s", self.timing.patience.as_secs_f32()))
+                        Some(Some(format!("{barrier}: no sign of life for {} s", self.timing.patience.as_secs_f32())))
                     }
                     Standing::Up if peer.phase == Phase::Starting => {
                         too_late(self.timing.start, "alive, but has not started")
@@ -425,25 +484,43 @@ impl Mesh {
                     Standing::Unmet(_) => None,
                 }
             };
+            // Never under the lock: an interrupt looks at the peers too.
             if let Some(halt) = interrupt() {
                 return Err(halt);
             }
             if let Some(reason) = verdict {
-                self.lose(rank, reason);
+                let Some(reason) = reason else { return Err(Halt::Peer) };
+                self.lose(rank, LossCause::Unreachable, reason);
                 self.lose_the_silent(barrier, awake);
                 return Err(Halt::Peer);
             }
-            self.event_count.wait(ticket, GLANCE);
+            self.event_count.wait(ticket, CHECK_INTERVAL);
         }
     }
 }
 
-/// How long a peer is waited for.
+/// While it lives, the mesh reports the peer that the stage waits for.
+struct Waiting<'a>(&'a Mesh);
+
+impl<'a> Waiting<'a> {
+    fn on(mesh: &'a Mesh, rank: usize) -> Self {
+        mesh.waits_for.store(rank + 1, Ordering::SeqCst);
+        Self(mesh)
+    }
+}
+
+impl Drop for Waiting<'_> {
+    fn drop(&mut self) {
+        self.0.waits_for.store(0, Ordering::SeqCst);
+    }
+}
+
+/// Limit of a wait for a peer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Patience {
-    /// Until it should have had its turn ([`Timing::stall`], [`Timing::start`]).
+    /// Until its turn is overdue ([`Timing::stall`], [`Timing::start`]).
     ForItsTurn,
-    /// For as long as it shows signs of life.
+    /// As long as it sends keep-alives.
     WhileItLives,
 }
 
@@ -453,14 +530,14 @@ impl Drop for Mesh {
     }
 }
 
-/// Threads that outlive their mesh's owner hold it weakly.
-fn read(mesh: &Weak<Mesh>, rank: usize, mut stream: TcpStream, mut seal: Seal) {
-    let mut buffered = io::BufReader::with_capacity(64 << 10, &mut stream);
+/// Reads frames from a link. Threads that outlive their mesh's owner hold it weakly.
+fn read(mesh: &Weak<Mesh>, rank: usize, stream: &TcpStream, mut seal: Seal, pulse: Pulse) {
+    let mut buffered = io::BufReader::with_capacity(64 << 10, Heard { stream, pulse });
     loop {
         let frame = frame::read_sealed(&mut buffered, MAX_PAYLOAD, &mut seal);
         let Some(mesh) = mesh.upgrade() else {
-            // Our side is closed. Until the peer's is, what it sends must be taken, or the kernel resets the connection
-            // and the peer may lose what we sent last.
+            // Our side is closed. Keep reading until the peer closes too. Otherwise the kernel resets the connection
+            // and the peer may lose our last frames.
             let _ = io::copy(&mut buffered, &mut io::sink());
             return;
         };
@@ -469,10 +546,10 @@ fn read(mesh: &Weak<Mesh>, rank: usize, mut stream: TcpStream, mut seal: Seal) {
             Err(error) => {
                 let parted = matches!(lock(&mesh.peers)[rank].standing, Standing::Left | Standing::Moved);
                 if !parted {
-                    mesh.lose(rank, error.to_string());
+                    mesh.lose(rank, LossCause::Unreachable, error.to_string());
                 }
                 if !matches!(error, FrameError::Closed) {
-                    // The other side must not go on talking into the void.
+                    // The other side must not continue to send.
                     let _ = stream.shutdown(Shutdown::Both);
                 }
                 return;
@@ -490,11 +567,10 @@ fn keep_alive(mesh: &Weak<Mesh>, timing: Timing) {
         }
         let links: Vec<_> = lock(&mesh.peers).iter().map(|peer| peer.link.clone()).collect();
         for link in links.into_iter().flatten() {
-            // A link that is being written to shows that we are alive.
+            // A thread that is writing to a link sends the keep-alive itself.
             if let Ok(mut writer) = link.writer.try_lock() {
-                // An error shows up where somebody waits for the peer.
-                let head = Head::new(Kind::KeepAlive, 0, mesh.config.busy.phase() as u32, 0);
-                let _ = writer.send(head, &[], timing.patience, &|| mesh.is_closed());
+                // An error becomes visible to a thread that waits for the peer.
+                let _ = writer.sign(&mesh.sign(), timing.patience, &|| mesh.is_closed());
             }
         }
     }

@@ -1,12 +1,13 @@
-//! Gangs: connections between members, what they agree on, and how they sum.
+//! Gangs: connections between members, agreement on states, and sums of gradients.
 
 pub(crate) mod endpoint;
 pub(crate) mod exchange;
 mod frame;
-mod handshake;
+pub(crate) mod handshake;
 mod link;
 pub(crate) mod member;
 pub(crate) mod mesh;
+mod pace;
 mod seal;
 pub(crate) mod tree;
 

@@ -1,11 +1,13 @@
-//! What protects the frames of a connection: a tag that only the peer can make, and encryption where the connection leaves this machine.
+//! Protection of a connection's frames: a tag that only the peer can make, and encryption if the connection leaves this
+//! machine.
 //!
-//! Each direction of each connection has a key of its own, which the handshake derives from the generation's secret and two fresh nonces.
-//! Frames are numbered from 0; the number is not sent. It is part of what a tag vouches for and the nonce of the cipher, so a
-//! nonce never repeats under a key, and a frame that was changed, left out, repeated or reordered has another tag.
+//! Each direction of each connection has its own key, which the handshake derives from the generation's secret and two
+//! fresh nonces. Frames are numbered from 0; the number is not sent. The tag covers it, and it is the nonce of the
+//! cipher, so a nonce never repeats under a key. A frame that is changed, missing, repeated or reordered has another
+//! tag.
 //!
-//! The cipher is AES-256-GCM of `ring`, which TLS brings with it. The header of a frame is authenticated and stays readable: an observer sees
-//! kinds, steps and lengths of frames, and no weights, gradients or values.
+//! The cipher is AES-256-GCM of `ring`, which TLS already depends on. The header of a frame is authenticated but
+//! readable. An observer sees kinds, steps and lengths of frames, but no weights, gradients or values.
 
 use std::net::TcpStream;
 
@@ -14,21 +16,20 @@ use ring::aead::{AES_256_GCM, Aad, LessSafeKey, Nonce, Tag, UnboundKey};
 /// Bytes of a tag.
 pub(super) const TAG: usize = 16;
 
-/// The protection of one direction of a connection, and the number of the next frame.
+/// The protection of one direction of a connection, with the number of the next frame.
 #[derive(Clone)]
 pub(crate) struct Seal {
     means: Means,
     next: u64,
-    /// The encrypted payload of the frame that is sent.
+    /// The encrypted payload of the frame being sent.
     encrypted: Vec<u8>,
 }
 
 #[derive(Clone)]
 enum Means {
-    /// Readable, and vouched for by keyed BLAKE3.
+    /// Readable, with a tag of keyed BLAKE3.
     Tagged([u8; 32]),
-    /// Encrypted and vouched for.
-    /// Boxed: an expanded key takes 544 bytes.
+    /// Encrypted, with a tag. Boxed, because an expanded key takes 544 bytes.
     Encrypted(Box<LessSafeKey>),
 }
 
@@ -40,23 +41,23 @@ impl std::fmt::Debug for Seal {
 }
 
 impl Seal {
-    /// Frames that stay readable, under `key`, which no other direction of a connection has.
+    /// Seals readable frames under `key`, which must be unique to this direction of the connection.
     pub(crate) fn tagged(key: [u8; 32]) -> Self {
         Self { means: Means::Tagged(key), next: 0, encrypted: Vec::new() }
     }
 
-    /// Frames that are encrypted under `key`, which no other direction of a connection has.
+    /// Seals encrypted frames under `key`, which must be unique to this direction of the connection.
     pub(crate) fn encrypted(key: [u8; 32]) -> Self {
         let key = UnboundKey::new(&AES_256_GCM, &key).expect("the cipher's keys have 32 bytes");
         Self { means: Means::Encrypted(Box::new(LessSafeKey::new(key))), next: 0, encrypted: Vec::new() }
     }
 
-    /// For a single frame of a handshake: a checksum.
+    /// Seals a single frame of a handshake with a checksum.
     pub(super) fn checksum() -> Self {
         Self::tagged([0; 32])
     }
 
-    /// The tag of the next frame, and its payload as it is sent. Without encryption the payload is not copied.
+    /// Returns the tag of the next frame and the payload to send. Without encryption, the payload is not copied.
     pub(super) fn seal<'a>(&'a mut self, header: &[u8], payload: &'a [u8]) -> ([u8; TAG], &'a [u8]) {
         let number = self.advance();
         match &self.means {
@@ -79,7 +80,7 @@ impl Seal {
                 let tag = tag(key, number, header, payload);
                 let mut claimed = *tag.as_bytes();
                 claimed[..TAG].copy_from_slice(&found);
-                // In constant time: the time must not say how much of a guessed tag is right.
+                // In constant time, so that the time does not reveal a partly correct guess of a tag.
                 if tag == blake3::Hash::from_bytes(claimed) { Ok(()) } else { Err(number) }
             }
             Means::Encrypted(key) => key
@@ -114,8 +115,8 @@ fn cut(tag: blake3::Hash) -> [u8; TAG] {
     bytes
 }
 
-/// Whether others may see what passes over `stream`: its ends have different addresses. Traffic between two processes of one
-/// machine stays in its kernel.
+/// Returns true if the ends of `stream` have different addresses, so that others may see the traffic. Traffic between
+/// two processes of one machine stays in its kernel.
 pub(super) fn leaves_the_machine(stream: &TcpStream) -> std::io::Result<bool> {
     Ok(stream.local_addr()?.ip().to_canonical() != stream.peer_addr()?.ip().to_canonical())
 }

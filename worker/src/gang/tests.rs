@@ -1,6 +1,7 @@
-//! Gangs of threads over loopback, with a coordinator of a few lines that does what the real one does about losses.
+//! Gangs of threads over loopback, with a minimal coordinator that handles losses as the real one does.
 
 mod eavesdropper;
+mod relay;
 mod silence;
 mod states;
 mod strangers;
@@ -13,7 +14,7 @@ use std::time::{Duration, Instant};
 
 use burn::tensor::Device;
 use proptest::prelude::*;
-use protocol::message::{Assignment, Grant, Member, Role, StageTask};
+use protocol::message::{Assignment, Grant, LossCause, LostPeer, Member, Role, StageTask};
 use protocol::stage::{CheckpointPolicy, StageSettings, TrainVae};
 use protocol::{Attempt, Fence, Generation, Incarnation, RunId, Seed, StageName, TaskId, WorkerId};
 use stages::context::{Adopted, ContextError, Exchange, GangContext, Rendezvous};
@@ -31,12 +32,13 @@ use crate::client::Client;
 use crate::context::HttpContext;
 use crate::event_count::{EventCount, lock};
 
-/// Short, so that losses by silence are found within a test.
+/// Short limits, so that silent peers are found within a test.
 const QUICK: Timing = Timing {
     patience: Duration::from_secs(2),
     keep_alive: Duration::from_millis(200),
     stall: Duration::from_secs(60),
     start: Duration::from_secs(60),
+    slow: Duration::from_secs(60),
     refused: Duration::from_millis(500),
 };
 
@@ -62,10 +64,10 @@ pub(crate) fn assignment(worker: &WorkerId, generation: u64, members: &[Member],
     };
     let role =
         Role::Member { generation: Generation(generation), members: members.to_vec(), secret: secret.to_owned() };
-    Assignment { grant, stage, role, resume: None, drain: false }
+    Assignment { grant, secret: "secret".to_owned(), stage, role, resume: None, drain: false }
 }
 
-/// One worker: where it is dialled, and what it holds once it is a member.
+/// One worker with its address, and its assignment once it is a member.
 #[derive(Debug)]
 struct Seat {
     member: Member,
@@ -97,7 +99,7 @@ impl Gang {
         Arc::new(Self { seats: (0..seats).map(seat).collect(), generation: AtomicU64::new(0), runtime })
     }
 
-    /// Starts a generation of these seats; others that were members are told that it is over.
+    /// Starts a generation with these seats and ends the assignments of other members.
     fn regroup(&self, seats: &[usize], drain: bool) {
         let generation = self.generation.fetch_add(1, Ordering::SeqCst) + 1;
         let members: Vec<Member> = seats.iter().map(|&i| self.seats[i].member.clone()).collect();
@@ -126,19 +128,19 @@ impl Gang {
 
     fn context(&self, seat: usize) -> HttpContext {
         let held = self.held(seat).expect("a member");
-        // Nobody is there; nothing in these tests is recorded or uploaded.
+        // No server listens there; these tests record and upload nothing.
         let client = Client::new(crate::tests::server_at("http://127.0.0.1:9"), self.runtime.handle().clone());
         let cache = Arc::new(Cache::new(None, None, Bounds::default()).expect("memory"));
-        HttpContext::new(held, client, cache, Device::default())
+        HttpContext::new(held, client, cache, Arc::default(), Device::default())
     }
 
-    /// What the coordinator does: members that somebody cannot reach are dropped. Suspects that are not dead come back.
+    /// Acts as the coordinator: drops members that another one cannot reach, and takes back suspects that are alive.
     fn supervise(self: Arc<Self>, mut members: Vec<usize>, over: &AtomicBool) {
         while !over.load(Ordering::SeqCst) {
             let mut lost: Vec<WorkerId> = Vec::new();
             for &i in &members {
                 if let (false, Some(held)) = (self.seats[i].dead.load(Ordering::SeqCst), self.held(i)) {
-                    lost.extend(held.doing().lost);
+                    lost.extend(held.doing().lost.into_iter().map(|peer| peer.worker));
                 }
             }
             let before = members.clone();
@@ -154,7 +156,7 @@ impl Gang {
     }
 }
 
-/// A gradient that depends on step and slice.
+/// A pseudorandom gradient of a step and a slice.
 fn gradient(step: u64, slice: usize, length: usize) -> Vec<f32> {
     let mut x = step.wrapping_mul(0x9E37_79B9_7F4A_7C15) ^ (slice as u64 + 1).wrapping_mul(0xD1B5_4A32_D192_ED03);
     (0..length)
@@ -167,7 +169,7 @@ fn gradient(step: u64, slice: usize, length: usize) -> Vec<f32> {
         .collect()
 }
 
-/// What a lone member computes.
+/// The result of a single member.
 fn reference(steps: u64, slices: usize, length: usize) -> Vec<f32> {
     let mut state = vec![0.0f32; length];
     for step in 0..steps {
@@ -208,7 +210,7 @@ fn train(context: &mut HttpContext, plan: Plan, mut before: impl FnMut(u64)) -> 
                 parts.clear();
                 met = true;
             } else if applied.is_none() {
-                // Whatever came of a state that was cut short.
+                // Discard the state of an interrupted transfer.
                 state.fill(0.0);
             }
             continue;
@@ -235,7 +237,7 @@ fn bits(state: &[f32]) -> Vec<u32> {
     state.iter().map(|x| x.to_bits()).collect()
 }
 
-/// Runs `members` seats to the end of `plan` without incident.
+/// Runs `plan` with `members` seats and without faults.
 fn run_whole(members: usize, plan: Plan) -> Vec<Vec<f32>> {
     let gang = Gang::new(members, Timing::default());
     gang.regroup(&(0..members).collect::<Vec<_>>(), false);
@@ -273,7 +275,7 @@ fn buffers_of_many_pieces_are_summed_too() {
     }
 }
 
-/// Kills one of `members` after `delay`; the others must end with the bits of an undisturbed run.
+/// Kills one of `members` after `delay`. The others must end with the bits of an undisturbed run.
 fn lose_one(members: usize, victim: usize, plan: Plan, at: u64, delay: Duration) {
     let gang = Gang::new(members, QUICK);
     let all: Vec<usize> = (0..members).collect();
@@ -312,7 +314,7 @@ fn lose_one(members: usize, victim: usize, plan: Plan, at: u64, delay: Duration)
         for (i, thread) in threads.into_iter().enumerate() {
             let result = thread.join().expect("no panic");
             if i == victim {
-                // It may have come through before it was struck.
+                // It may have finished before the kill.
                 assert!(matches!(result, Err(ContextError::GrantEnded(_)) | Ok(_)), "{result:?}");
             } else {
                 let state = result.unwrap_or_else(|e| panic!("member {i}: {e}"));
@@ -378,7 +380,7 @@ fn one_wish_to_drain_is_heard_by_all_after_the_same_step() {
     let gang = Gang::new(3, QUICK);
     gang.regroup(&[0, 1, 2], false);
     let contexts: Vec<HttpContext> = (0..3).map(|i| gang.context(i)).collect();
-    // Only the second is told.
+    // Only the second member gets the drain request.
     let held = gang.held(1).expect("a member");
     let stops: Vec<Vec<bool>> = thread::scope(|scope| {
         let threads: Vec<_> = contexts
@@ -427,6 +429,10 @@ fn mesh(gang: &Gang, seats: &[usize], own: usize, secret: &str) -> (Arc<Mesh>, A
     (Mesh::open(config, &gang.seats[seats[own]].endpoint, event_count.clone(), Arc::default()), event_count)
 }
 
+fn unreachable(worker: &str) -> LostPeer {
+    LostPeer { worker: worker.into(), cause: LossCause::Unreachable }
+}
+
 fn wait_until(what: &str, mut holds: impl FnMut() -> bool) {
     let begun = Instant::now();
     while !holds() {
@@ -435,7 +441,7 @@ fn wait_until(what: &str, mut holds: impl FnMut() -> bool) {
     }
 }
 
-/// Rank 0 has the last step to save; the others hold their state for as long as it lives, and learn of its death at once.
+/// Rank 0 has the last step to save. The others hold their state as long as it lives and learn of its death at once.
 #[test]
 fn members_hold_their_state_until_rank_0_has_saved() {
     let gang = Gang::new(3, QUICK);
@@ -453,7 +459,8 @@ fn members_hold_their_state_until_rank_0_has_saved() {
         assert!(holds.iter().all(|hold| !hold.is_finished()), "rank 0 has not reported");
         gang.held(0).expect("a member").sever();
         wait_until("both miss rank 0", || {
-            [1, 2].iter().all(|&i| gang.held(i).expect("a member").doing().lost == [WorkerId::from("w0")])
+            let misses = |i| gang.held(i).expect("a member").doing().lost == [unreachable("w0")];
+            [1, 2].into_iter().all(misses)
         });
         gang.regroup(&[1, 2], false);
         for hold in holds {

@@ -1,19 +1,19 @@
 //! Sums along the fixed binary tree over a step's slices (design: determinism).
 //!
-//! A node is a range of slices; the root is `0..slices`. A node of more than one slice splits where its left part is the
-//! largest power of two smaller than it. Floating-point addition is not associative, so the tree and not the
-//! membership decides which two numbers meet: a member that holds the sums of any set of disjoint nodes that cover a node gets
-//! the same bits for it.
+//! A node is a range of slices; the root is `0..slices`. A node of more than one slice splits so that its left part is
+//! the largest power of two smaller than it. Floating-point addition is not associative. The tree, and not the
+//! membership, decides which two numbers are added. So the sums of any set of disjoint nodes that cover a node give the
+//! same bits for it.
 
 use std::ops::Range;
 
 /// A range of slices that is a node of the tree.
 pub(crate) type Node = Range<usize>;
 
-/// Floats summed at once: all inputs' blocks and the scratch stay in the cache.
+/// Floats summed at once: all inputs' blocks and the scratch stay in the CPU cache.
 const BLOCK: usize = 4096;
 
-/// Where a node splits, or `None` for a single slice.
+/// Index at which a node splits, or `None` for a single slice.
 fn split(node: &Node) -> Option<usize> {
     match node.len() {
         0 | 1 => None,
@@ -21,7 +21,7 @@ fn split(node: &Node) -> Option<usize> {
     }
 }
 
-/// The largest nodes of the tree over `0..slices` that lie in `range`, in order; together they are `range`.
+/// The largest nodes of the tree over `0..slices` inside `range`, in order; together they are `range`.
 pub(crate) fn cover(slices: usize, range: &Range<usize>) -> Vec<Node> {
     fn visit(node: Node, range: &Range<usize>, out: &mut Vec<Node>) {
         if node.start >= range.end || node.end <= range.start {
@@ -42,12 +42,13 @@ pub(crate) fn cover(slices: usize, range: &Range<usize>) -> Vec<Node> {
     out
 }
 
-/// The slices of rank `rank` of `members`: contiguous, balanced, by rank.
+/// The slices of rank `rank` of `members`: contiguous, balanced, in order of rank.
 pub(crate) fn share(slices: usize, rank: usize, members: usize) -> Range<usize> {
     slices * rank / members..slices * (rank + 1) / members
 }
 
-/// Sums `known` (disjoint nodes in order, each with numbers as many as `out` has) into `out`, the sum of `node`.
+/// Sums `known` into `out` along the tree. `known` holds disjoint nodes in order that cover `node`, each with as many
+/// numbers as `out`.
 ///
 /// # Panics
 /// If `known` does not cover `node`; callers build it from [`cover`].
@@ -92,7 +93,7 @@ mod tests {
 
     use super::*;
 
-    /// The definition, one number at a time.
+    /// The definition, computed one number at a time.
     fn plain(node: Node, slices: &[Vec<f32>], at: usize) -> f32 {
         match split(&node) {
             None => slices[node.start][at],
@@ -118,7 +119,7 @@ mod tests {
                 .collect();
             let mut bounds: Vec<usize> = cuts.into_iter().map(|c| c % (slices + 1)).chain([0, slices]).collect();
             bounds.sort_unstable();
-            // Each range sums its own nodes; the sums meet afterwards.
+            // Each range sums its own nodes; the sums are combined afterwards.
             let mut partial: Vec<(Node, Vec<f32>)> = Vec::new();
             for pair in bounds.windows(2) {
                 for node in cover(slices, &(pair[0]..pair[1])) {

@@ -1,4 +1,4 @@
-//! Blobs that are damaged, absent or cut off on their way.
+//! Blobs that are damaged, missing or interrupted in transfer.
 
 use checkpoint::BlobError;
 use protocol::Digest;
@@ -57,7 +57,7 @@ fn cut_transfers_go_on_where_they_were_cut() {
     worker.grant(1);
     worker.wait("an upload", |coordinator| coordinator.blobs.contains_key(&Digest::of(&whole)));
     let uploaded = worker.fake.received.load(Ordering::SeqCst);
-    // Two parts of 8 MiB of which half arrived; all again would be twice as much.
+    // Half of two parts of 8 MiB arrived; sending all again would be twice as much.
     assert!(uploaded < (BYTES + (10 << 20)) as u64, "{uploaded} bytes were sent");
     worker.wait("an outcome", |coordinator| !coordinator.outcomes.is_empty());
     let outcomes = worker.leave().outcomes.clone();
@@ -79,12 +79,12 @@ fn a_cut_download_goes_on() {
     worker.grant(1);
     worker.wait("an outcome", |coordinator| !coordinator.outcomes.is_empty());
     let received = worker.fake.received.load(Ordering::SeqCst);
-    // What was in flight when it broke off may be lost, but not all that came before.
+    // Bytes in flight at the interruption may be lost, but not all bytes before them.
     assert!(received < (2 * BYTES) as u64, "{received} bytes were sent");
     assert!(matches!(worker.leave().outcomes[0].outcome, TaskOutcome::Finished { .. }));
 }
 
-/// A blob that is damaged in the store is no trouble of the network: said once, with its name, and not asked for again.
+/// A blob that is damaged in the store is no network error. It is reported once with its name and not fetched again.
 #[test]
 fn a_blob_that_is_damaged_in_the_store_fails_the_attempt_at_once() {
     let digest = Digest::of(b"rotten");

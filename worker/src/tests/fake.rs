@@ -1,6 +1,6 @@
-//! The coordinator: a few lines that can be told to misbehave.
+//! A fake coordinator that can be made to misbehave.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
@@ -8,31 +8,32 @@ use std::time::{Duration, Instant};
 use axum::Router;
 use axum::body::Bytes;
 use axum::extract::{DefaultBodyLimit, Json, Path, State};
-use axum::http::StatusCode;
+use axum::http::{HeaderMap, StatusCode};
 use axum::response::{IntoResponse, Response};
 use axum::routing::{get, post, put};
 use protocol::message::{
     ApiError, Assignment, CommitCheckpoint, DesiredAssignments, Grant, Join, Joined, LogBatch, MetricBatch,
     PROTOCOL_VERSION, Poll, Prepare, ReportOutcome, TaskOutcome,
 };
+use protocol::proof::{GRANT_HEADER, PROCESS_HEADER, SECRET_HEADER, SHORTEST_SECRET};
 use protocol::{Digest, Incarnation};
 
 use crate::event_count::lock;
 
-/// Long enough that no poll of a busy machine is given up in vain.
+/// Long enough that a poll does not time out on a busy machine.
 pub(super) const LEASE_MS: u64 = 6000;
 
 pub(super) type Metrics = BTreeMap<(u64, String), f64>;
 
 const TOKEN: &str = "a-token-of-tests-only";
 
-/// A coordinator at `url`, who wants [`TOKEN`].
+/// Options of a coordinator at `url` that requires [`TOKEN`].
 pub(crate) fn server_at(url: &str) -> access::Server {
     let token = TOKEN.parse().expect("a token");
     access::Server::new(url, Some(token), None).expect("a server")
 }
 
-/// What it was told, and what it asks for.
+/// Everything that the coordinator has received, and its orders.
 #[derive(Debug, Default)]
 pub(super) struct FakeState {
     pub(super) assignments: Vec<Assignment>,
@@ -46,49 +47,54 @@ pub(super) struct FakeState {
     pub(super) blobs: HashMap<Digest, Vec<u8>>,
     pub(super) staged: HashMap<Digest, Vec<u8>>,
     pub(super) metrics: Metrics,
+    /// Places of values that are not finite.
+    pub(super) odd: BTreeSet<(u64, String)>,
     pub(super) logs: BTreeMap<u64, String>,
     pub(super) checkpoints: Vec<CommitCheckpoint>,
     pub(super) outcomes: Vec<ReportOutcome>,
-    /// The fence that the store has; writes with another are refused.
+    /// The store's fence; writes with another one are refused.
     pub(super) fence: u64,
     pub(super) calls: u64,
-    /// Blobs that were asked for.
+    /// Blobs that were requested.
     pub(super) fetched: Vec<Digest>,
-    /// Ends with an artifact are refused.
+    /// Refuses outcomes with an artifact.
     pub(super) refuses: bool,
+    /// Refuses all blobs as too large.
+    pub(super) unfit: bool,
 }
 
-/// For how long a coordinator that has too much to do wants to be left alone: longer than any pause of ours between two tries.
+/// Time that a busy coordinator asks for, in seconds: longer than any of our pauses between two tries.
 pub(super) const BUSY_S: u64 = 2;
 
-/// The coordinator.
 #[derive(Debug, Default)]
 pub(super) struct Fake {
     pub(super) coordinator: Mutex<FakeState>,
+    /// Number of coming joins that find the name held by another process.
+    pub(super) name_held: AtomicU64,
     /// Answers 503 to everything.
     pub(super) away: AtomicBool,
-    /// Its disk is full: nothing can be stored.
+    /// Answers that the disk is full.
     pub(super) full: AtomicBool,
-    /// How often it said so.
+    /// Number of calls refused for a full disk.
     pub(super) turned_down: AtomicU64,
-    /// Tells the next batch of values to come again, and when it did.
+    /// Answers "busy" to the next batch of metrics, and records the time of the answer.
     pub(super) busy: AtomicBool,
-    pub(super) told: Mutex<Option<Instant>>,
-    /// How much later it came.
+    pub(super) refused_at: Mutex<Option<Instant>>,
+    /// Time until the batch came again.
     pub(super) waited: Mutex<Option<Duration>>,
-    /// Every third write is done, and then its answer is lost.
+    /// Every third write is done but its answer is lost.
     pub(super) lossy: AtomicBool,
-    /// The next so many polls are never answered.
+    /// Number of coming polls that are never answered.
     pub(super) hang: AtomicU64,
     /// Downloads never end.
     pub(super) stuck: AtomicBool,
-    /// The next so many downloads arrive with a flipped bit.
+    /// Number of coming downloads that arrive with a flipped bit.
     pub(super) damage: AtomicU64,
-    /// The next so many transfers of blobs break off in their middle.
+    /// Number of coming blob transfers that break off in the middle.
     pub(super) cut: AtomicU64,
     /// All blobs are damaged in the store.
     pub(super) rotten: AtomicBool,
-    /// Bytes of blobs that were transferred, or calls for damaged ones.
+    /// Bytes of transferred blobs, or the number of requests for damaged ones.
     pub(super) received: AtomicU64,
 }
 
@@ -97,7 +103,7 @@ fn refuse(status: StatusCode, code: &str) -> Response {
 }
 
 impl Fake {
-    /// The answer of a full disk, if it is full.
+    /// The refusal of a full disk, if the disk is full.
     fn no_room(&self) -> Option<Response> {
         let full = self.full.load(Ordering::SeqCst);
         full.then(|| {
@@ -106,13 +112,13 @@ impl Fake {
         })
     }
 
-    /// The answer of one that has too much to do, if it has.
+    /// The refusal of a busy coordinator, if it is busy.
     fn too_much(&self) -> Option<Response> {
-        if let Some(told) = lock(&self.told).take() {
-            *lock(&self.waited) = Some(told.elapsed());
+        if let Some(refused_at) = lock(&self.refused_at).take() {
+            *lock(&self.waited) = Some(refused_at.elapsed());
         }
         self.busy.swap(false, Ordering::SeqCst).then(|| {
-            *lock(&self.told) = Some(Instant::now());
+            *lock(&self.refused_at) = Some(Instant::now());
             ([("retry-after", BUSY_S.to_string())], refuse(StatusCode::TOO_MANY_REQUESTS, "busy")).into_response()
         })
     }
@@ -123,7 +129,7 @@ impl Fake {
         coordinator.version += 1;
     }
 
-    /// A write: checked, done, and answered unless the answer is to be lost.
+    /// Checks and does a write. The answer may be lost on purpose.
     fn write(&self, grant: &Grant, work: impl FnOnce(&mut FakeState)) -> Response {
         if self.away.load(Ordering::SeqCst) {
             return refuse(StatusCode::SERVICE_UNAVAILABLE, "internal");
@@ -144,8 +150,12 @@ impl Fake {
     }
 }
 
-async fn join(State(fake): State<Arc<Fake>>, Json(join): Json<Join>) -> Response {
+async fn join(State(fake): State<Arc<Fake>>, headers: HeaderMap, Json(join): Json<Join>) -> Response {
     assert_eq!(join.protocol, PROTOCOL_VERSION);
+    assert!(headers[SECRET_HEADER].len() >= SHORTEST_SECRET);
+    if fake.name_held.fetch_update(Ordering::SeqCst, Ordering::SeqCst, |n| n.checked_sub(1)).is_ok() {
+        return refuse(StatusCode::CONFLICT, "name-held");
+    }
     if let Some(response) = fake.no_room() {
         return response;
     }
@@ -193,6 +203,10 @@ async fn metrics(State(fake): State<Arc<Fake>>, Json(batch): Json<MetricBatch>) 
     }
     fake.write(&batch.grant, |coordinator| {
         for row in batch.rows {
+            if row.value.is_nan() {
+                coordinator.odd.insert((row.step, row.key));
+                continue;
+            }
             let before = coordinator.metrics.insert((row.step, row.key.clone()), row.value);
             assert!(before.is_none_or(|v| v == row.value), "a row changed its value");
         }
@@ -210,7 +224,7 @@ async fn logs(State(fake): State<Arc<Fake>>, Json(batch): Json<LogBatch>) -> Res
 async fn checkpoint(State(fake): State<Arc<Fake>>, Json(commit): Json<CommitCheckpoint>) -> Response {
     fake.write(&commit.grant.clone(), |coordinator| {
         assert!(coordinator.blobs.contains_key(&commit.manifest), "a manifest is uploaded before it is committed");
-        // What was recorded up to here must have arrived before.
+        // All values recorded up to this step must have arrived before.
         assert!(
             (1..=commit.step).all(|s| coordinator.metrics.contains_key(&(s, "loss".to_owned()))),
             "{:?}",
@@ -233,18 +247,22 @@ async fn outcome(State(fake): State<Arc<Fake>>, Json(report): Json<ReportOutcome
     })
 }
 
-/// Takes the next part of a blob. Of a part that is to be cut it keeps half.
+/// Stores the next part of a blob; keeps only half of a part that is to be cut.
 async fn put_blob(
     State(fake): State<Arc<Fake>>,
     Path(digest): Path<Digest>,
-    headers: axum::http::HeaderMap,
+    headers: HeaderMap,
     body: Bytes,
 ) -> Response {
-    let grant: Grant = serde_json::from_slice(headers["x-stride-grant"].as_bytes()).expect("a grant");
+    let grant: Grant = serde_json::from_slice(headers[GRANT_HEADER].as_bytes()).expect("a grant");
+    assert_eq!(headers[SECRET_HEADER], format!("the-secret-of-fence-{}", grant.fence));
     assert_eq!(headers["authorization"], format!("Bearer {TOKEN}"));
     let number =
         |name: &str| headers[name].to_str().ok().and_then(|text| text.parse::<usize>().ok()).expect("a number");
     let (offset, bytes) = (number("x-stride-offset"), number("x-stride-bytes"));
+    if lock(&fake.coordinator).unfit {
+        return refuse(StatusCode::PAYLOAD_TOO_LARGE, "too-large");
+    }
     fake.received.fetch_add(body.len() as u64, Ordering::SeqCst);
     let cut = fake.cut.fetch_update(Ordering::SeqCst, Ordering::SeqCst, |n| n.checked_sub(1)).is_ok();
     let mut answer = serde_json::Value::Null;
@@ -277,12 +295,9 @@ async fn staged(State(fake): State<Arc<Fake>>, Path(digest): Path<Digest>) -> Re
     Json(serde_json::json!({ "digest": digest, "stored": stored, "staged": staged })).into_response()
 }
 
-/// Sends a blob, or what follows byte N of it. An answer that is to be cut breaks off in its middle.
-async fn get_blob(
-    State(fake): State<Arc<Fake>>,
-    Path(digest): Path<Digest>,
-    headers: axum::http::HeaderMap,
-) -> Response {
+/// Sends a blob from byte N on. An answer that is to be cut breaks off in the middle.
+async fn get_blob(State(fake): State<Arc<Fake>>, Path(digest): Path<Digest>, headers: HeaderMap) -> Response {
+    assert!(headers.contains_key(PROCESS_HEADER) && headers.contains_key(SECRET_HEADER), "{headers:?}");
     if fake.away.load(Ordering::SeqCst) {
         return refuse(StatusCode::SERVICE_UNAVAILABLE, "internal");
     }
@@ -317,7 +332,7 @@ async fn get_blob(
     (status, [("content-length", length.to_string())], body).into_response()
 }
 
-/// Its calls.
+/// Routes of the fake.
 pub(super) fn router(fake: Arc<Fake>) -> Router {
     Router::new()
         .route("/v1/workers", post(join))

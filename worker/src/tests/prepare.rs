@@ -1,13 +1,13 @@
-//! What is fetched before a task is given.
+//! Prefetching of inputs before a task is assigned.
 
 use std::sync::Mutex;
 
 use protocol::Digest;
-use protocol::message::Prepare;
+use protocol::message::{Member, Prepare};
 
 use super::*;
 
-/// An artifact of one file in the fake's store: its manifest's digest, and the file's.
+/// Stores an artifact of one file in the fake's store. Returns the digests of its manifest and of the file.
 fn artifact(fake: &Fake, bytes: &[u8]) -> (Digest, Digest) {
     let file = Digest::of(bytes);
     let mut manifest = Manifest::new(ArtifactKind::Dataset, serde_json::json!({}));
@@ -20,7 +20,7 @@ fn artifact(fake: &Fake, bytes: &[u8]) -> (Digest, Digest) {
 }
 
 fn prepare(task: &str, input: Digest, resume: Option<Digest>) -> Prepare {
-    Prepare { task: task.into(), inputs: BTreeMap::from([("dataset".to_owned(), input)]), resume }
+    Prepare { task: task.into(), inputs: BTreeMap::from([("dataset".to_owned(), input)]), resume, peers: Vec::new() }
 }
 
 fn says_ready(coordinator: &FakeState, tasks: &[&str]) -> bool {
@@ -40,7 +40,7 @@ fn what_a_task_needs_is_fetched_before_it_is_given() {
     let (data, file) = artifact(&worker.fake, b"data");
     let (saved, state) = artifact(&worker.fake, b"state");
     *lock(&input) = Some(data);
-    // Part of it is not there yet, and part arrives damaged.
+    // One part is still missing, and one arrives damaged.
     let held_back = lock(&worker.fake.coordinator).blobs.remove(&state).expect("stored");
     worker.fake.damage.store(1, Ordering::SeqCst);
     worker.fake.desired(|coordinator| coordinator.prepare = vec![prepare("run/stage", data, Some(saved))]);
@@ -59,7 +59,7 @@ fn what_a_task_needs_is_fetched_before_it_is_given() {
     assert!(matches!(coordinator.outcomes[0].outcome, TaskOutcome::Finished { .. }), "{:?}", coordinator.outcomes);
 }
 
-/// A task whose input is damaged in the store is not waited for by everybody for ever: it is taken, and its attempt says so.
+/// A damaged input does not delay a task for ever: the task counts as ready, and its attempt reports the damage.
 #[test]
 fn a_damaged_input_does_not_keep_a_task_from_being_given() {
     let worker = Worker::start(Box::new(finished));
@@ -87,4 +87,26 @@ fn fetching_ahead_stops_when_the_task_is_another_s_and_when_the_worker_leaves() 
     let begun = Instant::now();
     worker.leave();
     assert!(begun.elapsed() < Duration::from_secs(5), "it waited for the download");
+}
+
+/// A member that refuses connections. The gang does not see a joiner that could not take part, and other tasks are
+/// prepared meanwhile.
+#[test]
+fn a_task_is_ready_only_once_its_members_answer() {
+    let worker = Worker::start(Box::new(finished));
+    let (data, _) = artifact(&worker.fake, b"data");
+    let closed = std::net::TcpListener::bind("127.0.0.1:0").expect("a free port").local_addr().expect("bound");
+    let member = |address: std::net::SocketAddr| Member {
+        worker: "holder".into(),
+        incarnation: protocol::Incarnation(1),
+        peer_address: address.to_string(),
+    };
+    let joined = |address| Prepare { peers: vec![member(address)], ..prepare("run/gang", data, None) };
+    worker.fake.desired(|coordinator| coordinator.prepare = vec![joined(closed), prepare("run/other", data, None)]);
+    worker.wait("the other one", |coordinator| says_ready(coordinator, &["run/other"]));
+    // The member comes back at the same address.
+    let timing = crate::gang::member::Timing::default();
+    let _endpoint = crate::gang::endpoint::Endpoint::open(closed, timing).expect("free again");
+    worker.wait("both", |coordinator| says_ready(coordinator, &["run/other", "run/gang"]));
+    worker.leave();
 }

@@ -1,4 +1,4 @@
-//! Blobs in an object store: S3 and what speaks its protocol, Google Cloud Storage, Azure.
+//! Blobs in an object store: S3 and compatible servers, Google Cloud Storage, Azure.
 //!
 //! ```text
 //! PREFIX/IDENTITY           the store that the blobs belong to
@@ -6,12 +6,13 @@
 //! PREFIX/quarantine/...     damaged blobs that were put aside
 //! ```
 //!
-//! Database, lock and arriving blobs stay in the store's folder, and so does the time when a blob was last put
-//! (`blobs/touched`). A blob is sent once all of it has arrived and hashes to its name: a small one by a put that fails if the
-//! name is taken, a large one in parts that appear as one object at the end. That end cannot be conditional everywhere, and
-//! need not be: equal names are equal bytes. A part that fails is sent again by itself; parts of an upload that was given up
-//! cost space until the bucket's own rule removes them.
+//! The store's folder keeps the database, the lock, arriving blobs, and the time of each blob's last put
+//! (`blobs/touched`). A blob is sent when all of it has arrived and hashes to its name. A small blob is sent by a put
+//! that fails if the name is taken; a large one in parts that appear as one object at the end. That end cannot be
+//! conditional on every server and need not be, because equal names mean equal bytes. A failed part is sent again by
+//! itself. Parts of an abandoned upload occupy space until the bucket's own rule removes them.
 
+mod health;
 mod remote;
 mod touched;
 
@@ -20,6 +21,7 @@ use std::fs::OpenOptions;
 use std::io::{self, Cursor, Read};
 use std::path::Path as FilePath;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
 
 use checkpoint::BlobError;
 use fail::fail_point;
@@ -36,23 +38,25 @@ use tokio::task::JoinSet;
 pub use self::remote::Remote;
 pub(super) use self::remote::check_url;
 
-use self::remote::innermost;
+use self::remote::LOCAL;
 use self::touched::Touched;
 use super::disk::{Os, regular};
 use super::staging::{Part, Staging};
-use super::{Backend, Entry, Staged, Stat};
+use super::{Backend, Entry, Problem, Staged, Stat};
 use crate::clock;
 
-/// How much goes out at once. The limit of 10,000 parts to an object allows 80 GB.
+/// Bytes sent in one request. With the limit of 10,000 parts an object may have 80 GB.
 const PART_BYTES: usize = 8 << 20;
-/// Parts that are under way at once, of all blobs together: this bounds the memory that sending takes.
+/// Number of parts under way at once, over all blobs, or as many bytes of small ones. Bounds the memory for sending.
 const PARTS: usize = 4;
-/// A blob that is read begins with a request for as little as the reader asked for, at least this much; each further one asks
-/// for twice as much, up to [`READ_BYTES`].
+/// Bytes of the first request of a read, or more if the reader asks for more. Each further request doubles, up to
+/// [`READ_BYTES`].
 const FIRST_READ_BYTES: usize = 64 << 10;
 const READ_BYTES: usize = 4 << 20;
+/// Time limit of a removal. It starts under a lease and must end before another process can take the lease.
+const REMOVAL: Duration = Duration::from_secs(10);
 
-/// Blobs in an object store.
+/// Backend that stores blobs in an object store.
 #[derive(Debug)]
 pub struct Objects(Arc<Inner>);
 
@@ -61,11 +65,12 @@ struct Inner {
     remote: Arc<Remote>,
     staging: Staging,
     touched: Mutex<Touched>,
+    /// Free room for requests under way, in KiB.
     parts: Arc<Semaphore>,
 }
 
 impl Objects {
-    /// For the store in `dir`. Only for the holder of the store's lock.
+    /// Opens the blobs of the store in `dir`. Only for the holder of the store's lock.
     pub fn open(remote: Arc<Remote>, dir: &FilePath) -> io::Result<Self> {
         let blobs = dir.join("blobs");
         std::fs::create_dir_all(&blobs)?;
@@ -73,14 +78,14 @@ impl Objects {
         Ok(Self::with(remote, staging, Touched::open(&blobs.join("touched"))?))
     }
 
-    /// For reading only: makes and clears nothing.
+    /// Opens the blobs read-only: creates and clears nothing.
     pub fn to_read(remote: Arc<Remote>, dir: &FilePath) -> io::Result<Self> {
         let staging = Staging::to_read(dir.join("staging"), Arc::new(Os));
         Ok(Self::with(remote, staging, Touched::read(&dir.join("blobs/touched"))?))
     }
 
     fn with(remote: Arc<Remote>, staging: Staging, touched: Touched) -> Self {
-        let parts = Arc::new(Semaphore::new(PARTS));
+        let parts = Arc::new(Semaphore::new((PARTS * PART_BYTES) >> 10));
         Self(Arc::new(Inner { remote, staging, touched: Mutex::new(touched), parts }))
     }
 }
@@ -96,7 +101,7 @@ impl Inner {
         match self.remote.wait(async move { store.head(&wanted).await }) {
             Ok(meta) => Ok(Some(meta)),
             Err(Error::NotFound { .. }) => Ok(None),
-            Err(e) => Err(self.remote.error("look at", &path, &e)),
+            Err(e) => Err(self.remote.error("read the metadata of", &path, &e)),
         }
     }
 
@@ -115,8 +120,7 @@ impl Inner {
     }
 
     fn note(&self, digest: Digest) -> Result<(), BlobError> {
-        let failed =
-            |e| BlobError::Storage(format!("the time of blob {digest} could not be noted in `blobs/touched`: {e}"));
+        let failed = |e| BlobError::Storage(format!("cannot record the time of blob {digest} in `blobs/touched`: {e}"));
         self.touched().note(digest).map_err(failed)
     }
 
@@ -127,23 +131,23 @@ impl Inner {
         listed.map_err(|e| self.remote.error("list", &path, &e))
     }
 
-    /// Sends `bytes` bytes, in one request if they are few; `false` if the name was taken.
+    /// Sends `bytes` bytes, in one request if they are few. Returns `false` if the name was taken.
     fn send(&self, path: &Path, bytes: u64, mut source: impl Read + Send + 'static) -> Result<bool, Error> {
         let (store, path, parts) = (self.store(), path.clone(), Arc::clone(&self.parts));
         if bytes > PART_BYTES as u64 {
-            return self.remote.wait(async move {
+            return self.remote.wait_long(async move {
                 let mut upload = store.put_multipart(&path).await?;
                 let sent = send_parts(&mut *upload, parts, source).await;
                 if sent.is_err() {
-                    // The error that it is given up for matters more.
+                    // The first error matters more than one of the abort.
                     let _ = upload.abort().await;
                 }
                 sent.map(|()| true)
             });
         }
         let whole = read_part(&mut source).map_err(local)?;
-        let put = self.remote.wait(async move {
-            let _one = parts.acquire().await;
+        let put = self.remote.wait_long(async move {
+            let _room = parts.acquire_many(kib(whole.len())).await;
             store.put_opts(&path, PutPayload::from(whole), PutOptions::from(PutMode::Create)).await
         });
         match put {
@@ -153,13 +157,13 @@ impl Inner {
         }
     }
 
-    /// Writes the marker unless there is one; `false` if there is.
+    /// Writes the marker unless one exists; returns `false` if one does.
     fn create_marker(&self, marker: &str) -> Result<bool, BlobError> {
         let path = self.remote.path("IDENTITY");
         self.send(&path, 0, Cursor::new(marker.to_owned())).map_err(|e| self.remote.error("write", &path, &e))
     }
 
-    /// The marker as it is now, with its version.
+    /// Reads the current marker with its version.
     fn read_marker(&self) -> Result<Option<(String, UpdateVersion)>, BlobError> {
         let (store, path) = (self.store(), self.remote.path("IDENTITY"));
         let wanted = path.clone();
@@ -171,7 +175,7 @@ impl Inner {
         match got {
             Ok((bytes, version)) => Ok(Some((String::from_utf8_lossy(&bytes).into_owned(), version))),
             Err(e @ Error::NotFound { .. }) => match self.remote.error("read", &path, &e) {
-                // There is no bucket either.
+                // The bucket does not exist either.
                 no_bucket @ BlobError::Storage(_) => Err(no_bucket),
                 _ => Ok(None),
             },
@@ -180,8 +184,13 @@ impl Inner {
     }
 }
 
+/// Returns the room that bytes take among those under way, in KiB.
+fn kib(bytes: usize) -> u32 {
+    u32::try_from(bytes.div_ceil(1 << 10).max(1)).unwrap_or(u32::MAX)
+}
+
 fn local(source: io::Error) -> Error {
-    Error::Generic { store: "staging", source: source.into() }
+    Error::Generic { store: LOCAL, source: source.into() }
 }
 
 async fn send_parts(
@@ -191,7 +200,8 @@ async fn send_parts(
 ) -> Result<(), Error> {
     let mut under_way = JoinSet::new();
     loop {
-        let slot = Arc::clone(&slots).acquire_owned().await.map_err(|e| local(io::Error::other(e)))?;
+        let slot =
+            Arc::clone(&slots).acquire_many_owned(kib(PART_BYTES)).await.map_err(|e| local(io::Error::other(e)))?;
         let (read, next) = tokio::task::spawn_blocking(move || (read_part(&mut source), source)).await?;
         source = next;
         let part = read.map_err(local)?;
@@ -269,21 +279,26 @@ impl Backend for Objects {
     fn remove(&self, digest: Digest) -> Result<(), BlobError> {
         let (store, path) = (self.0.store(), self.0.remote.blob(digest));
         let wanted = path.clone();
-        match self.0.remote.wait(async move { store.delete(&wanted).await }) {
+        let removing = async move {
+            let late =
+                || Error::Generic { store: "blobs", source: "the server did not answer the removal in time".into() };
+            tokio::time::timeout(REMOVAL, store.delete(&wanted)).await.unwrap_or_else(|_| Err(late()))
+        };
+        match self.0.remote.wait(removing) {
             Ok(()) | Err(Error::NotFound { .. }) => self.0.touched().forget(digest),
             Err(e) => return Err(self.0.remote.error("remove", &path, &e)),
         }
         Ok(())
     }
 
-    /// Copied by reading it: not every store copies large objects by itself.
+    /// Copies the object through this process: not every server can copy large objects itself.
     fn put_aside(&self, digest: Digest) -> Result<(), BlobError> {
         let Some(meta) = self.0.head(digest)? else { return Ok(()) };
         let aside = self.0.remote.path(&format!("quarantine/{}.{}", digest.hex(), clock::now_ms()));
         let source = self.read(digest, 0)?;
         self.0.send(&aside, meta.size, source).map_err(|e| self.0.remote.error("write", &aside, &e))?;
         self.remove(digest)?;
-        tracing::warn!("blob {digest} is damaged; it was put aside as `{}`", self.0.remote.shown(&aside));
+        tracing::warn!("blob {digest} is damaged; it was moved to `{}`", self.0.remote.shown(&aside));
         Ok(())
     }
 
@@ -316,6 +331,10 @@ impl Backend for Objects {
         Ok(self.0.list("quarantine")?.iter().map(|meta| self.0.remote.shown(&meta.location)).collect())
     }
 
+    fn problem(&self) -> Option<Problem> {
+        self.0.remote.problem()
+    }
+
     fn marker_place(&self) -> String {
         self.0.remote.shown(&self.0.remote.path("IDENTITY"))
     }
@@ -324,7 +343,8 @@ impl Backend for Objects {
         Ok(self.0.read_marker()?.map(|(text, _)| text))
     }
 
-    /// Writes over nothing by a put that must fail where there is something; that the server keeps to this is tried each time.
+    /// Creates and replaces by conditional puts. Each call also tests that the server refuses a put over an existing
+    /// object.
     fn set_marker(&self, old: Option<&str>, marker: &str) -> Result<bool, BlobError> {
         let path = self.0.remote.path("IDENTITY");
         let Some(old) = old else {
@@ -349,7 +369,7 @@ impl Backend for Objects {
     }
 }
 
-/// A blob that arrives in the store's folder, to be sent when all of it is there.
+/// A blob being written to the store's folder, sent when it is complete.
 #[derive(Debug)]
 struct StagedObject {
     part: Part,
@@ -365,13 +385,14 @@ impl Staged for StagedObject {
         fail_point!("blob::after_write");
         let here = |e: io::Error| super::fs::error("read", &self.part.path, &e);
         io::Write::flush(&mut self.part.file).map_err(here)?;
-        if self.objects.head(digest)?.is_some() {
-            return Ok(false);
-        }
-        let here = |e: io::Error| super::fs::error("read", &self.part.path, &e);
         let file = regular(OpenOptions::new().read(true), &self.part.path).map_err(here)?;
         let bytes = file.metadata().map_err(here)?.len();
-        // Noted first: a collection that sees the object must see that it is young, whatever the other side's clock says.
+        // A put in one request fails by itself if the name is taken.
+        if bytes > PART_BYTES as u64 && self.objects.head(digest)?.is_some() {
+            return Ok(false);
+        }
+        // Recorded first: a collection that sees the object must see that it is young, even if the server's clock
+        // differs.
         self.objects.note(digest)?;
         let path = self.objects.remote.blob(digest);
         let sent = self.objects.send(&path, bytes, file).map_err(|e| self.objects.remote.error("write", &path, &e));
@@ -380,13 +401,13 @@ impl Staged for StagedObject {
     }
 }
 
-/// Reads an object in ranges, each with a request of its own: a slow reader keeps no connection waiting.
+/// Reads an object in ranges, one request each, so that a slow reader keeps no connection open.
 struct Ranges {
     remote: Arc<Remote>,
     path: Path,
     at: u64,
     end: u64,
-    /// How much the next request asks for.
+    /// Bytes of the next request.
     next: usize,
     part: Cursor<bytes::Bytes>,
 }
@@ -401,9 +422,11 @@ impl Read for Ranges {
         self.next = length.saturating_mul(2);
         let range = self.at..self.end.min(self.at + length as u64);
         let (store, path, wanted) = (Arc::clone(&self.remote.store), self.path.clone(), range.clone());
-        let part = self.remote.wait(async move { store.get_range(&path, wanted).await });
-        let part =
-            part.map_err(|e| io::Error::other(format!("`{}`: {}", self.remote.shown(&self.path), innermost(&e))))?;
+        let part = self.remote.wait_long(async move { store.get_range(&path, wanted).await });
+        let part = part.map_err(|e| match self.remote.error("read", &self.path, &e) {
+            BlobError::Unreachable(message) => io::Error::new(io::ErrorKind::HostUnreachable, message),
+            e => io::Error::other(e.to_string()),
+        })?;
         if part.is_empty() {
             return Err(io::ErrorKind::UnexpectedEof.into());
         }

@@ -1,4 +1,4 @@
-//! Requests to an object store, and what is said when one fails.
+//! Requests to an object store, and the messages when they fail.
 
 use std::fmt;
 use std::sync::Arc;
@@ -14,15 +14,21 @@ use object_store::{BackoffConfig, ClientConfigKey, Error, ObjectStore, RetryConf
 use protocol::Digest;
 use tokio::runtime::Runtime;
 
-/// A connection that is not there by then is tried again. A machine in the same building answers in milliseconds.
+use super::health::Health;
+use crate::blob::Problem;
+
+/// Time limit of a connection attempt. A machine in the same building answers in milliseconds.
 const CONNECT: &str = "5 seconds";
-/// How long one request may take: a part of 8 MiB at 1.1 Mbit/s.
+/// Time limit of one request: a part of 8 MiB at 1.1 Mbit/s.
 const REQUEST: &str = "60 seconds";
-/// For how long a request is tried again. The caller is told then, and decides.
+/// Total time of retries of one request; then the caller gets the error.
 const RETRY: Duration = Duration::from_secs(30);
 const RETRIES: usize = 6;
 
-/// Which object stores there are: how a place in one is written, and where its credentials come from.
+/// Marks an error as local instead of the object store's.
+pub(super) const LOCAL: &str = "local";
+
+/// Supported object stores, with the schemes of their URLs and the sources of their credentials.
 const KINDS: [Kind; 3] = [
     Kind {
         scheme: "s3",
@@ -52,7 +58,7 @@ struct Kind {
     http: &'static str,
 }
 
-/// A bucket's name and a prefix in it, of `SCHEME://BUCKET/PREFIX`; otherwise what is wrong with that.
+/// Splits `SCHEME://BUCKET/PREFIX` into bucket and prefix, or describes the mistake.
 fn split(url: &str) -> Result<(&'static Kind, &str, &str), String> {
     let of = |kind: &'static Kind| Some((kind, url.strip_prefix(kind.scheme)?.strip_prefix("://")?));
     let (kind, rest) =
@@ -60,33 +66,34 @@ fn split(url: &str) -> Result<(&'static Kind, &str, &str), String> {
     let (bucket, prefix) = rest.split_once('/').unwrap_or((rest, ""));
     let plain = |c: char| c.is_ascii_alphanumeric() || matches!(c, '-' | '_' | '.');
     if bucket.contains(['@', ':']) {
-        return Err(format!("credentials are not part of it; they come from {} in the environment", kind.credentials));
+        return Err(format!("credentials do not belong in the URL; set {} in the environment", kind.credentials));
     }
     if bucket.is_empty() || !bucket.chars().all(plain) {
-        return Err(format!("`{bucket}` is no bucket's name"));
+        return Err(format!("`{bucket}` is not a bucket name"));
     }
     let prefix = prefix.trim_end_matches('/');
     let is_folder = |name: &str| !name.is_empty() && name.chars().all(plain) && !matches!(name, "." | "..");
     if !prefix.is_empty() && !prefix.split('/').all(is_folder) {
         return Err(format!(
-            "`{prefix}` is no prefix: expected names of letters, digits, `-`, `_` and `.` with `/` between them"
+            "`{prefix}` is not a prefix: expected names of letters, digits, `-`, `_` and `.` with `/` between them"
         ));
     }
     Ok((kind, bucket, prefix))
 }
 
-/// Says what is wrong with a text that should name a place in an object store.
+/// Checks a URL that should name a place in an object store.
 pub(in crate::blob) fn check_url(url: &str) -> Result<(), String> {
     split(url).map(|_| ())
 }
 
-/// A prefix in a bucket, and a runtime of its own for requests: so that calls may block in any thread.
+/// A prefix in a bucket, with its own runtime for requests, so that calls may block in any thread.
 pub struct Remote {
     url: String,
     kind: &'static Kind,
     bucket: String,
     prefix: String,
     pub(super) store: Arc<dyn ObjectStore>,
+    health: Health,
     /// `None` only while it is dropped.
     runtime: Option<Runtime>,
 }
@@ -100,20 +107,20 @@ impl fmt::Debug for Remote {
 impl Drop for Remote {
     fn drop(&mut self) {
         if let Some(runtime) = self.runtime.take() {
-            // Waiting is not allowed in some threads that this may be dropped in; nothing is under way by now.
+            // Some threads that may drop this must not block; no request is under way by now.
             runtime.shutdown_background();
         }
     }
 }
 
 impl Remote {
-    /// The place that `url` names. Credentials and endpoint come from the environment, under the names that the clouds' own tools
-    /// use. Sends nothing yet.
+    /// Connects to the place that `url` names. Credentials and endpoint come from the environment variables of the
+    /// clouds' own tools. Sends no request yet.
     pub fn connect(url: &str) -> Result<Self, BlobError> {
         let wrong =
-            |message: &dyn fmt::Display| BlobError::Storage(format!("`{url}` is no place for blobs: {message}"));
+            |message: &dyn fmt::Display| BlobError::Storage(format!("`{url}` is not a place for blobs: {message}"));
         let (kind, bucket, _) = split(url).map_err(|e| wrong(&e))?;
-        // The TLS library asks for one; another one that is installed already does as well.
+        // rustls needs a default provider; one that is already installed works as well.
         let _ = rustls::crypto::ring::default_provider().install_default();
         let retry = RetryConfig {
             backoff: BackoffConfig { max_backoff: Duration::from_secs(5), ..BackoffConfig::default() },
@@ -154,28 +161,29 @@ impl Remote {
         Self::over(url, store)
     }
 
-    /// The place that `url` names, in any object store.
+    /// Makes the place that `url` names, over any object store.
     pub fn over(url: &str, store: Arc<dyn ObjectStore>) -> Result<Self, BlobError> {
         let wrong =
-            |message: &dyn fmt::Display| BlobError::Storage(format!("`{url}` is no place for blobs: {message}"));
+            |message: &dyn fmt::Display| BlobError::Storage(format!("`{url}` is not a place for blobs: {message}"));
         let (kind, bucket, prefix) = split(url).map_err(|e| wrong(&e))?;
         let runtime = tokio::runtime::Builder::new_multi_thread()
             .worker_threads(2)
             .thread_name("blobs")
             .enable_all()
             .build()
-            .map_err(|e| BlobError::Unavailable(format!("no threads for requests to `{url}`: {e}")))?;
+            .map_err(|e| BlobError::Unavailable(format!("cannot start threads for requests to `{url}`: {e}")))?;
         Ok(Self {
             url: url.trim_end_matches('/').to_owned(),
             kind,
             bucket: bucket.to_owned(),
             prefix: prefix.to_owned(),
             store,
+            health: Health::default(),
             runtime: Some(runtime),
         })
     }
 
-    /// The object called `rest` under the prefix.
+    /// Returns the path of the object `rest` under the prefix.
     pub(super) fn path(&self, rest: &str) -> Path {
         if self.prefix.is_empty() { Path::from(rest) } else { Path::from(format!("{}/{rest}", self.prefix)) }
     }
@@ -185,84 +193,116 @@ impl Remote {
         self.path(&format!("sha256/{}/{}", &hex[..2], &hex[2..]))
     }
 
-    /// The digest that an object's name says, if it is a blob's.
+    /// Returns the digest in an object's name, if the object is a blob.
     pub(super) fn digest(&self, location: &Path) -> Option<Digest> {
         let rest = location.as_ref().strip_prefix(self.path("sha256").as_ref())?.strip_prefix('/')?;
         let (start, end) = rest.split_once('/')?;
         (start.len() == 2).then(|| format!("sha256:{start}{end}").parse().ok()).flatten()
     }
 
-    /// An object as a user would name it.
+    /// Formats an object's path for users.
     pub(super) fn shown(&self, path: &Path) -> String {
         format!("{}://{}/{path}", self.kind.scheme, self.bucket)
     }
 
-    /// Runs a request and blocks until it has ended, in whatever thread this is.
+    /// Returns the current problem of the store, if there is one.
+    pub(super) fn problem(&self) -> Option<Problem> {
+        let problem = self.health.problem()?;
+        Some(Problem { what: format!("`{}` cannot be used: {}", self.url, problem.what), ..problem })
+    }
+
+    /// Runs a short request and blocks until it ends. May be called in any thread.
     pub(super) fn wait<T: Send + 'static>(
         &self,
         request: impl Future<Output = Result<T, Error>> + Send + 'static,
     ) -> Result<T, Error> {
-        let ended = || Error::Generic { store: "blobs", source: "the request ended early".into() };
+        let _waiting = self.health.begin();
+        self.wait_long(request)
+    }
+
+    /// Runs a request that may take minutes because it moves many bytes. Blocks until it ends.
+    pub(super) fn wait_long<T: Send + 'static>(
+        &self,
+        request: impl Future<Output = Result<T, Error>> + Send + 'static,
+    ) -> Result<T, Error> {
+        let ended = self.run(request);
+        match &ended {
+            Ok(_) | Err(Error::NotFound { .. } | Error::AlreadyExists { .. } | Error::Precondition { .. }) => {
+                self.health.answered();
+            }
+            // A local error, not one of the store.
+            Err(Error::Generic { store: LOCAL, .. }) => {}
+            Err(e) => self.health.failed(|| shortened(&innermost(e))),
+        }
+        ended
+    }
+
+    fn run<T: Send + 'static>(
+        &self,
+        request: impl Future<Output = Result<T, Error>> + Send + 'static,
+    ) -> Result<T, Error> {
+        let ended = || Error::Generic { store: LOCAL, source: "the request ended early".into() };
         let Some(runtime) = &self.runtime else { return Err(ended()) };
         let (answer, answered) = mpsc::sync_channel(1);
         runtime.spawn(async move {
-            // Nobody else has the receiver, and it waits.
+            // The receiver below is still waiting, so sending cannot fail.
             let _ = answer.send(request.await);
         });
         answered.recv().map_err(|_| ended())?
     }
 
-    /// What a failed request means, and what to do: `did` to the object at `path`.
+    /// Translates a failed request into a message with a remedy; `did` names the operation on the object at `path`.
     pub(super) fn error(&self, did: &str, path: &Path, e: &Error) -> BlobError {
         let (text, kind, bucket) = (innermost(e), self.kind, &self.bucket);
         let what = format!("failed to {did} `{}`", self.shown(path));
-        let says = |words: &[&str]| words.iter().any(|word| text.contains(word));
-        if says(&["NoSuchBucket", "ContainerNotFound", "bucket does not exist"]) {
-            let advice = "make it, or name another one with `--blobs`";
+        let mentions = |words: &[&str]| words.iter().any(|word| text.contains(word));
+        if mentions(&["NoSuchBucket", "ContainerNotFound", "bucket does not exist"]) {
+            let advice = "create it, or name another one with `--blobs`";
             return BlobError::Storage(format!("{what}: there is no bucket `{bucket}`; {advice}"));
         }
-        if says(&["169.254.169.254", "metadata.google.internal", "MissingCredentials"]) {
+        if mentions(&["169.254.169.254", "metadata.google.internal", "MissingCredentials"]) {
             let set = kind.credentials;
             return BlobError::Storage(format!("{what}: there are no credentials in the environment; set {set}"));
         }
-        if says(&["URL scheme is not allowed"]) {
+        if mentions(&["URL scheme is not allowed"]) {
             let (endpoint, http) = (kind.endpoint, kind.http);
             return BlobError::Storage(format!("{what}: {endpoint} is not https; use https, or set {http}"));
         }
-        // A listing that is refused comes as a failure of no kind in particular.
+        // A refused listing arrives as a generic error.
         let is_refusal = matches!(e, Error::PermissionDenied { .. } | Error::Unauthenticated { .. });
-        if is_refusal || says(&["SignatureDoesNotMatch", "InvalidAccessKeyId", "AccessDenied", "AuthenticationFailed"])
+        if is_refusal
+            || mentions(&["SignatureDoesNotMatch", "InvalidAccessKeyId", "AccessDenied", "AuthenticationFailed"])
         {
             return BlobError::Storage(format!(
-                "{what}: access was refused ({}); check {}, and that they may list, read, write and delete in `{}`",
-                told(&text),
+                "{what}: access was refused ({}); check {}, and their permission to list, read, write and delete in `{}`",
+                shortened(&text),
                 kind.credentials,
                 self.url
             ));
         }
         match e {
             Error::NotImplemented { .. } | Error::NotSupported { .. } => {
-                BlobError::Storage(format!("{what}: the server does not know how ({})", told(&text)))
+                BlobError::Storage(format!("{what}: the server does not support the request ({})", shortened(&text)))
             }
-            _ => BlobError::Unavailable(format!(
-                "{what}: {}; check that the network and {} are right and that the server runs",
-                told(&text),
+            _ => BlobError::Unreachable(format!(
+                "{what}: {}; check the network and {}, and that the server runs",
+                shortened(&text),
                 kind.endpoint
             )),
         }
     }
 
-    /// A server that overwrites what it was asked to leave.
+    /// Error of a server that overwrites an object despite a condition.
     pub(super) fn no_conditions(&self, path: &Path) -> BlobError {
         BlobError::Storage(format!(
-            "`{}` was written over although the request said not to (`If-None-Match: *`): the server ignores conditions, and two \
-             stores could take the same blobs for theirs; use a server that knows conditional writes",
+            "`{}` was overwritten despite `If-None-Match: *`: the server ignores conditions, so two stores could claim the \
+             same blobs; use a server with conditional writes",
             self.shown(path)
         ))
     }
 }
 
-/// What lies at the bottom of an error, with the layers above it, which may repeat each other.
+/// Formats an error with its causes, omitting repeated ones.
 pub(super) fn innermost(error: &Error) -> String {
     let mut cause: &dyn std::error::Error = error;
     let mut text = error.to_string();
@@ -276,8 +316,8 @@ pub(super) fn innermost(error: &Error) -> String {
     text
 }
 
-/// What a server's answer says, without its XML and at a length that fits a line.
-fn told(text: &str) -> String {
+/// Formats a server's answer without XML, shortened to one line.
+fn shortened(text: &str) -> String {
     let element = |name: &str| {
         let (_, rest) = text.split_once(&format!("<{name}>"))?;
         rest.split_once(&format!("</{name}>")).map(|(inner, _)| inner)
@@ -304,12 +344,12 @@ mod tests {
         for (url, says) in [
             ("http://b/p", "expected s3://"),
             ("s3:/b/p", "expected s3://"),
-            ("s3:///p", "no bucket's name"),
+            ("s3:///p", "not a bucket name"),
             ("s3://key:secret@b/p", "AWS_ACCESS_KEY_ID"),
             ("az://c@account/p", "AZURE_STORAGE_ACCOUNT_NAME"),
-            ("s3://b/../p", "no prefix"),
-            ("s3://b/p//q", "no prefix"),
-            ("s3://b/p?x=1", "no prefix"),
+            ("s3://b/../p", "not a prefix"),
+            ("s3://b/p//q", "not a prefix"),
+            ("s3://b/p?x=1", "not a prefix"),
         ] {
             let wrong = split(url).err().unwrap();
             assert!(wrong.contains(says), "{url}: {wrong}");
@@ -319,8 +359,8 @@ mod tests {
     #[test]
     fn answers_are_said_without_their_xml() {
         let xml = "status 403: <Error><Code>InvalidAccessKeyId</Code><Message>no such key</Message></Error>";
-        assert_eq!(told(xml), "InvalidAccessKeyId: no such key");
-        assert_eq!(told("a\n  b"), "a b");
-        assert_eq!(told(&"x".repeat(1000)).chars().count(), 401);
+        assert_eq!(shortened(xml), "InvalidAccessKeyId: no such key");
+        assert_eq!(shortened("a\n  b"), "a b");
+        assert_eq!(shortened(&"x".repeat(1000)).chars().count(), 401);
     }
 }

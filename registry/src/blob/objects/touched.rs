@@ -1,9 +1,9 @@
-//! When blobs in an object store were last put, by this machine's clock.
+//! Times of the last put of blobs in an object store, by this machine's clock.
 //!
-//! An object cannot be touched, and copying gigabytes onto themselves to make them young costs time and money. So the time is
-//! kept beside the database, which only this store's holder writes either: a file of lines `DIGEST MILLISECONDS` that is
-//! appended to and synced, before the object is sent. A line that does not read was cut short by a loss of power, when nobody
-//! had been told yet. A blob without a line is as old as the server says.
+//! The time of an object cannot be set, and copying gigabytes onto themselves to renew it costs time and money. So the
+//! times are kept beside the database, where only the store's holder writes: a file of lines `DIGEST MILLISECONDS`,
+//! appended and synced before the object is sent. An unreadable line was cut by a power loss before its put was
+//! acknowledged. Without a line the server's time counts.
 
 use std::collections::HashMap;
 use std::fs::{File, OpenOptions};
@@ -15,7 +15,7 @@ use protocol::Digest;
 use crate::blob::disk::{regular, sync_dir};
 use crate::clock;
 
-/// How many lines more than blobs the file may have before it is written anew.
+/// Surplus of lines over blobs at which the file is rewritten.
 const SPARE_LINES: usize = 10_000;
 
 /// Times by digest, and the file that keeps them.
@@ -23,13 +23,13 @@ const SPARE_LINES: usize = 10_000;
 pub(super) struct Touched {
     times: HashMap<Digest, i64>,
     path: PathBuf,
-    /// `None` where the store is only read.
+    /// `None` in a store that is open for reading only.
     file: Option<File>,
     lines: usize,
 }
 
 impl Touched {
-    /// For reading only.
+    /// Reads the file without opening it for writing.
     pub(super) fn read(path: &Path) -> io::Result<Self> {
         let text = match regular(OpenOptions::new().read(true), path).and_then(io::read_to_string) {
             Err(e) if e.kind() == ErrorKind::NotFound => String::new(),
@@ -42,19 +42,19 @@ impl Touched {
         Ok(Self { times: text.lines().filter_map(line).collect(), path: path.to_owned(), file: None, lines: 0 })
     }
 
-    /// For the store's holder.
+    /// Opens the file for writing. Only for the store's holder.
     pub(super) fn open(path: &Path) -> io::Result<Self> {
         let mut touched = Self::read(path)?;
         touched.rewrite()?;
         Ok(touched)
     }
 
-    /// When a blob was last put, if that is known.
+    /// Returns the time of a blob's last put, if it is recorded.
     pub(super) fn at(&self, digest: Digest) -> Option<i64> {
         self.times.get(&digest).copied()
     }
 
-    /// Notes that a blob is put now; returns once that would survive a loss of power.
+    /// Records a put of a blob now and returns when the record is durable.
     pub(super) fn note(&mut self, digest: Digest) -> io::Result<()> {
         let now = clock::now_ms();
         self.times.insert(digest, now);
@@ -67,7 +67,7 @@ impl Touched {
         file.sync_data()
     }
 
-    /// Forgets a blob that has gone. Its line goes when the file is next written anew.
+    /// Forgets a removed blob. Its line disappears with the next rewrite.
     pub(super) fn forget(&mut self, digest: Digest) {
         self.times.remove(&digest);
     }

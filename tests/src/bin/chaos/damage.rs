@@ -1,4 +1,4 @@
-//! Files of a store that change between two runs: an emptied database, and blobs that are other than they were.
+//! Changes to a store's files between two runs: an emptied database, and changed blobs.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -10,12 +10,13 @@ use serde_json::Value;
 
 use crate::hardship::Random;
 
-/// The hardest collection: what no row names goes, however new it is.
+/// The strictest collection: data without a row is deleted, however new it is.
 const COLLECT: [&str; 4] = ["registry", "gc", "--grace", "0"];
-/// How many results are damaged.
+/// Number of damaged results.
 const RESULTS: usize = 3;
 
-/// Empties the database, then damages results of the finished run `view`, and wants each noticed, named, computed again and nothing else touched.
+/// Empties the database, then damages results of the finished run `view`. Checks that each damage is noticed, named and
+/// recomputed, and that nothing else changes.
 pub(crate) fn between_runs(
     cluster: &mut Cluster,
     random: &mut Random,
@@ -67,7 +68,7 @@ pub(crate) fn between_runs(
     Ok(())
 }
 
-/// A refusal counts only if the command itself was understood.
+/// Checks that the command line itself was understood, so that a refusal counts.
 fn understood(said: Said) -> Result<Said, String> {
     if said.stderr.contains("try '--help'") {
         Err(format!("the command line is wrong:\n{}", said.stderr))
@@ -76,7 +77,7 @@ fn understood(said: Said) -> Result<Said, String> {
     }
 }
 
-/// With an empty database nothing may be served, collected or called whole.
+/// Checks that with an empty database nothing is served, collected or reported as intact.
 fn emptied(cluster: &Cluster) -> Result<(), String> {
     let (bench, store) = (cluster.bench(), cluster.bench().store());
     let before = blobs(&store);
@@ -108,7 +109,7 @@ fn emptied(cluster: &Cluster) -> Result<(), String> {
     fs::remove_dir_all(kept).map_err(|e| e.to_string())
 }
 
-/// Every blob's length.
+/// All blobs with their lengths.
 fn blobs(store: &Path) -> BTreeMap<PathBuf, u64> {
     let folders = fs::read_dir(store.join("blobs/sha256")).into_iter().flatten().flatten();
     let files = folders.flat_map(|folder| fs::read_dir(folder.path()).into_iter().flatten().flatten());
@@ -126,8 +127,8 @@ fn blob(store: &Path, digest: &str) -> Option<PathBuf> {
     path.exists().then_some(path)
 }
 
-/// The blobs of a stage's outputs themselves: manifests and the files that they list. What a manifest only mentions, as a report does
-/// the model that it measured, is another stage's.
+/// The blobs of a stage's own outputs: manifests and the files that they list. Data that a manifest only mentions, such
+/// as the model that a report measured, belongs to another stage.
 fn own(outputs: &Value, store: &Path) -> BTreeSet<PathBuf> {
     let digests = outputs.as_object().into_iter().flat_map(|outputs| outputs.values()).filter_map(Value::as_str);
     let mut found = BTreeSet::new();
@@ -140,7 +141,7 @@ fn own(outputs: &Value, store: &Path) -> BTreeSet<PathBuf> {
     found
 }
 
-/// The blobs that a value names, and those that they name.
+/// The blobs that a value names, directly and through other blobs.
 fn named(value: &Value, store: &Path, found: &mut BTreeSet<PathBuf>) {
     match value {
         Value::String(text) => {
@@ -148,7 +149,7 @@ fn named(value: &Value, store: &Path, found: &mut BTreeSet<PathBuf>) {
                 && found.insert(path.clone())
                 && let Some(manifest) = fs::read(&path).ok().and_then(|bytes| serde_json::from_slice(&bytes).ok())
             {
-                // What a manifest came from is another stage's.
+                // The lineage of a manifest belongs to other stages.
                 named(&without_lineage(manifest), store, found);
             }
         }
@@ -173,14 +174,15 @@ fn view_needs(view: &Value, store: &Path, path: &Path) -> bool {
     all.contains(path)
 }
 
-/// Stage, blob and what became of it.
+/// Stage, blob and kind of damage.
 type Damaged = (String, PathBuf, &'static str);
 
 fn damage(random: &mut Random, view: &Value, store: &Path) -> Result<Vec<Damaged>, String> {
     let mut choices: Vec<(String, Vec<PathBuf>)> = Vec::new();
     let stages: Vec<(String, BTreeSet<PathBuf>)> =
         digests(view).into_iter().map(|(stage, outputs)| (stage, own(&outputs, store))).collect();
-    // A model lists the files of its parts: what is there again once the part was made is nothing to notice afterwards.
+    // A model lists the files of its parts. Once a part is recomputed, its damage can no longer be noticed, so shared
+    // blobs are excluded.
     let is_shared = |path: &PathBuf| stages.iter().filter(|(_, all)| all.contains(path)).count() > 1;
     for (stage, all) in &stages {
         let alone: Vec<PathBuf> = all.iter().filter(|path| !is_shared(path)).cloned().collect();
@@ -211,7 +213,7 @@ fn damage(random: &mut Random, view: &Value, store: &Path) -> Result<Vec<Damaged
                 "is empty"
             }
         };
-        // Blobs are read-only; the harness is not bound by that.
+        // Blobs are read-only, but the harness can replace them.
         fs::remove_file(&path)
             .and_then(|()| fs::write(&path, bytes))
             .map_err(|e| format!("{}: {e}", path.display()))?;

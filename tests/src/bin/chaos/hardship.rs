@@ -1,27 +1,41 @@
-//! What a seed is troubled with besides kills, stops and cuts.
+//! Troubles of a seed besides kills, stops and cuts.
 
 use std::str::FromStr;
 
 /// The kind of trouble, as in `disk:3`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Hardship {
-    /// Kills, stops and cuts alone.
+    /// Only kills, stops and cuts.
     None,
-    /// One host is on a slow line all the time.
+    /// One host has a slow line all the time.
     Slow,
+    /// One host has a line of 30 KB/s all the time.
+    Crawl,
+    /// One worker refuses all connections; it connects to others.
+    Refuse,
+    /// Now and then a worker's messages do not reach the others, while it receives theirs.
+    OneWay,
     /// The store's disk is full now and then.
     Full,
-    /// The store's disk stands still now and then.
+    /// Writes to the store's disk block now and then.
     Paused,
-    /// After the run the database is emptied once and blobs of its results are damaged; then the pipeline is submitted again.
+    /// After the run, the database is emptied once and blobs of its results are damaged. Then the pipeline is submitted
+    /// again.
     Damaged,
 }
 
 impl Hardship {
-    const ALL: [(&str, Self); 4] =
-        [("slow", Self::Slow), ("full", Self::Full), ("paused", Self::Paused), ("damaged", Self::Damaged)];
+    const ALL: [(&str, Self); 7] = [
+        ("slow", Self::Slow),
+        ("crawl", Self::Crawl),
+        ("refuse", Self::Refuse),
+        ("oneway", Self::OneWay),
+        ("full", Self::Full),
+        ("paused", Self::Paused),
+        ("damaged", Self::Damaged),
+    ];
 
-    /// Whether the store needs a disk of its own.
+    /// Returns true if the store needs its own disk.
     pub(crate) fn needs_disk(self) -> bool {
         matches!(self, Self::Full | Self::Paused)
     }
@@ -63,7 +77,7 @@ impl std::fmt::Display for Seed {
     }
 }
 
-/// SplitMix64: what happens, and when, is a function of the seed.
+/// SplitMix64: all events and their times are a function of the seed.
 pub(crate) struct Random(pub(crate) u64);
 
 impl Random {
@@ -75,12 +89,12 @@ impl Random {
         z ^ (z >> 31)
     }
 
-    /// In `0..below`.
+    /// Draws from `0..below`.
     pub(crate) fn index(&mut self, below: usize) -> usize {
         (self.next() % below as u64) as usize
     }
 
-    /// In `0..1`.
+    /// Draws from `0..1`.
     pub(crate) fn unit(&mut self) -> f64 {
         (self.next() >> 11) as f64 / (1u64 << 53) as f64
     }

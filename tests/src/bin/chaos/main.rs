@@ -1,8 +1,8 @@
-//! Breaks a training run on purpose, by a seed, and compares what it made with what an undisturbed run makes.
+//! Breaks a training run on purpose, by a seed, and compares its results with those of an undisturbed run.
 //!
-//! A coordinator and three workers as processes; on average every five seconds one of them is killed, stopped for a while,
-//! or cut off the network. In the end every stage must be done, with the digests of one worker that nobody disturbed, and
-//! the store must be whole. See `tests/chaos.sh`.
+//! A coordinator and three workers run as processes. Every five seconds on average, one of them is killed, stopped for
+//! a while, or cut off the network. At the end every stage must be done, with the digests of one undisturbed worker,
+//! and the store must be intact. See `tests/chaos.sh`.
 #![expect(clippy::print_stdout, reason = "a harness prints what it did and measured")]
 
 mod damage;
@@ -43,14 +43,16 @@ const SETS: [&str; 14] = [
 const WORKERS: [&str; 3] = ["w1", "w2", "w3"];
 /// Mean time between two disturbances.
 const MEAN: f64 = 5.0;
-/// A run that gets no further for so long, while the coordinator and a worker are there to work on it, has hung.
+/// Time without progress after which a run has hung, while the coordinator and a worker are available.
 const STUCK: Duration = Duration::from_secs(60);
-/// What comes to a host on a slow line, in kilobits a second.
+/// Bandwidth towards a host on a slow line, in kilobits per second.
 const SLOW: u32 = 4_000;
-/// A run that takes longer has hung.
+/// Bandwidth of a line of 30 KB/s.
+const CRAWL: u32 = 240;
+/// Duration after which a run has hung.
 const LIMIT: Duration = Duration::from_secs(3600);
 
-/// What is run: the quickstart, smaller unless `full`.
+/// Settings of the run: the quickstart, smaller unless `full`.
 fn sets(full: bool) -> Vec<&'static str> {
     let sets: &[&str] = if full { &[] } else { &SETS };
     sets.iter().flat_map(|set| ["--set", *set]).collect()
@@ -64,33 +66,37 @@ fn between(random: &mut Random, low: f64, high: f64) -> Duration {
     Duration::from_secs_f64(low + random.unit() * (high - low))
 }
 
-/// The time to the next disturbance.
+/// Draws the time to the next disturbance.
 fn wait(random: &mut Random) -> Duration {
     Duration::from_secs_f64(-MEAN * (1.0 - random.unit()).ln())
 }
 
-/// What ends a disturbance.
+/// The end of a disturbance.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Remedy {
-    /// A killed worker's successor starts.
+    /// Starts the successor of a killed worker.
     Join(usize),
-    /// A stopped worker goes on.
+    /// Continues a stopped worker.
     Wake(usize),
-    /// A worker's link is mended.
+    /// Restores a worker's link.
     Mend(usize),
+    /// Lets a worker's messages reach the others again.
+    Unmute(usize),
     Serve,
     WakeServer,
-    /// A full disk gets its room back.
+    /// Frees the space of a full disk.
     Empty,
-    /// A paused disk goes on.
+    /// Resumes a paused disk.
     Resume,
 }
 
 struct Chaos {
     cluster: Cluster,
-    /// The store's own; after the cluster, so that nobody holds it when it goes.
+    /// The store's own disk. Declared after the cluster, so that no process holds it when it is dropped.
     disk: Option<Disk>,
     hardship: Hardship,
+    /// The worker that refuses connections.
+    refuses: Option<usize>,
     network: Option<Network>,
     random: Random,
     begun: Instant,
@@ -110,16 +116,26 @@ impl Chaos {
         let address = network.as_ref().map_or_else(Cluster::free_address, Network::coordinator);
         let cluster = Cluster::listen_on(trainer, address, disk.as_ref().map(Disk::path).as_deref());
         let mut random = Random(number);
-        if let Some(network) = network.as_ref().filter(|_| hardship == Hardship::Slow) {
+        let line = match hardship {
+            Hardship::Slow => Some(SLOW),
+            Hardship::Crawl => Some(CRAWL),
+            _ => None,
+        };
+        if let (Some(network), Some(kilobits)) = (&network, line) {
             let host = random.index(WORKERS.len());
-            if network.slow_down(host, SLOW) {
-                println!("  {} is on a line of {SLOW} kbit/s", WORKERS[host]);
+            if network.slow_down(host, kilobits) {
+                println!("  {} is on a line of {kilobits} kbit/s", WORKERS[host]);
             }
+        }
+        let refuses = (hardship == Hardship::Refuse).then(|| random.index(WORKERS.len()));
+        if let Some(i) = refuses {
+            println!("  nobody can connect to {}", WORKERS[i]);
         }
         let mut chaos = Self {
             cluster,
             disk,
             hardship,
+            refuses,
             network,
             random,
             begun: Instant::now(),
@@ -137,10 +153,12 @@ impl Chaos {
     }
 
     fn join(&mut self, i: usize) {
-        match &self.network {
-            Some(network) => self.cluster.join_by(WORKERS[i], &network.inside(i), &[]),
-            None => self.cluster.join(WORKERS[i]),
-        }
+        let wrap = self.network.as_ref().map(|network| network.inside(i)).unwrap_or_default();
+        // Each host has its own loopback. On one machine, the worker listens on the other address family only.
+        let nowhere = format!("{}:{}", if self.network.is_some() { "127.0.0.1" } else { "[::1]" }, 7_800 + i);
+        let refuses = ["--peer-address", &nowhere];
+        let more = if self.refuses == Some(i) { &refuses[..] } else { &[] };
+        self.cluster.join_by(WORKERS[i], &wrap, more);
     }
 
     fn say(&mut self, what: &'static str, who: &str, how_long: Duration) {
@@ -148,7 +166,7 @@ impl Chaos {
         println!("  {:>6.1} s  {what} {who} for {:.1} s", self.begun.elapsed().as_secs_f64(), how_long.as_secs_f64());
     }
 
-    /// One disturbance. What is down already is left alone.
+    /// Causes one disturbance. Does nothing if its target is already down.
     fn disturb(&mut self, view: Option<&Value>) {
         let (dice, i) = (self.random.index(100), self.random.index(WORKERS.len()));
         let now = Instant::now();
@@ -157,6 +175,9 @@ impl Chaos {
             0..25 if self.hardship == Hardship::Paused => {
                 ("pause", Remedy::Resume, between(&mut self.random, 0.5, 15.0))
             }
+            0..30 if self.hardship == Hardship::OneWay => {
+                ("mute", Remedy::Unmute(i), between(&mut self.random, 1.0, 60.0))
+            }
             0..40 => ("kill", Remedy::Join(i), between(&mut self.random, 0.0, 4.0)),
             40..55 => ("stop", Remedy::Wake(i), between(&mut self.random, 0.5, 25.0)),
             55..75 => ("kill", Remedy::Serve, between(&mut self.random, 0.0, 6.0)),
@@ -164,11 +185,11 @@ impl Chaos {
             _ => ("cut off", Remedy::Mend(i), between(&mut self.random, 1.0, 30.0)),
         };
         match remedy {
-            Remedy::Join(i) | Remedy::Wake(i) | Remedy::Mend(i) if self.down[i] => return,
-            // A process that waits for a paused disk takes no signal.
+            Remedy::Join(i) | Remedy::Wake(i) | Remedy::Mend(i) | Remedy::Unmute(i) if self.down[i] => return,
+            // A process that waits for a paused disk handles no signal.
             Remedy::Serve | Remedy::WakeServer if self.server_down || self.disk_down => return,
             Remedy::Empty | Remedy::Resume if self.disk_down || self.server_down || self.disk.is_none() => return,
-            Remedy::Mend(_) if self.network.is_none() => return,
+            Remedy::Mend(_) | Remedy::Unmute(_) if self.network.is_none() => return,
             _ => {}
         }
         match remedy {
@@ -185,13 +206,14 @@ impl Chaos {
             }
             Remedy::Wake(i) => self.cluster.signal(WORKERS[i], Signal::SIGSTOP),
             Remedy::Mend(i) => self.network.as_ref().expect("looked at above").cut(i),
+            Remedy::Unmute(i) => self.network.as_ref().expect("looked at above").mute(i, true),
             Remedy::Serve => self.cluster.kill_server(),
             Remedy::WakeServer => signal(self.cluster.server().expect("it is up"), Signal::SIGSTOP),
             Remedy::Empty => self.disk.as_ref().expect("looked at above").fill(),
             Remedy::Resume => self.disk.as_mut().expect("looked at above").pause(),
         }
         let who = match remedy {
-            Remedy::Join(i) | Remedy::Wake(i) | Remedy::Mend(i) => {
+            Remedy::Join(i) | Remedy::Wake(i) | Remedy::Mend(i) | Remedy::Unmute(i) => {
                 self.down[i] = true;
                 WORKERS[i]
             }
@@ -207,7 +229,7 @@ impl Chaos {
         if let Some(last) = self.kills.last_mut()
             && remedy != Remedy::Join(i)
         {
-            // A recovery that is still under way is not a measurement of that kill alone.
+            // A recovery under way after this is no measurement of that kill alone.
             last.disturbed.get_or_insert(SystemTime::now());
         }
         self.say(what, who, how_long);
@@ -223,20 +245,21 @@ impl Chaos {
                 Remedy::Join(i) => self.join(i),
                 Remedy::Wake(i) => self.cluster.signal(WORKERS[i], Signal::SIGCONT),
                 Remedy::Mend(i) => self.network.as_ref().expect("it was cut").mend(i),
+                Remedy::Unmute(i) => self.network.as_ref().expect("it was muted").mute(i, false),
                 Remedy::Serve => self.cluster.serve(),
                 Remedy::WakeServer => signal(self.cluster.server().expect("it is there"), Signal::SIGCONT),
                 Remedy::Empty => self.disk.as_ref().expect("it was filled").empty(),
                 Remedy::Resume => self.disk.as_mut().expect("it was paused").resume(),
             }
             match remedy {
-                Remedy::Join(i) | Remedy::Wake(i) | Remedy::Mend(i) => self.down[i] = false,
+                Remedy::Join(i) | Remedy::Wake(i) | Remedy::Mend(i) | Remedy::Unmute(i) => self.down[i] = false,
                 Remedy::Serve | Remedy::WakeServer => self.server_down = false,
                 Remedy::Empty | Remedy::Resume => self.disk_down = false,
             }
         }
     }
 
-    /// A coordinator may end when its disk is full, and somebody starts it again; nothing else excuses its end.
+    /// Restarts a coordinator that ended on a full disk. Any other end is an error.
     fn look_after_the_server(&mut self) -> Result<(), String> {
         if self.server_down || self.cluster.serving() {
             return Ok(());
@@ -251,7 +274,7 @@ impl Chaos {
         Ok(())
     }
 
-    /// Disturbs until the run is over.
+    /// Disturbs until the run has ended.
     fn run(&mut self, sets: &[&str]) -> Result<Value, String> {
         let run = self.cluster.submit(&config(), sets);
         let mut next = Instant::now() + wait(&mut self.random);
@@ -296,7 +319,7 @@ impl Chaos {
     }
 }
 
-/// How far each stage is.
+/// Progress of each stage.
 fn progress(view: &Value) -> Vec<(Value, Value)> {
     let stages = view["stages"].as_array().into_iter().flatten();
     stages.map(|stage| (stage["state"].clone(), stage["progress"]["done"].clone())).collect()
@@ -343,8 +366,8 @@ fn reference(trainer: &str, sets: &[&str]) -> Value {
     said.json()
 }
 
-/// How long a worker takes to join a gang that trains about 20 M parameters: weights, both moments and a moving average come from a peer,
-/// over loopback.
+/// Measures the time for a worker to join a gang that trains about 20 M parameters. Weights, both moments and a moving
+/// average come from a peer over loopback.
 fn join_large(trainer: &str) {
     const LARGE: [&str; 9] = [
         "dataset.clips=8",

@@ -1,4 +1,4 @@
-//! How long a gang stands still when a member is killed, from the times in the workers' logs.
+//! Measures the interruption of a gang after a member is killed, from the times in the workers' logs.
 
 use std::time::{Duration, SystemTime};
 
@@ -9,15 +9,15 @@ use serde_json::Value;
 pub(crate) struct Kill {
     pub(crate) at: SystemTime,
     pub(crate) worker: &'static str,
-    /// Who was in its gang, itself among them; empty if it was in none.
+    /// Members of its gang, including itself; empty if it was in none.
     pub(crate) members: Vec<String>,
-    /// Nobody else was down.
+    /// True if no other process was down.
     pub(crate) calm: bool,
-    /// When somebody else was disturbed after it.
+    /// Time of the next disturbance of another process.
     pub(crate) disturbed: Option<SystemTime>,
 }
 
-/// The members of the training gang that `worker` is in.
+/// The members of the training gang that includes `worker`.
 pub(crate) fn gang_of(view: &Value, worker: &str) -> Vec<String> {
     let stages = view["stages"].as_array().into_iter().flatten();
     let training = stages.filter(|stage| stage["progress"]["unit"] == "steps");
@@ -28,14 +28,14 @@ pub(crate) fn gang_of(view: &Value, worker: &str) -> Vec<String> {
     members.into_iter().find(|names| names.iter().any(|name| name == worker)).unwrap_or_default()
 }
 
-/// A line that says that a member met its gang.
+/// A log line that reports that a member met its gang.
 #[derive(Debug)]
 struct Meeting {
     at: SystemTime,
     adopted: Option<Transfer>,
 }
 
-/// A peer's state that a member took over.
+/// A transfer of a peer's state to a member.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Transfer {
     pub(crate) bytes: f64,
@@ -54,12 +54,12 @@ fn transfer(line: &str) -> Option<Transfer> {
     Some(Transfer { bytes: number("bytes=")?, seconds: number("seconds=")? })
 }
 
-/// The states that a worker took over, by its log.
+/// The transfers of states to a worker, from its log.
 pub(crate) fn transfers(log: &str) -> Vec<Transfer> {
     meetings(log).into_iter().filter_map(|meeting| meeting.adopted).collect()
 }
 
-/// `2026-01-31T23:59:59.123456Z`.
+/// Parses `2026-01-31T23:59:59.123456Z`.
 fn time(text: &str) -> Option<SystemTime> {
     let (date, clock) = text.strip_suffix('Z')?.split_once('T')?;
     let mut date = date.split('-').map(|part| part.parse::<i64>().ok());
@@ -67,7 +67,7 @@ fn time(text: &str) -> Option<SystemTime> {
     let mut clock = clock.split(':');
     let (hour, minute) = (clock.next()?.parse::<i64>().ok()?, clock.next()?.parse::<i64>().ok()?);
     let second: f64 = clock.next()?.parse().ok()?;
-    // Days since 1970 in the proleptic Gregorian calendar, with the year beginning in March.
+    // Days since 1970 in the proleptic Gregorian calendar, with the year starting in March.
     let (year, month) = if month <= 2 { (year - 1, month + 9) } else { (year, month - 3) };
     let days = 365 * year + year.div_euclid(4) - year.div_euclid(100) + year.div_euclid(400);
     let days = days + (153 * month + 2) / 5 + day - 1 - 719_468;
@@ -83,7 +83,7 @@ fn spread(name: &str, mut all: Vec<f64>) {
     println!("  {name}: {} times, median {:.2} s, longest {:.2} s", all.len(), all[all.len() / 2], all[all.len() - 1]);
 }
 
-/// Prints what is known about recoveries.
+/// Prints the measured recoveries.
 pub(crate) fn print(kills: &[Kill], logs: &[(&str, String)]) {
     let met: Vec<_> = logs.iter().map(|(name, log)| (*name, meetings(log))).collect();
     let mut recoveries = Vec::new();

@@ -1,4 +1,4 @@
-//! Tries at tasks: how one ends, whether another follows, and with which members a gang goes on.
+//! Attempts at tasks: their ends, their successors, and the members with which a gang continues.
 
 use protocol::message::Member;
 use protocol::{Digest, Fence, TaskId, WorkerId};
@@ -10,12 +10,12 @@ use crate::state::execution::ExecutionState;
 use crate::state::gang::{self, Change};
 use crate::state::task::{Lease, Part, Task};
 
-/// Why a worker no longer holds what it held.
+/// The reason why a worker no longer holds a task.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Loss {
-    /// It was lost: counts against the task's budget.
+    /// The worker was lost; this counts against the task's budget.
     Lost,
-    /// The coordinator's own restart: counts against nothing.
+    /// The coordinator restarted; this counts against no budget.
     Restart,
 }
 
@@ -25,11 +25,15 @@ impl Deciding<'_> {
         let task = &execution.tasks[i];
         let change = match task.part {
             Part::Gang => gang::without(task.holders(), lost, execution.range()),
-            Part::Alone | Part::Shard { .. } | Part::Merge => Change::Disband,
+            Part::Alone | Part::Resolve | Part::Shard { .. } | Part::Merge => Change::Disband,
         };
         match change {
             Change::Keep => {}
             Change::Regroup(members) => self.regroup(key, i, members),
+            Change::Disband if loss == Loss::Lost && self.saves_first(&task.clone(), lost) => {
+                let members = task.holders().iter().filter(|member| !lost.contains(&member.worker)).cloned().collect();
+                self.regroup(key, i, members);
+            }
             Change::Disband if loss == Loss::Restart => {
                 let fence = self.change(key, i, |task| task.release(None));
                 self.fences.push(fence);
@@ -41,9 +45,16 @@ impl Deciding<'_> {
         }
     }
 
-    /// Ends a try. The next begins after a back-off, unless the budget is spent: then the work has failed.
+    /// Returns true if a gang with too few members has one with unsaved state. It saves before the gang is disbanded.
+    fn saves_first(&self, task: &Task, lost: &[WorkerId]) -> bool {
+        let left: Vec<Member> = task.holders().iter().filter(|m| !lost.contains(&m.worker)).cloned().collect();
+        task.part == Part::Gang && !left.is_empty() && self.may_hold(task, &left)
+    }
+
+    /// Ends an attempt. The next one starts after a back-off. If the budget is spent, the execution fails instead.
     pub(crate) fn try_again(&mut self, key: Digest, i: usize, why: &str, fault: bool) {
         let (now, policy) = (self.now(), self.state.policy.clone());
+        self.why = Some(why.to_owned());
         let tried = self.change(key, i, |task| {
             let drain_by = matches!(task.lease, Lease::Held { drain_by: Some(_), .. });
             task.streak += 1;
@@ -58,6 +69,7 @@ impl Deciding<'_> {
             }
             Ok(task.release((!drain_by).then(|| now.after(policy.backoff(task.streak)))))
         });
+        self.why = None;
         match tried {
             Ok(fence) => self.fences.push(fence),
             Err(message) => self.fail_execution(key, message, fault),
@@ -66,7 +78,7 @@ impl Deciding<'_> {
 
     pub(crate) fn fail_execution(&mut self, key: Digest, message: String, own: bool) {
         self.record(Fact::ExecutionState { key, state: ExecutionState::Failed { message, own } });
-        // A worker that is still busy with it can write no more.
+        // Release the held tasks: raising their fences stops workers that are still busy with them from writing.
         let held: Vec<usize> = self.state.executions[&key].tasks.held().collect();
         for i in held {
             let fence = self.change(key, i, |task| task.release(None));
@@ -80,7 +92,7 @@ impl Deciding<'_> {
         self.fences.push(fence);
     }
 
-    /// Unpredictable, and different for every generation.
+    /// Derives the secret of a generation: unpredictable, and different for every fence.
     pub(crate) fn secret(&self, task: &Task) -> impl FnOnce(Fence) -> String + use<> {
         let (entropy, id) = (self.moment.entropy, task.id.clone());
         move |fence| Digest::of(format!("{entropy} {id} {fence}").as_bytes()).hex()
@@ -104,12 +116,6 @@ impl Deciding<'_> {
     pub(crate) fn backoff_over(&mut self, task: &TaskId) -> Result<bool, Rejected> {
         let now = self.now();
         let (key, i) = self.place(task)?;
-        Ok(self.change(key, i, |task| match &mut task.lease {
-            Lease::Waiting { not_before } if not_before.is_some_and(|time| time <= now) => {
-                *not_before = None;
-                true
-            }
-            Lease::Waiting { .. } | Lease::Held { .. } | Lease::Done { .. } => false,
-        }))
+        Ok(self.change(key, i, |task| task.end_backoff(now)))
     }
 }

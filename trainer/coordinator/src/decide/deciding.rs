@@ -1,21 +1,22 @@
-//! A decision under way: the facts so far, what they imply for the store, and what they touch. [`Deciding::record`] is the one way to
-//! change the state; every part of a decision goes through it.
+//! A decision in progress: its facts, the writes that they imply, and the objects that they affect.
+//! [`Deciding::record`] is the only way to change the state; every part of a decision uses it.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use protocol::{Digest, TaskId};
-use registry::Write;
+use registry::{HistoryEntry, Write};
 
 use crate::event::Effect;
 use crate::fact::{Fact, TaskChange};
+use crate::history;
 use crate::rejected::Rejected;
 use crate::state::State;
 use crate::state::run::{Run, Status};
 use crate::state::task::Task;
 use crate::time::{Millis, Moment};
 
-/// A decision under way.
+/// A decision in progress.
 #[derive(Debug)]
 pub(crate) struct Deciding<'a> {
     pub(crate) state: &'a mut State,
@@ -24,11 +25,14 @@ pub(crate) struct Deciding<'a> {
     pub(crate) writes: Vec<Write>,
     pub(crate) fences: Vec<Write>,
     pub(crate) effects: Vec<Effect>,
-    /// Runs that were touched and are not reconciled yet.
+    /// Events for human readers, and the reason of the next fact, if there is one.
+    pub(crate) history: Vec<HistoryEntry>,
+    pub(crate) why: Option<String>,
+    /// Changed runs that are not reconciled yet.
     pub(crate) unreconciled: BTreeSet<u64>,
-    /// Runs that were touched.
+    /// Changed runs.
     pub(crate) runs: BTreeSet<u64>,
-    /// Executions that were touched, or whose users were.
+    /// Changed executions, and executions with a changed user.
     pub(crate) touched: BTreeSet<Digest>,
 }
 
@@ -41,22 +45,25 @@ impl<'a> Deciding<'a> {
             writes: Vec::new(),
             fences: Vec::new(),
             effects: Vec::new(),
+            history: Vec::new(),
+            why: None,
             unreconciled: BTreeSet::new(),
             runs: BTreeSet::new(),
             touched: BTreeSet::new(),
         }
     }
 
-    /// Makes a fact true, and keeps it: the only way to change the state.
+    /// Applies and records a fact. This is the only way to change the state.
     pub(crate) fn record(&mut self, fact: Fact) {
         self.touch(&fact);
+        self.history.extend(history::of(self.state, &fact, self.why.as_deref()));
         if let Err(misfit) = self.state.apply(&fact) {
             panic!("{misfit}: {fact:?}");
         }
         self.facts.push(fact);
     }
 
-    /// Notes what `fact`, which comes next, may have consequences for.
+    /// Notes the objects that `fact`, which is about to be applied, may affect.
     fn touch(&mut self, fact: &Fact) {
         let mut runs = Vec::new();
         match fact {
@@ -77,9 +84,10 @@ impl<'a> Deciding<'a> {
                 }
                 self.touched.extend(stages.iter().filter_map(|(_, status)| status.key()));
             }
-            Fact::StagesAdded { run, .. } | Fact::SweepBegun { run, .. } | Fact::SweepMoved { run, .. } => {
-                runs.push(*run)
-            }
+            Fact::Resolved { run, .. }
+            | Fact::StagesAdded { run, .. }
+            | Fact::SweepBegun { run, .. }
+            | Fact::SweepMoved { run, .. } => runs.push(*run),
             Fact::RunForgotten { run } => {
                 let known = self.state.runs.get(run).into_iter();
                 self.touched.extend(known.flat_map(|run| &run.stages).filter_map(Status::key));
@@ -88,7 +96,14 @@ impl<'a> Deciding<'a> {
             Fact::ExecutionState { key, .. } => {
                 self.touched.insert(*key);
                 self.touched.extend(self.state.mended_for(*key));
-                runs.extend(self.state.executions.get(key).into_iter().flat_map(|execution| execution.users.keys()));
+                runs.extend(
+                    self.state
+                        .executions
+                        .get(key)
+                        .into_iter()
+                        .flat_map(|execution| execution.users.iter())
+                        .map(|(run, _)| *run),
+                );
             }
             Fact::ExecutionPlacement { key, .. }
             | Fact::ExecutionSource { key, .. }
@@ -107,7 +122,7 @@ impl<'a> Deciding<'a> {
         self.runs.extend(runs);
     }
 
-    /// Changes a task: what `change` makes of it is the fact, not how.
+    /// Changes a task and records the difference as a fact.
     pub(crate) fn change<T>(&mut self, key: Digest, i: usize, change: impl FnOnce(&mut Task) -> T) -> T {
         let before = &self.state.executions[&key].tasks[i];
         let mut after = before.clone();
@@ -120,7 +135,7 @@ impl<'a> Deciding<'a> {
         made
     }
 
-    /// Changes a run: what `change` makes of it is the fact, not how.
+    /// Changes a run and records the differences as facts.
     pub(crate) fn change_run<T>(&mut self, number: u64, change: impl FnOnce(&mut Run) -> T) -> T {
         let before = Arc::clone(&self.state.runs[&number]);
         let mut after = Run::clone(&before);
@@ -145,6 +160,11 @@ impl<'a> Deciding<'a> {
                 }
                 None => self.record(Fact::SweepBegun { run: number, sweep: Box::new(Clone::clone(&**sweep)) }),
             }
+        }
+        let places: BTreeSet<usize> = before.resolved.keys().chain(after.resolved.keys()).copied().collect();
+        for stage in places.into_iter().filter(|place| before.resolved.get(place) != after.resolved.get(place)) {
+            let digests = after.resolved.get(&stage).cloned().unwrap_or_default();
+            self.record(Fact::Resolved { run: number, stage, digests });
         }
         let is_new = |(i, status): &(usize, &Status)| before.stages.get(*i).unwrap_or(&Status::Waiting) != *status;
         let stages: Vec<(usize, Status)> =

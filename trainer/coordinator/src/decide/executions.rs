@@ -1,4 +1,4 @@
-//! Executions: what the store knows of a stage, what an earlier try left, and what becomes of it.
+//! Results of lookups for executions: a stored value, data of an earlier try, or the need to compute.
 
 use std::sync::Arc;
 
@@ -9,6 +9,7 @@ use registry::Write;
 use super::deciding::Deciding;
 use crate::event::Effect;
 use crate::fact::Fact;
+use crate::register::Registration;
 use crate::rejected::Rejected;
 use crate::state::execution::{ExecutionState, StageExecution};
 use crate::state::task::Task;
@@ -38,9 +39,9 @@ impl Deciding<'_> {
                 self.record(Fact::ExecutionState { key, state });
             }
             (None, Some(registration)) => {
-                let candidates = registration.candidates.clone();
+                let effect = self.registering(&execution, registration);
                 self.record(Fact::ExecutionState { key, state: ExecutionState::Bundling });
-                self.effects.push(Effect::Register { key, candidates });
+                self.effects.push(effect);
             }
             (None, None) => {
                 let fence = self.state.fence;
@@ -55,7 +56,7 @@ impl Deciding<'_> {
         true
     }
 
-    /// Goes on from what an earlier try left.
+    /// Restores the tasks, budgets and working time of an earlier try.
     fn take_up(&mut self, archived: &StageExecution) {
         let (key, fence) = (archived.key, self.state.fence);
         let again = |task: &Task| {
@@ -76,11 +77,19 @@ impl Deciding<'_> {
         self.writes.push(Write::Archive { key, run, stage: archived.stage.clone(), execution: None });
     }
 
-    /// It goes on from something that an earlier try has saved.
+    /// Records that an execution continues from data of an earlier try.
     pub(crate) fn resumed(&mut self, key: Digest) {
         if !self.state.executions[&key].resumed {
             self.record(Fact::ExecutionResumed { key });
         }
+    }
+
+    /// The effect that makes the bundles of a registration.
+    pub(crate) fn registering(&self, execution: &StageExecution, registration: &Registration) -> Effect {
+        let owner = self.state.registrant(execution).map(|run| run.owner.clone()).unwrap_or_default();
+        let promotes = registration.promote.as_ref().map(|(alias, _)| alias.clone());
+        let candidates = registration.candidates.clone();
+        Effect::Register { key: execution.key, candidates, promotes, owner }
     }
 
     pub(crate) fn bundled(&mut self, key: Digest, bundles: &[Digest]) -> Result<bool, Rejected> {
@@ -93,7 +102,12 @@ impl Deciding<'_> {
         if bundles.len() != registration.candidates.len() {
             return Err(Rejected::Invalid(format!("stage `{}` needs a bundle for each candidate", execution.stage)));
         }
-        let (known, mut writes) = registration.writes(&execution.run, &execution.stage, bundles);
+        let Some(run) = self.state.registrant(&execution).cloned() else {
+            // The run that registers was cancelled meanwhile.
+            self.fail_execution(key, "no run waits for this registration".to_owned(), false);
+            return Ok(true);
+        };
+        let (known, mut writes) = registration.writes(&run, &execution.stage, bundles);
         writes.push(result(&execution, None, &known, now));
         let state = ExecutionState::Done { known: Arc::new(known), cached: false };
         self.record(Fact::ExecutionState { key, state });
@@ -102,7 +116,7 @@ impl Deciding<'_> {
     }
 }
 
-/// The write that makes a stage's value known under its key.
+/// The write that stores a stage's value under its key.
 pub(crate) fn result(execution: &StageExecution, grant: Option<Grant>, known: &Known, now: Millis) -> Write {
     Write::StageResult {
         grant,

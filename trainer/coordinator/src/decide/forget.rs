@@ -1,4 +1,4 @@
-//! What has ended leaves memory for the tables.
+//! Removal of ended runs and unused executions from memory; their data stays in the tables.
 
 use registry::Write;
 
@@ -8,7 +8,7 @@ use crate::fact::Fact;
 use crate::state::execution::ExecutionState;
 
 impl Deciding<'_> {
-    /// Runs that have ended go, then executions that nobody waits for or works on.
+    /// Removes ended runs, then executions without a waiting run and without a busy worker.
     pub(crate) fn forget(&mut self) {
         for number in std::mem::take(&mut self.runs) {
             let Some(run) = self.state.runs.get(&number).filter(|run| run.state.is_final()).cloned() else { continue };

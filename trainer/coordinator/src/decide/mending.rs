@@ -1,7 +1,7 @@
-//! Inputs that a worker found damaged or missing are made again, while what reads them waits.
+//! Recomputation of inputs that a worker found damaged or missing; their readers wait.
 //!
-//! Runs keep their values meanwhile: what is made again is what was there. Only what the coordinator has in memory can be made again, which
-//! is all of a run since it was submitted; of others the next submission finds the damage.
+//! Runs keep their values meanwhile, because recomputation gives the same value. Only executions in memory can be
+//! recomputed, which are all of a run since its submission. The next submission finds other damage.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -14,8 +14,8 @@ use crate::fact::Fact;
 use crate::state::execution::ExecutionState;
 
 impl Deciding<'_> {
-    /// A try at task `i` of an execution has found something damaged. It counts as a fault, so that a disk that damages everything is
-    /// not written to for ever.
+    /// Handles an attempt at task `i` that found a damaged input. It counts as a fault, which ends the writing to a
+    /// disk that damages everything.
     pub(crate) fn mend(&mut self, key: Digest, i: usize, message: &str) {
         let givers = self.givers(key);
         if givers.is_empty() {
@@ -25,14 +25,14 @@ impl Deciding<'_> {
         if self.state.executions[&key].state != ExecutionState::Open {
             return;
         }
-        // The others read the same.
+        // The other tasks read the same inputs.
         for i in self.state.executions[&key].tasks.held().collect::<Vec<_>>() {
             let fence = self.change(key, i, |task| task.release(None));
             self.fences.push(fence);
         }
         for (giver, (number, stage)) in &givers {
             let (execution, run) = (Arc::clone(&self.state.executions[giver]), Arc::clone(&self.state.runs[number]));
-            // Others may have found the damage before.
+            // Another reader may have found the damage before.
             if execution.is_over() {
                 self.want_again(&execution, &run, stage, true);
                 self.effects.push(Effect::Lookup { key: *giver });
@@ -44,14 +44,13 @@ impl Deciding<'_> {
         });
     }
 
-    /// The executions that gave what an execution reads, each with a run and a stage that have it.
+    /// The executions that produced the inputs of an execution, each with a run and a stage that have its value.
     fn givers(&self, key: Digest) -> BTreeMap<Digest, (u64, StageName)> {
         let execution = &self.state.executions[&key];
         let mut givers = BTreeMap::new();
-        for run in execution.users.keys().filter_map(|number| self.state.runs.get(number)) {
-            // One that is made again itself is done, as its run has it.
-            let readers = run.stages.iter().enumerate().filter(|(_, status)| status.key() == Some(key));
-            for input in readers.flat_map(|(stage, _)| &run.pipeline.stages[stage].inputs) {
+        for (number, stage) in &execution.users {
+            let Some(run) = self.state.runs.get(number) else { continue };
+            for input in &run.pipeline.stages[*stage].inputs {
                 let Some(status) = run.status(&input.stage) else { continue };
                 let (Some(giver), Some(known)) = (status.key(), status.known()) else { continue };
                 let is_read = known.outputs.values().any(|output| execution.inputs.values().any(|read| read == output));
@@ -63,7 +62,7 @@ impl Deciding<'_> {
         givers
     }
 
-    /// What waited for its inputs to be made again goes on once they are, and fails if they cannot be.
+    /// Reopens executions whose inputs have been recomputed, and fails those whose inputs cannot be.
     pub(crate) fn go_on_with_whole_inputs(&mut self, number: u64) {
         let run = Arc::clone(&self.state.runs[&number]);
         for (_, key) in run.all_active() {
@@ -76,11 +75,11 @@ impl Deciding<'_> {
                 let failed = inputs.iter().find_map(|input| match state(input) {
                     Some(ExecutionState::Failed { message, .. }) => Some(message.clone()),
                     Some(_) => None,
-                    None => Some("it is not known any more".to_owned()),
+                    None => Some("it is no longer known".to_owned()),
                 });
                 let is_whole = inputs.iter().all(|input| matches!(state(input), Some(ExecutionState::Done { .. })));
                 if let Some(why) = failed {
-                    self.fail_execution(key, format!("an input was damaged and could not be made again: {why}"), false);
+                    self.fail_execution(key, format!("a damaged input could not be recomputed: {why}"), false);
                 } else if is_whole {
                     self.record(Fact::ExecutionState { key, state: ExecutionState::Open });
                 }

@@ -1,20 +1,25 @@
-//! The only one who decides: (state, moment, event) to facts and effects.
+//! Turns (state, moment, event) into facts and effects. No other code decides.
 //!
-//! Nothing here reads a clock, a socket or a generator. What is decided is a list of facts; `Deciding::record` is the one way to
-//! change the state, and keeps each fact. They are stored in the same transaction as the rows that they imply, before any other effect;
-//! recovery applies them and decides nothing again. After the event itself, every run that it touched is reconciled (stages whose work is
-//! over, stages whose inputs are there), work that nobody wants is asked to drain, idle workers are given what is ready, and what has
-//! ended leaves memory for the tables.
+//! Nothing here reads a clock, a socket or a generator. A decision is a list of facts; `Deciding::record` is the only
+//! way to change the state, and keeps each fact. The facts are stored in one transaction with the rows that they imply,
+//! before any other effect. Recovery applies them without deciding again. A decision has these steps:
 //!
-//! A decision looks at what its facts touch, and at no other run or execution: what it costs does not grow with what there ever was.
+//! 1. Apply the event itself.
+//! 2. Reconcile every run that it touched: stages whose work is over, stages whose inputs are available.
+//! 3. Ask workers on unwanted work to drain.
+//! 4. Assign ready work to idle workers.
+//! 5. Move ended runs and unused executions from memory to the tables.
 //!
-//! This file says in which order things happen, one file for each topic what happens: those beside it, `outcome`, `reconcile`, `sweep` and
-//! `schedule`. All of them stand on `deciding`.
+//! A decision inspects only the objects that its facts touch, so its cost does not grow with the number of past runs.
+//!
+//! This file defines the order of the steps. Each topic has a file of its own: those in this folder, `outcome`,
+//! `reconcile`, `sweep` and `schedule`. All of them build on `deciding`.
 
 pub(crate) mod attempts;
 pub(crate) mod deciding;
 pub(crate) mod executions;
 mod forget;
+mod gangs;
 mod mending;
 mod runs;
 mod start;
@@ -34,8 +39,8 @@ use crate::state::execution::ExecutionState;
 use crate::state::worker::Sign;
 use crate::time::Moment;
 
-/// Decides what `event` does. `state` is changed only by an accepted event; an event that changes nothing has no effect
-/// but the answer to its sender.
+/// Decides on `event`. Only an accepted event changes `state`. An event that changes nothing has no effect except the
+/// answer to its sender.
 pub fn decide(state: &mut State, moment: Moment, event: Event) -> Result<Vec<Effect>, Rejected> {
     let moment = Moment { now: moment.now.max(state.now), ..moment };
     let mut cx = Deciding::new(state, moment);
@@ -49,28 +54,31 @@ pub fn decide(state: &mut State, moment: Moment, event: Event) -> Result<Vec<Eff
     schedule::schedule(&mut cx);
     cx.count_time();
     cx.forget();
-    let Deciding { state, facts, mut writes, mut fences, mut effects, .. } = cx;
+    let Deciding { state, facts, mut writes, mut fences, mut effects, history, .. } = cx;
     (state.seq, state.now) = (state.seq + 1, moment.now);
     state.recorded += facts.len() as u64;
     let decision = Decision { now: moment.now, facts };
     let mut stored = vec![Write::Facts { seq: state.seq, facts: decision.to_json() }];
-    // What a grant vouches for comes before the fences that may end that very grant.
+    // Writes that need a valid grant precede the fences that may end the same grant.
     stored.append(&mut writes);
     stored.append(&mut fences);
+    if !history.is_empty() {
+        stored.push(Write::History(history));
+    }
     effects.insert(0, Effect::Store(stored));
     effects.push(Effect::Wake);
     Ok(effects)
 }
 
 impl Deciding<'_> {
-    /// The event itself. `false`: it changes nothing.
+    /// Applies the event itself. Returns `false` if it changes nothing.
     fn happen(&mut self, event: Event) -> Result<bool, Rejected> {
         match event {
             Event::Started { alone, park } => self.started(alone, park),
-            Event::Submit { pipeline, source, idempotency_key, until } => {
-                return self.submit(*pipeline, source, idempotency_key, until);
+            Event::Submit { pipeline, source, idempotency_key, until, owner } => {
+                return self.submit(*pipeline, source, idempotency_key, until, owner);
             }
-            Event::Join { join } => self.join(join)?,
+            Event::Join { join, by } => self.join(join, by)?,
             Event::WorkerBack { worker } => return self.sign(&worker, Sign::Back),
             Event::WorkerReady { worker, incarnation, tasks } => return self.ready(worker, incarnation, tasks),
             Event::LeaseExpired { worker, incarnation } => {
@@ -86,13 +94,17 @@ impl Deciding<'_> {
                 }
                 self.record(Fact::WorkerForgotten { worker });
             }
-            Event::WorkerGone { worker } => {
+            Event::WorkerGone { worker, incarnation } => {
+                if let Some(incarnation) = incarnation {
+                    self.state.process(&worker, incarnation)?;
+                }
                 if !self.sign(&worker, Sign::Gone)? {
                     return Ok(false);
                 }
                 self.drop_worker(&worker, Loss::Lost);
             }
-            Event::PeersLost { grant, lost } => return self.peers_lost(&grant, &lost),
+            Event::GangDivided { task, fence } => return self.gang_divided(&task, fence),
+            Event::GangStalled { task, fence } => return self.gang_stalled(&task, fence),
             Event::Checkpoint { commit } => return self.checkpoint(commit),
             Event::Outcome { report } => return self.outcome(report),
             Event::Control { run, action, archived } => return self.control(&run, action, archived),

@@ -1,11 +1,11 @@
-//! Runs: how they begin, and what clients ask of them.
+//! Submission and control of runs.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use protocol::message::RunState;
 use protocol::pipeline::Pipeline;
-use protocol::{RunId, StageName, limits};
+use protocol::{Owner, RunId, StageName, limits};
 use registry::Write;
 
 use super::deciding::Deciding;
@@ -22,17 +22,26 @@ impl Deciding<'_> {
         source: String,
         key: Option<String>,
         until: Option<StageName>,
+        owner: Owner,
     ) -> Result<bool, Rejected> {
-        // A run that has ended is found in the tables, before the event.
-        let twin = self.state.runs.values().find(|run| key.is_some() && run.idempotency_key == key);
-        if let Some(twin) = twin {
+        // The caller has already looked for ended runs in the tables.
+        let twin = key.as_ref().and_then(|key| self.state.idempotent.get(key));
+        if let Some(twin) = twin.and_then(|number| self.state.runs.get(number)) {
             self.effects.push(Effect::Submitted(twin.id.clone()));
             return Ok(false);
         }
         check_pipeline(&pipeline, until.as_ref())?;
-        let run = Run::new(self.state.submitted + 1, Arc::new(pipeline), key, until);
-        for old in self.state.runs.values().cloned().collect::<Vec<_>>() {
-            if old.parked && old.state == RunState::Paused && old.submitted.digest() == run.submitted.digest() {
+        let run = Run::new(self.state.submitted + 1, owner, Arc::new(pipeline), key, until);
+        if let Some(id) = self.interrupted_twin(&run) {
+            self.control(&id, Control::Resume, None)?;
+            self.effects.push(Effect::Submitted(id));
+            return Ok(true);
+        }
+        self.check_room()?;
+        for old in self.interrupted() {
+            // An interrupted run of another owner stays interrupted.
+            let is_its_own = run.owner.controls(&old.owner.group());
+            if is_its_own && old.submitted.digest() == run.submitted.digest() {
                 self.change_run(old.number, |old| old.skip_rest(&format!("taken over by run `{}`", run.id)));
                 self.set_run_state(old.number, RunState::Cancelled, old.parked);
             }
@@ -44,9 +53,38 @@ impl Deciding<'_> {
             state: word(run.state),
             idempotency_key: run.idempotency_key.clone(),
         });
+        self.writes.push(Write::RunOwner { run: run.id.clone(), owner: run.owner.group() });
         self.effects.push(Effect::Submitted(run.id.clone()));
         self.record(Fact::Run { run: Box::new(run) });
         Ok(true)
+    }
+
+    /// Refuses another run if the limit is reached.
+    fn check_room(&self) -> Result<(), Rejected> {
+        let (live, most) = (self.state.runs.size(), self.state.policy.live_runs);
+        if live < most {
+            return Ok(());
+        }
+        Err(Rejected::Full(format!("{live} runs are active; expected at most {most}")))
+    }
+
+    /// Interrupted runs in the order of their submission.
+    fn interrupted(&self) -> Vec<Arc<Run>> {
+        let parked = self.state.parked.iter().filter_map(|number| self.state.runs.get(number));
+        parked.filter(|old| old.is_interrupted()).cloned().collect()
+    }
+
+    /// The newest interrupted run equivalent to `run`, if `run` has no idempotency key.
+    fn interrupted_twin(&self, run: &Run) -> Option<RunId> {
+        if run.idempotency_key.is_some() {
+            return None;
+        }
+        let same = |old: &&Arc<Run>| {
+            run.owner.controls(&old.owner.group())
+                && old.until == run.until
+                && old.submitted.digest() == run.submitted.digest()
+        };
+        self.interrupted().iter().rev().find(same).map(|old| old.id.clone())
     }
 
     pub(crate) fn control(
@@ -69,6 +107,7 @@ impl Deciding<'_> {
             return Ok(false);
         }
         if !known {
+            self.check_room()?;
             self.record(Fact::Run { run: Box::new(Run::clone(&run)) });
         }
         match action {
@@ -83,20 +122,20 @@ impl Deciding<'_> {
     pub(crate) fn set_run_state(&mut self, number: u64, state: RunState, parked: bool) {
         let run = self.state.runs[&number].id.clone();
         self.record(Fact::RunState { run: number, state, parked });
-        // The row of one that ends is written when it leaves memory, at the end of this decision.
+        // The row of an ended run is written at the end of this decision, when the run leaves memory.
         if !state.is_final() {
             self.writes.push(Write::RunState { run, state: word(state) });
         }
     }
 }
 
-/// A run's state as it stands in its row.
+/// The name of a run's state in its row.
 pub(crate) fn word(state: RunState) -> String {
     let state = serde_json::to_value(state).expect("a state is a word");
     state.as_str().unwrap_or_default().to_owned()
 }
 
-/// What even a pipeline from an honest client of another build may get wrong.
+/// Checks a pipeline for mistakes that even an honest client of another build can make.
 fn check_pipeline(pipeline: &Pipeline, until: Option<&StageName>) -> Result<(), Rejected> {
     if pipeline.stages.len() > limits::STAGES {
         let stages = pipeline.stages.len();
@@ -110,19 +149,19 @@ fn check_pipeline(pipeline: &Pipeline, until: Option<&StageName>) -> Result<(), 
         for input in &stage.inputs {
             if !seen.contains(&input.stage) {
                 return Err(Rejected::Invalid(format!(
-                    "stage `{}`: `{}` names stage `{}`, which does not stand before it",
+                    "stage `{}`: `{}` names stage `{}`, which is not an earlier stage",
                     stage.name, input.field, input.stage
                 )));
             }
         }
         if !seen.insert(&stage.name) {
-            return Err(Rejected::Invalid(format!("stage `{}` stands twice in the pipeline", stage.name)));
+            return Err(Rejected::Invalid(format!("stage `{}` is in the pipeline twice", stage.name)));
         }
     }
     match until {
         Some(until) if !seen.contains(until) => {
             let names: Vec<&str> = seen.iter().map(|name| name.as_str()).collect();
-            Err(Rejected::Invalid(format!("`until`: there is no stage `{until}`; there is: {}", names.join(", "))))
+            Err(Rejected::Invalid(format!("`until`: unknown stage `{until}`; expected one of: {}", names.join(", "))))
         }
         Some(_) | None => Ok(()),
     }

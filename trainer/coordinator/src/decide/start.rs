@@ -1,4 +1,4 @@
-//! What a coordinator makes of what another one left.
+//! Recovery after a start of the coordinator.
 
 use std::sync::Arc;
 
@@ -19,12 +19,12 @@ impl Deciding<'_> {
         let keys: Vec<Digest> = self.state.executions.keys().copied().collect();
         for key in keys {
             let execution = Arc::clone(&self.state.executions[&key]);
-            // The time during which no coordinator ran is nobody's work.
+            // Time without a running coordinator does not count as work.
             if let Some(since) = execution.busy_since {
                 let wall_ms = execution.wall_ms + before.since(since);
                 self.record(Fact::ExecutionTime { key, wall_ms, busy_since: None });
             }
-            // Workers that are still busy go on as if nothing had been.
+            // Workers that are still busy continue undisturbed.
             if execution.state == ExecutionState::Open && execution.has_something() && (alone || !execution.is_busy()) {
                 self.resumed(key);
             }
@@ -32,8 +32,7 @@ impl Deciding<'_> {
                 ExecutionState::Looking => self.effects.push(Effect::Lookup { key }),
                 ExecutionState::Bundling => {
                     let registration = execution.registration.as_ref().expect("bundling is registering");
-                    let candidates = registration.candidates.clone();
-                    self.effects.push(Effect::Register { key, candidates });
+                    self.effects.push(self.registering(&execution, registration));
                 }
                 ExecutionState::Open
                 | ExecutionState::Mending { .. }
@@ -48,7 +47,7 @@ impl Deciding<'_> {
                 self.drop_worker(&worker, Loss::Restart);
                 self.record(Fact::WorkerForgotten { worker });
             } else {
-                Arc::make_mut(&mut self.state.heard.workers).insert(worker, now);
+                self.state.heard.workers.insert_mut(worker, now);
             }
         }
         if park {

@@ -1,9 +1,8 @@
-//! Worker processes: that they come, are heard, fall silent and go.
+//! Life of worker processes: join, poll, silence and end.
 
 use std::collections::BTreeSet;
-use std::sync::Arc;
 
-use protocol::message::{Grant, Join};
+use protocol::message::Join;
 use protocol::{Incarnation, TaskId, WorkerId};
 
 use super::attempts::Loss;
@@ -11,23 +10,27 @@ use super::deciding::Deciding;
 use crate::event::Effect;
 use crate::fact::Fact;
 use crate::rejected::Rejected;
-use crate::state::worker::{Sign, Worker};
+use crate::state::worker::{Identity, Sign, Worker};
 
 impl Deciding<'_> {
-    pub(crate) fn join(&mut self, join: Join) -> Result<(), Rejected> {
+    /// Assigns a worker name to a new process, if the old process has ended or is the same.
+    pub(crate) fn join(&mut self, join: Join, by: Identity) -> Result<(), Rejected> {
         if !protocol::id::is_name(join.worker.as_str()) {
             return Err(Rejected::Invalid(format!("`{}` is not a worker name", join.worker)));
         }
+        if let Some(known) = self.state.workers.get(&join.worker) {
+            known.gives_way_to(&join.worker, &by)?;
+        }
         self.drop_worker(&join.worker, Loss::Lost);
-        let process = Worker::joined(&join, self.state.incarnation.next());
+        let process = Worker::joined(&join, by, self.state.incarnation.next());
         self.effects.push(Effect::Joined(process.incarnation));
         let now = self.now();
-        Arc::make_mut(&mut self.state.heard.workers).insert(join.worker.clone(), now);
+        self.state.heard.workers.insert_mut(join.worker.clone(), now);
         self.record(Fact::Worker { worker: join.worker, process });
         Ok(())
     }
 
-    /// Takes note of what a worker has fetched ahead; `false` if all of that is known or over.
+    /// Notes the tasks whose inputs a worker has fetched. Returns `false` if none is new.
     pub(crate) fn ready(
         &mut self,
         worker: WorkerId,
@@ -44,11 +47,12 @@ impl Deciding<'_> {
         Ok(true)
     }
 
-    /// Takes note of a sign of a known worker; `false` if it says nothing new.
+    /// Applies a sign to a known worker. Returns `false` if it changes nothing.
     pub(crate) fn sign(&mut self, worker: &WorkerId, sign: Sign) -> Result<bool, Rejected> {
         let known = self.state.workers.get(worker);
         let known = known.ok_or_else(|| Rejected::NotFound(format!("worker `{worker}` is not known")))?;
-        if known.presence.after(sign, self.now()) == known.presence {
+        let is_over = known.shunned.is_some_and(|until| until <= self.now()) && sign == Sign::Back;
+        if known.presence.after(sign, self.now()) == known.presence && !is_over {
             return Ok(false);
         }
         self.set_presence(worker, sign);
@@ -60,34 +64,10 @@ impl Deciding<'_> {
         let Some(known) = self.state.workers.get(worker) else { return };
         let mut process = known.clone();
         process.presence = process.presence.after(sign, now);
-        process.suspicions += u32::from(sign == Sign::PeersLost);
+        process.shunned = process.shunned.filter(|until| sign != Sign::Back || *until > now);
         if process != *known {
             self.record(Fact::Worker { worker: worker.clone(), process });
         }
-    }
-
-    /// A member of a gang says whom it cannot reach; `false` if those are no members any more.
-    pub(crate) fn peers_lost(&mut self, grant: &Grant, lost: &[WorkerId]) -> Result<bool, Rejected> {
-        let (_, task) = self.state.task(&grant.task)?;
-        task.check(grant)?;
-        let members = task.holders().iter().map(|member| &member.worker);
-        let lost: Vec<WorkerId> =
-            members.filter(|worker| **worker != grant.worker && lost.contains(worker)).cloned().collect();
-        if lost.is_empty() {
-            return Ok(false);
-        }
-        self.suspect(&grant.task, &lost)?;
-        Ok(true)
-    }
-
-    /// Takes members out of a gang whose peers cannot reach them.
-    pub(crate) fn suspect(&mut self, task: &TaskId, lost: &[WorkerId]) -> Result<(), Rejected> {
-        for worker in lost {
-            self.set_presence(worker, Sign::PeersLost);
-        }
-        let (key, i) = self.place(task)?;
-        self.take_from(key, i, lost, Loss::Lost);
-        Ok(())
     }
 
     pub(crate) fn drop_worker(&mut self, worker: &WorkerId, loss: Loss) {

@@ -1,8 +1,7 @@
-//! Every point of a space of choices, in the order of the settings' names; the last one turns fastest.
+//! All points of a space of choices, in the order of the settings' names; the last setting varies fastest.
 
 use protocol::sweep::{Domain, MAX_TRIALS, Sweep, Values};
 
-/// All points.
 pub(super) fn points(sweep: &Sweep) -> Vec<Values> {
     let mut points = vec![Values::new()];
     for (path, domain) in &sweep.space {

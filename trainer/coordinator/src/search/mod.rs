@@ -1,17 +1,17 @@
-//! Who is tried next: a sweep's searcher as a pure fold over its results.
+//! The searcher of a sweep, which chooses the next trials: a pure fold over results.
 //!
-//! Work is handed out as numbered tickets, one rung of one trial each. Results come in any order, but they are folded in the order of the
-//! tickets, and ticket `n` is issued as a function of the results of tickets `0..=n - parallel` alone. So neither the number of workers nor
-//! who is fast, who is killed and who starts again can change a trial, a rung or the best: the decisions are a function of the sweep and the
-//! seed. The price is that a slow ticket holds up those `parallel` behind it.
+//! Work is issued as numbered tickets, each for one rung of one trial. Results arrive in any order but are folded in
+//! the order of tickets. Ticket `n` is a function of the results of tickets `0..=n - parallel` only. The decisions are
+//! therefore a function of the sweep and the seed: neither the number of workers nor their speed or restarts can change
+//! a trial, a rung or the best. The price is that a slow ticket delays the `parallel` tickets after it.
 //!
-//! | question | answered by |
+//! | question | answer |
 //! |---|---|
-//! | which points are tried, and in which order | `grid`, `random`: fixed before anything runs, all different |
-//! | who goes on to the next rung | `asha` |
-//! | who is best | the best result of the last rung; of equals the trial with the lower number |
+//! | points to try, and their order | `grid`, `random`: fixed in advance, all different |
+//! | trial to advance to the next rung | `asha` |
+//! | best trial | the best result of the last rung; in a tie, the lower trial number |
 //!
-//! A trial that failed or whose metric is no finite number has a result like any other: the worst.
+//! A trial that failed or has a non-finite metric counts as the worst result.
 
 mod asha;
 mod grid;
@@ -29,33 +29,29 @@ use serde::{Deserialize, Serialize};
 pub use self::score::Score;
 use self::score::Standing;
 
-/// A thing to do.
+/// A unit of work for a sweep.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Ticket {
-    /// Train a trial up to the end of a rung, and measure it.
-    Rung {
-        /// Which trial.
-        trial: usize,
-        /// Which rung.
-        rung: usize,
-    },
-    /// Nothing: with what is known now there is nothing to do. It keeps the count of tickets in step with the results.
+    /// Train a trial to the end of a rung, and evaluate it.
+    Rung { trial: usize, rung: usize },
+    /// No work can be chosen from the current results. An idle ticket keeps the number of tickets in step with the
+    /// results.
     Idle,
 }
 
-/// What became of a searcher, without the rules by which: as they are kept.
+/// The changes of a searcher, without the rules that caused them, as stored.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Progress {
-    /// Tickets that were issued.
+    /// Newly issued tickets.
     pub tickets: Vec<Ticket>,
-    /// Results that came, by ticket.
+    /// New results, by ticket.
     pub scores: Vec<(usize, Score)>,
-    /// Tickets whose results count now.
+    /// Number of tickets whose results are folded.
     pub folded: usize,
 }
 
-/// A searcher and all that it knows.
+/// A searcher with its results.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Search {
     kind: SearchKind,
@@ -63,22 +59,22 @@ pub struct Search {
     factor: usize,
     parallel: usize,
     rungs: Vec<u64>,
-    /// Never changes; shared, because a decision copies the state.
+    /// Constant; shared, because a decision copies the state.
     #[serde(with = "crate::state::shared")]
     trials: Arc<Vec<Values>>,
     tickets: Vec<Ticket>,
-    /// By ticket; filled in any order.
+    /// Results by ticket, filled in any order.
     scores: Vec<Option<Score>>,
-    /// Tickets whose results count already.
+    /// Number of tickets whose results are folded.
     folded: usize,
-    /// Results that count, by trial and rung.
+    /// Folded results by trial and rung.
     known: Vec<Vec<Score>>,
-    /// Rungs issued, by trial.
+    /// Number of issued rungs, by trial.
     issued: Vec<usize>,
 }
 
 impl Search {
-    /// The searcher of `sweep` on stage `name` with `settings`, before it has issued anything.
+    /// Creates the searcher of `sweep` for stage `name` with `settings`, with its first tickets.
     pub fn new(sweep: &Sweep, settings: &StageSettings, name: &StageName, seed: Seed) -> Self {
         let trials = match sweep.search {
             SearchKind::Grid => grid::points(sweep),
@@ -105,7 +101,7 @@ impl Search {
         search
     }
 
-    /// Takes note of the result of a ticket and issues what follows from it; a second result of a ticket is ignored.
+    /// Adds the result of a ticket and returns the newly issued tickets. A second result of a ticket is ignored.
     pub fn report(&mut self, ticket: usize, score: Score) -> Range<usize> {
         let before = self.tickets.len();
         if let Some(place @ None) = self.scores.get_mut(ticket) {
@@ -137,7 +133,7 @@ impl Search {
     }
 
     fn next(&self) -> Ticket {
-        // Every point is looked at before budget goes into the best of some.
+        // Every point gets its first rung before the best ones get more.
         if let Some(trial) = self.issued.iter().position(|rungs| *rungs == 0) {
             return Ticket::Rung { trial, rung: 0 };
         }
@@ -158,12 +154,12 @@ impl Search {
         Standing { mode, factor, rungs, known: &self.known, issued: &self.issued }
     }
 
-    /// Whether nothing is under way and nothing will be.
+    /// Returns true if no work is in progress and none will be issued.
     pub fn is_over(&self) -> bool {
         self.tickets[self.folded..].iter().all(|ticket| *ticket == Ticket::Idle) && self.next() == Ticket::Idle
     }
 
-    /// What has become of it since `before`.
+    /// The changes since `before`.
     pub fn since(&self, before: &Self) -> Progress {
         let tickets = self.tickets[before.tickets.len()..].to_vec();
         let new = |(ticket, score): (usize, &Option<Score>)| {
@@ -175,7 +171,7 @@ impl Search {
         Progress { tickets, scores, folded: self.folded }
     }
 
-    /// Takes note of what has become of it; asks no rule.
+    /// Applies stored changes without evaluating any rule.
     pub fn follow(&mut self, progress: &Progress) {
         for ticket in &progress.tickets {
             if let Ticket::Rung { trial, .. } = ticket
@@ -206,12 +202,12 @@ impl Search {
         &self.tickets
     }
 
-    /// The result of a ticket, if it is there; it may not count yet.
+    /// The result of a ticket, if available; it may not be folded yet.
     pub fn score(&self, ticket: usize) -> Option<Score> {
         self.scores.get(ticket).copied().flatten()
     }
 
-    /// The values of every trial, whether it has begun or not.
+    /// The values of every trial, started or not.
     pub fn trials(&self) -> &[Values] {
         &self.trials
     }
@@ -221,17 +217,17 @@ impl Search {
         &self.rungs
     }
 
-    /// Where a rung stops; `None` is the end of the schedule.
+    /// The step at which a rung stops; `None` is the end of the schedule.
     pub fn stop(&self, rung: usize) -> Option<u64> {
         (rung + 1 < self.rungs.len()).then(|| self.rungs[rung])
     }
 
-    /// Steps that a rung adds to those of the rung before.
+    /// Steps that a rung adds to the previous one.
     pub fn steps(&self, rung: usize) -> u64 {
         self.rungs[rung] - rung.checked_sub(1).map_or(0, |before| self.rungs[before])
     }
 
-    /// The best trial at the whole budget so far, and its metric.
+    /// The best trial at the whole budget so far, with its metric.
     pub fn best(&self) -> Option<(usize, f64)> {
         let last = self.rungs.len() - 1;
         self.standing().ranking(last).into_iter().next().and_then(|trial| match self.known[trial][last] {
@@ -240,13 +236,13 @@ impl Search {
         })
     }
 
-    /// Steps that the sweep will take if no trial fails.
+    /// Number of steps for the whole sweep if no trial fails.
     pub fn planned(&self) -> u64 {
         let standing = self.standing();
         (0..self.rungs.len()).map(|rung| asha::quota(standing, rung) as u64 * self.steps(rung)).sum()
     }
 
-    /// Steps of every trial at the whole budget.
+    /// Number of steps for all trials at the whole budget.
     pub fn full(&self) -> u64 {
         self.trials.len() as u64 * self.rungs.last().copied().unwrap_or_default()
     }

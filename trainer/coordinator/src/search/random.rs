@@ -1,8 +1,8 @@
-//! Points drawn at random, all different. A number depends on the seed, the stage, the trial and the setting alone, so that one more setting
-//! or trial changes no other.
+//! Random points, all different. A value depends only on the seed, the stage, the trial and the setting, so that
+//! another setting or trial changes no existing value.
 //!
-//! A space of choices is drawn from without putting back. Drawn numbers are rounded to five digits: they are read by people, and the last
-//! bits of a logarithm are not the same on every machine.
+//! Points of a space of choices are drawn without replacement. Drawn numbers are rounded to five digits: they are
+//! easier to read, and the last bits of a logarithm differ between machines.
 
 use std::collections::BTreeSet;
 
@@ -11,10 +11,10 @@ use protocol::sweep::{Domain, MAX_TRIALS, Sweep, Values};
 use protocol::{Digest, Seed, StageName, canonical};
 use serde_json::Value;
 
-/// So often a trial is drawn again that would be equal to an earlier one.
+/// Maximum number of draws for a trial that would repeat an earlier one.
 const AGAIN: u64 = 100;
 
-/// The points of all trials; fewer than asked for if the space has no more.
+/// The points of all trials; fewer than requested if the space is smaller.
 pub(super) fn points(sweep: &Sweep, settings: &StageSettings, name: &StageName, seed: Seed) -> Vec<Values> {
     let count = sweep.trials();
     if let Some(all) = sweep.points().filter(|all| *all <= MAX_TRIALS) {
@@ -38,18 +38,18 @@ pub(super) fn points(sweep: &Sweep, settings: &StageSettings, name: &StageName, 
     points
 }
 
-/// 64 bits that depend on their key alone.
+/// Hashes the key to 64 bits.
 fn bits(seed: Seed, name: &StageName, trial: u64, again: u64, path: &str) -> u64 {
     let digest = Digest::of(format!("stride/sweep/1 {seed} {name} {trial} {again} {path}").as_bytes());
     digest.as_bytes()[..8].iter().fold(0, |number, byte| number << 8 | u64::from(*byte))
 }
 
-/// Uniform in [0, 1).
+/// Maps 64 bits to a uniform number in [0, 1).
 fn uniform(bits: u64) -> f64 {
     (bits >> 11) as f64 / (1_u64 << 53) as f64
 }
 
-/// The value at `share` of a domain.
+/// The value at quantile `share` of a domain.
 fn value(domain: &Domain, share: f64, whole: bool) -> Value {
     let number = |value: f64, low: f64, high: f64| {
         if whole {
@@ -60,7 +60,7 @@ fn value(domain: &Domain, share: f64, whole: bool) -> Value {
     };
     match domain {
         Domain::Choice(values) => values[((share * values.len() as f64) as usize).min(values.len() - 1)].clone(),
-        // The upper end of whole numbers is one of them.
+        // The upper bound of whole numbers is inclusive.
         Domain::Uniform(low, high) => {
             let width = high - low + if whole { 1.0 } else { 0.0 };
             number(low + share * width, *low, *high)

@@ -1,15 +1,15 @@
-//! How trials stand: what each got at each rung.
+//! Results of trials by rung, and their ranking.
 
 use protocol::stage::Mode;
 use serde::{Deserialize, Serialize};
 
-/// How a rung of a trial ended.
+/// The result of a trial at a rung.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Score {
-    /// The metric, finite.
+    /// A finite metric.
     Value(f64),
-    /// It failed, or the metric is no finite number.
+    /// The trial failed, or its metric is not finite.
     Failed,
 }
 
@@ -19,7 +19,7 @@ impl Score {
         if value.is_finite() { Self::Value(value) } else { Self::Failed }
     }
 
-    /// The metric, turned so that less is better; the worst for a failure.
+    /// The metric with the sign for minimisation; infinity for a failure.
     pub(super) fn loss(self, mode: Mode) -> f64 {
         match (self, mode) {
             (Self::Value(value), Mode::Min) => value,
@@ -29,16 +29,16 @@ impl Score {
     }
 }
 
-/// What counts of all trials so far.
+/// All folded results.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Standing<'a> {
     pub(super) mode: Mode,
-    /// One of this many goes on.
+    /// One in this many trials advances.
     pub(super) factor: usize,
     pub(super) rungs: usize,
-    /// Results, by trial and rung.
+    /// Results by trial and rung.
     pub(super) known: &'a [Vec<Score>],
-    /// Rungs issued, by trial.
+    /// Number of issued rungs, by trial.
     pub(super) issued: &'a [usize],
 }
 

@@ -1,4 +1,4 @@
-//! Decisions against results that come in any order, from any number of workers, with a crash anywhere.
+//! Decisions of searchers for results in any order, from any number of workers, with crashes at any point.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -41,7 +41,7 @@ fn search(sweep: &Sweep) -> Search {
     Search::new(sweep, &settings(), &"pcm".into(), Seed(7))
 }
 
-/// A generator for the tests' own choices.
+/// A random generator for the tests' own choices.
 struct Dice(u64);
 
 impl Dice {
@@ -53,7 +53,7 @@ impl Dice {
     }
 }
 
-/// What a rung of a trial gives, no matter which worker computes it: better with each rung, and now and then a failure.
+/// The result of a rung of a trial, the same for every worker: better with each rung, with occasional failures.
 fn truth(world: u64, ticket: Ticket) -> Score {
     let Ticket::Rung { trial, rung } = ticket else { panic!("nobody executions on {ticket:?}") };
     let mut dice = Dice(1 + world * 7919 + trial as u64 * 104_729);
@@ -72,7 +72,8 @@ fn open(search: &Search) -> Vec<usize> {
     (0..search.tickets().len()).filter(|ticket| search.score(*ticket).is_none()).collect()
 }
 
-/// Works off a sweep with `workers`, in whatever order they finish; at each result a crash may come, after which all is folded again.
+/// Completes a sweep with `workers` that finish in random order. With `crashes`, some results are followed by a crash,
+/// after which all results are folded again.
 fn work_off(sweep: &Sweep, world: u64, workers: usize, dice: &mut Dice, crashes: bool) -> Search {
     let mut at = search(sweep);
     for _ in 0..10_000 {
@@ -148,7 +149,7 @@ fn without_failures_asha_costs_what_was_planned_and_keeps_the_good_ones() {
             let open = open(&at);
             let ticket = open[dice.below(open.len())];
             let Ticket::Rung { trial, .. } = at.tickets()[ticket] else { unreachable!() };
-            // The worst case of a searcher that does not wait: every trial is better than all before it.
+            // The worst case for asynchronous halving: every trial is better than all before it.
             at.report(ticket, Score::of(100.0 - trial as f64));
         }
         let spent: u64 =
@@ -183,7 +184,7 @@ fn equal_points_are_not_tried_twice() {
             protocol::sweep::with_values(&settings(), point).unwrap();
         }
     }
-    // A space with 24 points has no more, no matter how often one asks.
+    // A space with 24 points gives at most 24 trials, however many are requested.
     let small = Sweep { search: SearchKind::Asha, trials: 1000, ..sweep(SearchKind::Grid, 0) };
     let points: BTreeSet<String> = search(&small).trials().iter().map(text).collect();
     assert_eq!(points.len(), 24);

@@ -1,25 +1,32 @@
-//! The one task that decides. Events come over a queue; what has gathered there is decided and answered by [`Batches`], which
-//! says what to store and does no more than that. This file brings the queue, the clock and the disk.
+//! The only task that decides. Events arrive in a queue; [`Batches`] decides the gathered events and returns the writes
+//! to store, but performs no I/O. This file supplies the queue, the clock and the disk.
 //!
-//! If a part without which nothing goes on panics, the coordinator has failed: everybody who waits and everybody who comes is told so
-//! at once, and [`Handle::trouble`](super::Handle::trouble) says it to the process around it. What was acknowledged is stored.
+//! If an essential part panics, the coordinator has failed. All waiting and new callers get an error at once, and
+//! [`Handle::trouble`](super::Handle::trouble) reports it to the surrounding process. Acknowledged work is stored.
 
 use std::sync::Arc;
+use std::time::Instant;
 
 use protocol::Digest;
-use registry::{Store, Write};
+use registry::{Store, Write, WriteError};
 use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
 
 use super::actor_handle::{ActorHandle, Reply};
+use super::allowances::Allowances;
 use super::blocking::blocking;
 use super::effects;
+use super::secrets::Secrets;
+use super::token_table::TokenTable;
 use crate::batch::{Ask, Batches, Done, Turn};
-use crate::journal;
+use crate::journal::{self, Recovered};
 use crate::state::State;
 use crate::time::Moment;
 
-/// Unpredictable bytes: a secret of the process, drawn once, and a counter.
+/// Maximum number of bytes of a snapshot in one transaction.
+const SNAPSHOT_BYTES: usize = 256 << 10;
+
+/// Unpredictable bytes, derived from a random secret of the process and a counter.
 #[derive(Debug)]
 struct Entropy {
     secret: [u8; 32],
@@ -42,18 +49,26 @@ impl Entropy {
 }
 
 /// Starts the actor on a recovered state.
-pub(crate) fn start(store: Store, state: State) -> (Arc<ActorHandle>, JoinHandle<()>) {
+pub(crate) fn start(
+    store: Store,
+    recovered: Recovered,
+    secrets: Secrets,
+    tokens: Arc<TokenTable>,
+    allowances: Allowances,
+) -> (Arc<ActorHandle>, JoinHandle<()>) {
+    let Recovered { snapshot, state } = recovered;
     let (now, snapshot_at) = (state.now, state.seq);
     let batches = Batches::new(state);
-    let (actor_handle, queue) = ActorHandle::new(store, now, Arc::clone(batches.front()));
+    let front = Arc::clone(batches.front());
+    let (actor_handle, queue) = ActorHandle::new(store, secrets, now, front, tokens, snapshot, allowances);
     let actor_handle = Arc::new(actor_handle);
     let moments = Moments { actor_handle: Arc::clone(&actor_handle), entropy: Entropy::new() };
     let actor = Actor { actor_handle: Arc::clone(&actor_handle), batches, moments, snapshot_at, snapshot: None };
-    let task = actor_handle.spawn("the actor, which decides everything,", actor.run(queue));
+    let task = actor_handle.spawn("the actor", actor.run(queue));
     (actor_handle, task)
 }
 
-/// When events are decided, and what is unpredictable about them.
+/// Source of the time and the randomness of decisions.
 struct Moments {
     actor_handle: Arc<ActorHandle>,
     entropy: Entropy,
@@ -69,9 +84,9 @@ struct Actor {
     actor_handle: Arc<ActorHandle>,
     batches: Batches<Reply>,
     moments: Moments,
-    /// The decision at which the newest snapshot was begun.
+    /// The decision of the newest snapshot, stored or in progress.
     snapshot_at: u64,
-    /// A snapshot on its way.
+    /// The task that stores a snapshot.
     snapshot: Option<JoinHandle<()>>,
 }
 
@@ -97,7 +112,9 @@ impl Actor {
             fail::fail_point!("actor::decide");
             let mut turn = self.batches.decide(|| self.moments.next());
             while let Turn::Store(writes) = turn {
-                let written = self.actor_handle.store.write(writes).await;
+                let begun = Instant::now();
+                let written = self.actor_handle.store.write_proven(writes).await;
+                self.actor_handle.meters.committed(begun.elapsed());
                 self.actor_handle.wrote(&written);
                 turn = self.batches.stored(written, || self.moments.next());
             }
@@ -112,7 +129,7 @@ impl Actor {
             self.actor_handle.change();
         }
         for (reply, answer) in done.answers {
-            // The asker may have gone away meanwhile; what was decided stands.
+            // The caller may have gone away; the decision still holds.
             let _ = reply.send(answer);
         }
         for effect in &done.effects {
@@ -120,25 +137,58 @@ impl Actor {
         }
     }
 
-    /// Stores the state as a whole every so many decisions, beside whatever goes on.
+    /// Starts to store a snapshot in the background if enough decisions were made since the last one.
     fn snapshot_if_due(&mut self) {
         let state = self.batches.state();
         let is_over = self.snapshot.as_ref().is_none_or(JoinHandle::is_finished);
         if is_over && state.seq >= self.snapshot_at + state.policy.snapshot_every {
             self.snapshot_at = state.seq;
-            let storing = snapshot(self.actor_handle.store.clone(), Arc::clone(state));
-            self.snapshot = Some(self.actor_handle.spawn("the storing of a snapshot", storing));
+            let (actor_handle, state) = (Arc::clone(&self.actor_handle), Arc::clone(state));
+            let storing = async move { snapshot(&actor_handle, &state).await };
+            self.snapshot = Some(self.actor_handle.spawn("a snapshot task", storing));
         }
     }
 }
 
-/// Stores `state` as a whole. Whatever happens meanwhile follows on it.
-pub(crate) async fn snapshot(store: Store, state: Arc<State>) {
-    let seq = state.seq;
-    let text = blocking(move || journal::snapshot(&state)).await;
-    match store.write(vec![Write::Snapshot { seq, state: text }]).await {
-        Ok(()) => tracing::debug!(seq, "stored a snapshot"),
-        // The facts are there; only the next start takes longer.
-        Err(error) => tracing::warn!(seq, %error, "no snapshot"),
+/// Stores the parts of `state` that changed since the previous snapshot. Concurrent decisions build on this snapshot.
+pub(crate) async fn snapshot(actor_handle: &ActorHandle, state: &Arc<State>) {
+    let mut stored = actor_handle.snapshot.lock().await;
+    if state.seq == stored.seq {
+        return;
     }
+    match store_snapshot(&actor_handle.store, &stored, state).await {
+        Ok(()) => {
+            tracing::debug!(state.seq, "stored a snapshot");
+            *stored = Arc::clone(state);
+        }
+        // The facts are stored, so that only the next start takes longer.
+        Err(error) => tracing::warn!(state.seq, %error, "cannot store a snapshot"),
+    }
+}
+
+async fn store_snapshot(store: &Store, before: &Arc<State>, state: &Arc<State>) -> Result<(), WriteError> {
+    let seq = state.seq;
+    let (old, new) = (Arc::clone(before), Arc::clone(state));
+    let mut changed = blocking(move || journal::changed_parts(&old, &new)).await.into_iter();
+    // Other writes can run between these transactions.
+    loop {
+        let (parts, rest) = blocking(move || {
+            let (mut parts, mut bytes) = (Vec::new(), 0);
+            while bytes < SNAPSHOT_BYTES
+                && let Some(part) = changed.next()
+            {
+                let (name, text) = part.stored();
+                bytes += name.len() + text.as_ref().map_or(0, String::len);
+                parts.push((name, text));
+            }
+            (parts, changed)
+        })
+        .await;
+        if parts.is_empty() {
+            break;
+        }
+        changed = rest;
+        store.write(vec![Write::SnapshotParts { seq, parts }]).await?;
+    }
+    store.write(vec![Write::Snapshot { seq, state: journal::snapshot(state) }]).await
 }

@@ -1,65 +1,101 @@
-//! The actor as everybody else sees it: what may be asked, the newest stored state, and whether anything still goes on.
+//! Access to the actor for other tasks: requests, the newest stored state, and the actor's health.
 
 use std::future::Future;
 use std::panic::AssertUnwindSafe;
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
 use futures::FutureExt as _;
-use protocol::message::{Poll, RunView, Submit};
+use protocol::message::{Poll, RunView, StorageProblem, Submit};
 use protocol::pipeline::Pipeline;
-use protocol::{RunId, WorkerId, limits};
-use registry::{QueryError, ReadStore, Store, WriteError};
+use protocol::stage::Register;
+use protocol::{Alias, Digest, Group, ModelName, Owner, RunId, WorkerId, limits};
+use registry::{Proof, QueryError, ReadStore, Store, WriteError};
 use tokio::sync::{Semaphore, mpsc, oneshot, watch};
 use tokio::task::JoinHandle;
 
+use super::allowances::Allowances;
 use super::blocking::blocking;
-use super::clock::Clock;
+use super::clock::{Clock, wall_clock, wall_ms};
+use super::meters::Meters;
 use super::records::{Records, read};
+use super::secrets::Secrets;
+use super::storage::{self, unless_away};
+use super::token_table::TokenTable;
 use super::versions::resolve_versions;
+use super::vouching::Reach;
 use crate::batch::{Ask, Front, Refused};
 use crate::event::{Effect, Event, Observation};
+use crate::outcome::refused_for_good;
 use crate::rejected::Rejected;
 use crate::state::State;
 use crate::state::run::Control;
 use crate::time::Millis;
 
-/// How many asks wait for the actor; more wait for room.
+/// Maximum number of requests in the queue; further callers wait for room.
 const QUEUE: usize = 1024;
 
-/// Where an answer goes.
+/// The sender for the answer to a request.
 pub(super) type Reply = oneshot::Sender<Result<Vec<Effect>, Refused>>;
 
-/// What is shared between the actor and those who ask it.
+/// State shared between the actor and its callers.
 #[derive(Debug)]
 pub(crate) struct ActorHandle {
     asks: mpsc::Sender<(Ask, Reply)>,
-    /// Places for calls of clients, and for batches that go past the actor to the disk.
+    /// Permits for calls of clients, and for batches that go to the disk without the actor.
     pub(crate) clients: Semaphore,
     pub(crate) batches: Semaphore,
+    /// Permits for reading much data, and for waiting to do so.
+    pub(crate) reads: Semaphore,
+    pub(crate) readers: Semaphore,
+    /// Limits of runs and tokens.
+    pub(crate) allowances: Allowances,
     front: Arc<Front>,
+    /// The state of the newest stored snapshot.
+    pub(super) snapshot: tokio::sync::Mutex<Arc<State>>,
     changed: watch::Sender<u64>,
-    trouble: Mutex<Option<String>>,
+    trouble: Mutex<Option<StorageProblem>>,
     failure: OnceLock<String>,
     stop: watch::Sender<bool>,
     clock: Clock,
+    /// The current tokens and their permissions.
+    pub(crate) tokens: Arc<TokenTable>,
     pub(crate) store: Store,
+    pub(crate) secrets: Secrets,
+    pub(crate) reach: Arc<Reach>,
+    pub(crate) meters: Meters,
 }
 
 impl ActorHandle {
-    /// A handle, and the queue of what is asked through it.
-    pub(super) fn new(store: Store, now: Millis, front: Arc<Front>) -> (Self, mpsc::Receiver<(Ask, Reply)>) {
+    /// Creates a handle and its queue of requests.
+    pub(super) fn new(
+        store: Store,
+        secrets: Secrets,
+        now: Millis,
+        front: Arc<Front>,
+        tokens: Arc<TokenTable>,
+        snapshot: State,
+        allowances: Allowances,
+    ) -> (Self, mpsc::Receiver<(Ask, Reply)>) {
         let (asks, queue) = mpsc::channel(QUEUE);
         let handle = Self {
             asks,
             clients: Semaphore::new(limits::CLIENTS_WAITING),
             batches: Semaphore::new(limits::BATCHES_WAITING),
+            reads: Semaphore::new(limits::READS_AT_ONCE),
+            readers: Semaphore::new(limits::READS_WAITING),
+            allowances,
             front,
+            snapshot: tokio::sync::Mutex::new(Arc::new(snapshot)),
             changed: watch::Sender::new(0),
             trouble: Mutex::new(None),
             failure: OnceLock::new(),
             stop: watch::Sender::new(false),
             clock: Clock::new(now),
+            tokens,
             store,
+            secrets,
+            reach: Arc::default(),
+            meters: Meters::default(),
         };
         (handle, queue)
     }
@@ -71,27 +107,64 @@ impl ActorHandle {
         {
             return answer;
         }
-        // The actor is gone. What it panicked of is known only after all that it held was dropped.
+        // The actor has ended. A panic message becomes available only after all of its data was dropped.
         let _ = self.stopped().wait_for(|stop| *stop).await;
         Err(self.over())
     }
 
-    /// Why nobody answers any more.
+    /// The reason why requests are no longer answered.
     pub(crate) fn over(&self) -> Refused {
         self.failure.get().map_or(Refused::Stopped, |failure| Refused::Failed(failure.clone()))
     }
 
-    /// Decides an event; returns once it is stored.
+    /// Decides an event and returns once it is stored. Artifacts that rows will name are proven complete before the
+    /// event is queued, so that only the caller waits for the blob storage.
     pub(crate) async fn decide(&self, event: Event) -> Result<Vec<Effect>, Refused> {
-        self.ask(Ask::Event(Box::new(event))).await
+        let mut artifacts = event.artifacts();
+        if artifacts.is_empty() {
+            return self.ask(Ask::Event(Box::new(event))).await;
+        }
+        loop {
+            let mut proofs = Vec::with_capacity(artifacts.len());
+            for artifact in &artifacts {
+                match self.prove(*artifact).await {
+                    Ok(proof) => proofs.push(proof),
+                    Err(error) => return Err(self.refused(&event, error).await),
+                }
+            }
+            match self.ask(Ask::Event(Box::new(event.clone()))).await {
+                // The event names an artifact committed earlier, or a garbage collection has run meanwhile.
+                Err(Refused::Write(WriteError::Unproven { artifact })) => {
+                    if !artifacts.contains(&artifact) {
+                        artifacts.push(artifact);
+                    }
+                }
+                decided => return decided,
+            }
+        }
     }
 
-    /// Takes note of what was heard, and decides what follows from it.
+    async fn prove(&self, artifact: Digest) -> Result<Proof, WriteError> {
+        let proven = unless_away(&self.store, self.store.prove(artifact)).await;
+        proven.map_err(|away| WriteError::Unreachable(away.to_string()))?
+    }
+
+    /// Decides the replacement of an event whose artifact is incomplete for good; returns the reason of the refusal.
+    async fn refused(&self, event: &Event, error: WriteError) -> Refused {
+        let Some(instead) = refused_for_good(event, &error) else { return error.into() };
+        tracing::warn!(%error, "refused: a named artifact is incomplete");
+        match self.ask(Ask::Event(Box::new(instead))).await {
+            Ok(_) => error.into(),
+            Err(refused) => refused,
+        }
+    }
+
+    /// Notes an observation and decides its consequences.
     pub(crate) async fn observe(&self, observation: Observation) -> Result<(), Refused> {
         self.ask(Ask::Observation(observation, self.now())).await.map(drop)
     }
 
-    /// Takes note of a poll; returns once what follows from it is stored.
+    /// Notes a poll and returns once its consequences are stored.
     pub(crate) async fn poll(&self, worker: WorkerId, poll: Poll) -> Result<(), Refused> {
         match self.front.poll(self.now(), worker, poll)? {
             None => Ok(()),
@@ -99,9 +172,10 @@ impl ActorHandle {
         }
     }
 
-    /// Submits a pipeline.
-    pub(crate) async fn submit(&self, submit: Submit) -> Result<RunId, Refused> {
-        // Beside the threads that answer heartbeats: a large one takes a while.
+    /// Submits a pipeline of `owner`, who sees the models of group `sees`, or all models if it is `None`.
+    pub(crate) async fn submit(&self, mut submit: Submit, owner: Owner, sees: Option<Group>) -> Result<RunId, Refused> {
+        submit.idempotency_key = submit.idempotency_key.map(|key| owner.group().key(&key));
+        // A large pipeline takes a while, so it is parsed outside the threads that answer heartbeats.
         let read = blocking(move || {
             let pipeline: Pipeline = serde_json::from_value(submit.pipeline)
                 .map_err(|e| format!("the pipeline does not parse: {e}; was it made by another build?"))?;
@@ -109,13 +183,15 @@ impl ActorHandle {
             Ok(pipeline)
         });
         let mut pipeline = read.await.map_err(Rejected::Invalid)?;
-        // One that was submitted before has its versions already.
+        // A run submitted earlier already has its versions.
         if let Some(key) = &submit.idempotency_key
             && let Some(row) = self.store.run_by_key(key).await.map_err(WriteError::from)?
         {
             return Ok(row.run);
         }
-        resolve_versions(&mut pipeline, &self.store).await.map_err(|error| match error {
+        self.check_registrations(&pipeline, &owner).await?;
+        let seen = self.seen_store(sees.as_ref());
+        resolve_versions(&mut pipeline, &seen).await.map_err(|error| match error {
             QueryError::NotFound(why) | QueryError::Invalid(why) => Refused::from(Rejected::Invalid(why)),
             error => Refused::from(WriteError::from(error)),
         })?;
@@ -124,10 +200,11 @@ impl ActorHandle {
             source: submit.source,
             idempotency_key: submit.idempotency_key.clone(),
             until: submit.until,
+            owner,
         };
         let mut tries = 0;
         loop {
-            // One that has ended is in the tables alone.
+            // An ended run is only in the tables.
             if let Some(key) = &submit.idempotency_key
                 && let Some(row) = self.store.run_by_key(key).await.map_err(WriteError::from)?
             {
@@ -135,7 +212,7 @@ impl ActorHandle {
             }
             tries += 1;
             match self.decide(event.clone()).await {
-                // Another one with this key came between the look and the event, and has ended already.
+                // Another run with this key was submitted after the lookup and has already ended.
                 Err(Refused::Write(WriteError::Conflict(_))) if submit.idempotency_key.is_some() && tries < 3 => {}
                 decided => {
                     let run = decided?.into_iter().find_map(|effect| match effect {
@@ -148,7 +225,55 @@ impl ActorHandle {
         }
     }
 
-    /// Asks something of a run, whether it is in memory or has ended.
+    /// Refuses a pipeline that would move an alias or extend a model without the owner's permission.
+    async fn check_registrations(&self, pipeline: &Pipeline, owner: &Owner) -> Result<(), Refused> {
+        for stage in &pipeline.stages {
+            let Some(settings) = stage.settings.get::<Register>() else { continue };
+            let forbidden = |why: &str| Rejected::Forbidden(format!("stage `{}`: {why}", stage.name));
+            let invalid = |e: protocol::id::ParseNameError| Rejected::Invalid(format!("stage `{}`: {e}", stage.name));
+            let model: ModelName = settings.model.parse().map_err(invalid)?;
+            if self.store.model(&model).await.map_err(WriteError::from)?.is_some() {
+                let group = self.model_owner(&model).await?;
+                if !owner.admin && group.as_ref().is_none_or(|group| !owner.controls(group)) {
+                    return Err(forbidden(&format!("model `{model}` belongs to another owner")).into());
+                }
+            }
+            if settings.promote.to.is_empty() {
+                continue;
+            }
+            let alias: Alias = settings.promote.to.parse().map_err(invalid)?;
+            self.may_promote(owner, &alias).map_err(|why| forbidden(&format!("`promote.to: {alias}`: {why}")))?;
+        }
+        Ok(())
+    }
+
+    /// Checks that the token of a run's owner may currently move an alias of its own models.
+    pub(crate) fn may_promote(&self, owner: &Owner, alias: &Alias) -> Result<(), String> {
+        self.tokens.current().may_move(owner.into(), alias, Some(&owner.group()), wall_clock().0)
+    }
+
+    /// The group that owns a model.
+    pub(crate) async fn model_owner(&self, model: &ModelName) -> Result<Option<Group>, WriteError> {
+        Ok(self.store.model_owners(Some(model)).await?.remove(model))
+    }
+
+    /// The group that owns a run, active or ended.
+    pub(crate) async fn run_owner(&self, run: &RunId) -> Result<Option<Group>, WriteError> {
+        match self.state().run(run) {
+            Ok(run) => Ok(Some(run.owner.group())),
+            Err(_) => Ok(self.store.run_owners(std::slice::from_ref(run)).await?.remove(run)),
+        }
+    }
+
+    /// The store as group `sees` sees it, or all of it if `sees` is `None`.
+    pub(crate) fn seen_store(&self, sees: Option<&Group>) -> ReadStore {
+        match sees {
+            Some(group) => self.store.seen_by(group),
+            None => ReadStore::clone(&self.store),
+        }
+    }
+
+    /// Controls a run, active or ended.
     pub(crate) async fn control(&self, run: &RunId, action: Control) -> Result<(), Refused> {
         let mut tries = 0;
         loop {
@@ -162,22 +287,28 @@ impl ActorHandle {
             tries += 1;
             let looked_too_early = archived.is_none();
             match self.decide(Event::Control { run: run.clone(), action, archived }).await {
-                // It ended between the look and the event.
+                // The run ended after the lookup.
                 Err(Refused::Rejected(Rejected::NotFound(_))) if looked_too_early && tries < 3 => {}
                 decided => return decided.map(drop),
             }
         }
     }
 
-    /// A run as clients see it, whether it is in memory or has ended.
+    /// A run as clients see it, active or ended.
     pub(crate) async fn run_view(&self, run: &RunId) -> Result<RunView, Refused> {
         self.records().run_view(run).await
     }
 
-    /// What there is to tell of runs now. The state is read before the tables: a run that ends in between is in both, and not in
-    /// neither.
+    /// Current records of all runs. The state is read before the tables, so that a run that ends in between is in both
+    /// rather than in neither.
     pub(crate) fn records(&self) -> Records {
-        Records::new(ReadStore::clone(&self.store), self.state(), self.now())
+        self.records_for(None)
+    }
+
+    /// Current records as group `sees` sees them, or all of them.
+    pub(crate) fn records_for(&self, sees: Option<Group>) -> Records {
+        let (state, now) = (self.state(), self.now());
+        Records::new(self.seen_store(sees.as_ref()), state, now, sees)
     }
 
     /// The newest stored state.
@@ -185,38 +316,45 @@ impl ActorHandle {
         self.front.state()
     }
 
-    /// Says that something durable has changed.
+    /// Notifies of a durable change.
     pub(super) fn change(&self) {
         self.changed.send_modify(|version| *version += 1);
     }
 
-    /// Ticks with every durable change.
+    /// A receiver that is notified of every durable change.
     pub(crate) fn changes(&self) -> watch::Receiver<u64> {
         self.changed.subscribe()
     }
 
-    /// Why the store takes no writes, if it does not.
+    /// The reason why the store refuses writes, if it does.
     pub(crate) fn trouble(&self) -> Option<String> {
-        self.trouble.lock().unwrap_or_else(PoisonError::into_inner).clone()
+        let trouble = self.trouble.lock().unwrap_or_else(PoisonError::into_inner);
+        trouble.as_ref().map(|problem| problem.what.clone())
     }
 
-    /// What has panicked, if something has.
+    /// The current problem of the store's disk or of the blob storage.
+    pub(crate) fn storage(&self) -> Option<StorageProblem> {
+        let trouble = self.trouble.lock().unwrap_or_else(PoisonError::into_inner).clone();
+        trouble.or_else(|| storage::problem(&self.store))
+    }
+
+    /// The message of the first panic, if any.
     pub(crate) fn failure(&self) -> Option<&str> {
         self.failure.get().map(String::as_str)
     }
 
-    /// Nothing goes on from here: `what` has panicked.
+    /// Stops the coordinator because `what` panicked.
     fn fail(&self, what: &str, panic: &(dyn std::any::Any + Send)) {
         let said = panic.downcast_ref::<String>().map(String::as_str).or(panic.downcast_ref::<&str>().copied());
-        let message = format!("{what} panicked: {}", said.unwrap_or("it did not say why"));
+        let message = format!("{what} panicked: {}", said.unwrap_or("without a message"));
         tracing::error!("{message}");
-        // The first one tells; those that follow are mostly its consequences.
+        // The first panic counts; later ones are usually its consequences.
         let _ = self.failure.set(message);
         self.stop();
         self.change();
     }
 
-    /// Starts `part`, without which nothing goes on: if it panics, the coordinator has failed.
+    /// Starts an essential task. If it panics, the coordinator has failed.
     pub(crate) fn spawn(
         self: &Arc<Self>,
         what: &'static str,
@@ -230,28 +368,29 @@ impl ActorHandle {
         })
     }
 
-    /// Takes note of whether the store took a write.
+    /// Updates the store's problem from the result of a write.
     pub(crate) fn wrote<T>(&self, result: &Result<T, WriteError>) {
         let mut trouble = self.trouble.lock().unwrap_or_else(PoisonError::into_inner);
         match result {
             Ok(_) => *trouble = None,
-            Err(WriteError::Storage(message)) => *trouble = Some(message.clone()),
-            Err(error @ WriteError::Superseded { .. }) => *trouble = Some(error.to_string()),
+            Err(error @ (WriteError::Storage(_) | WriteError::Superseded { .. })) => {
+                let since_ms = trouble.as_ref().map_or_else(wall_ms, |problem| problem.since_ms);
+                *trouble = Some(StorageProblem { since_ms, what: error.to_string() });
+            }
             Err(_) => {}
         }
     }
 
-    /// The time.
     pub(crate) fn now(&self) -> Millis {
         self.clock.now()
     }
 
-    /// Ends the actor and everything that waits for it.
+    /// Stops the actor and everything that waits for it.
     pub(crate) fn stop(&self) {
         let _ = self.stop.send(true);
     }
 
-    /// Becomes true when the coordinator stops.
+    /// A receiver that becomes true when the coordinator stops.
     pub(crate) fn stopped(&self) -> watch::Receiver<bool> {
         self.stop.subscribe()
     }

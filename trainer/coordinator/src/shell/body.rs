@@ -1,4 +1,4 @@
-//! Bodies: read within limits of size, time and memory, and parsed where a large one holds nobody up.
+//! Reading of request bodies within limits of size, time and memory. Large ones are parsed on a blocking thread.
 
 use std::sync::Arc;
 
@@ -13,11 +13,11 @@ use super::blocking::blocking;
 use super::failure::Failure;
 use super::route::Route;
 
-/// Larger bodies wait for memory, and are parsed beside the threads that answer heartbeats.
+/// Bodies above this size wait for memory and are parsed outside the threads that answer heartbeats.
 const LARGE: usize = 64 << 10;
 
-/// A message as JSON, like `axum::Json`, but bounded by its route and by what all bodies together may take: a large one gives its share
-/// of that back when it is answered.
+/// A JSON message like `axum::Json`, limited by its route and by the memory for all bodies together. A large one
+/// returns its share of that memory when it has been answered.
 #[derive(Debug)]
 pub(crate) struct Message<T>(
     pub(crate) T,
@@ -43,7 +43,7 @@ impl<S: Sync, T: DeserializeOwned + Send + 'static> FromRequest<S> for Message<T
             let message = "expected `content-type: application/json`".to_owned();
             return Err(Failure::new(StatusCode::UNSUPPORTED_MEDIA_TYPE, "invalid", message));
         }
-        // As much as it may become if it does not say how long it is. Small ones, heartbeats among them, queue behind nobody.
+        // Reserves the route's limit if the length is unknown. Small bodies, such as heartbeats, never wait here.
         let most = HttpBody::size_hint(request.body()).upper().and_then(|most| usize::try_from(most).ok());
         let most = most.unwrap_or(route.body).min(route.body);
         let permit = if most > LARGE {
@@ -76,5 +76,5 @@ fn unread(error: &axum::Error, limit: usize) -> Failure {
         }
         cause = inner.source();
     }
-    Failure::invalid(format!("the body was cut off: {error}"))
+    Failure::new(StatusCode::REQUEST_TIMEOUT, "cut", format!("the body was cut off: {error}"))
 }

@@ -1,4 +1,4 @@
-//! How a refused call looks on the wire.
+//! Refused calls as HTTP answers.
 
 use axum::Json;
 use axum::http::{HeaderValue, StatusCode, header};
@@ -16,7 +16,7 @@ use crate::rejected::Rejected;
 pub(crate) struct Failure {
     status: StatusCode,
     error: ApiError,
-    /// After how many seconds the same call may succeed.
+    /// Seconds after which the same call may succeed.
     retry_after: Option<u32>,
 }
 
@@ -25,7 +25,7 @@ impl Failure {
         Self { status, error: ApiError { code: code.to_owned(), message, hint: None }, retry_after: None }
     }
 
-    /// There is too much of this already; it may come again.
+    /// The refusal of a call that exceeds a temporary limit.
     pub(crate) fn busy(message: String) -> Self {
         let failure = Self::new(StatusCode::TOO_MANY_REQUESTS, "busy", message);
         Self { retry_after: Some(limits::COME_AGAIN_S), ..failure }
@@ -44,7 +44,7 @@ impl Failure {
         Self::new(StatusCode::PAYLOAD_TOO_LARGE, "invalid", format!("the body is larger than {limit} bytes"))
     }
 
-    /// As the whole answer to a request that is not read.
+    /// Formats the refusal as a whole HTTP answer, for a request that is not read.
     pub(crate) fn to_http(&self) -> Vec<u8> {
         let body = serde_json::json!(self.error).to_string();
         let (status, length) = (self.status, body.len());
@@ -69,9 +69,15 @@ impl From<Rejected> for Failure {
     fn from(rejected: Rejected) -> Self {
         let (status, code) = match rejected {
             Rejected::StaleFence { .. } => (StatusCode::CONFLICT, "stale-fence"),
+            Rejected::NameHeld(_) => (StatusCode::CONFLICT, "name-held"),
+            Rejected::Forbidden(_) => (StatusCode::FORBIDDEN, "forbidden"),
             Rejected::NotFound(_) => (StatusCode::NOT_FOUND, "not-found"),
             Rejected::Conflict(_) => (StatusCode::CONFLICT, "conflict"),
             Rejected::Invalid(_) => (StatusCode::BAD_REQUEST, "invalid"),
+            Rejected::Full(_) => {
+                let hint = "wait until some have ended, cancel some, or start the server with a larger `--max-runs`";
+                return Self::busy(rejected.to_string()).hint(hint);
+            }
         };
         Self::new(status, code, rejected.to_string())
     }
@@ -87,8 +93,11 @@ impl From<WriteError> for Failure {
             WriteError::NotFound(_) => Self::new(StatusCode::NOT_FOUND, "not-found", message),
             WriteError::Storage(_) => Self::new(StatusCode::INSUFFICIENT_STORAGE, "storage", message)
                 .hint("free some space or make the store writable, then `trainer resume`"),
+            WriteError::Unreachable(_) => Self::new(StatusCode::SERVICE_UNAVAILABLE, "unreachable", message),
             WriteError::Superseded { .. } => Self::new(StatusCode::SERVICE_UNAVAILABLE, "storage", message),
-            WriteError::Internal(_) => Self::new(StatusCode::INTERNAL_SERVER_ERROR, "internal", message),
+            WriteError::Unproven { .. } | WriteError::Internal(_) => {
+                Self::new(StatusCode::INTERNAL_SERVER_ERROR, "internal", message)
+            }
         }
     }
 }
@@ -100,7 +109,7 @@ impl From<Refused> for Failure {
             Refused::Write(error) => error.into(),
             Refused::Stopped => Self::new(StatusCode::SERVICE_UNAVAILABLE, "internal", refused.to_string()),
             Refused::Failed(_) => Self::new(StatusCode::SERVICE_UNAVAILABLE, "failed", refused.to_string())
-                .hint("start it again: what was acknowledged is stored; and report this, for it is a bug of Stride's"),
+                .hint("start it again: acknowledged work is stored; and report this bug in Stride"),
         }
     }
 }
@@ -125,10 +134,12 @@ impl From<BlobError> for Failure {
             BlobError::NotFound(_) => Self::new(StatusCode::NOT_FOUND, "not-found", message),
             BlobError::Storage(_) => Self::new(StatusCode::INSUFFICIENT_STORAGE, "storage", message)
                 .hint("free some space or make the store writable, then `trainer resume`"),
-            // Not 5xx: the bytes on our disk are wrong, and asking again would not change them.
+            // Not a 5xx status: a retry cannot repair the bytes on our disk.
             BlobError::Corrupt { .. } | BlobError::Damaged(_) => Self::new(StatusCode::CONFLICT, "damaged", message)
-                .hint("run the pipeline again: the stage that made it is computed anew, which mends it"),
+                .hint("run the pipeline again: it recomputes the stage and repairs the blob"),
             BlobError::Refused(_) => Self::new(StatusCode::CONFLICT, "stale-fence", message),
+            BlobError::Unfit(_) => Self::new(StatusCode::PAYLOAD_TOO_LARGE, "too-large", message),
+            BlobError::Unreachable(_) => Self::new(StatusCode::SERVICE_UNAVAILABLE, "unreachable", message),
             BlobError::Unavailable(_) => Self::new(StatusCode::INTERNAL_SERVER_ERROR, "internal", message),
         }
     }

@@ -1,16 +1,21 @@
-//! Connections: who may hold one, for how long, and over TLS or not.
+//! Limits of connections, by number and idle time, with or without TLS.
 //!
-//! A connection is a stranger's until a call on it has shown a good token. Strangers share a small part of all connections,
-//! and where it is full the oldest of them goes: a worker that connects needs milliseconds to show its token, while those
-//! who only sit there are the oldest soon. So a crowd of strangers costs a worker nothing, and cannot use up descriptors.
+//! A connection is anonymous until one of its calls has shown a valid token. Anonymous connections share a small part
+//! of the total. If that part is full, the oldest anonymous connection is closed. A new worker shows its token within
+//! milliseconds, whereas idle connections soon become the oldest. A flood of anonymous connections therefore neither
+//! delays workers nor exhausts file descriptors.
+//!
+//! Callers other than workers also share a limited part, with a further limit per token, so that readers cannot block
+//! workers.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 use std::convert::Infallible;
-use std::net::SocketAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 use std::time::{Duration, Instant};
 
+use access::{Caller, Scope};
 use axum::body::Body;
 use axum::extract::Request;
 use axum::http::StatusCode;
@@ -29,76 +34,94 @@ use tower::Service;
 
 use super::failure::Failure;
 
-/// So much of a request's head is held in memory.
+/// Largest buffered head of a request.
 const HEAD_BYTES: usize = 64 << 10;
-/// How long a TLS handshake may take, and saying goodbye.
+/// Time limit of a TLS handshake and of the final exchange.
 const HANDSHAKE: Duration = Duration::from_secs(10);
-/// How long to wait when there is no descriptor for another connection.
+/// Delay after a failed `accept`, usually for lack of file descriptors.
 const PAUSE: Duration = Duration::from_millis(20);
-/// So long a stranger may stay however many come: time to show a token. A flood of newcomers waits meanwhile.
+/// Minimum time for an anonymous connection to show a token, however many others arrive. New connections wait
+/// meanwhile.
 const GRACE: Duration = Duration::from_millis(50);
 
-/// How many connections there may be, and how long one may say nothing.
+/// Limits of connections.
 #[derive(Debug, Clone)]
 pub struct Connections {
-    /// All of them.
+    /// All connections.
     pub most: usize,
-    /// Those that have not shown a token yet.
-    pub strangers: usize,
-    /// How long the head of a request may take, and how long a connection may idle between two.
+    /// Connections without a valid token so far.
+    pub anonymous: usize,
+    /// Connections of callers other than workers.
+    pub clients: usize,
+    /// Connections of one such token.
+    pub of_token: usize,
+    /// Time limit for the head of a request, and for idling between two requests.
     pub idle: Duration,
 }
 
 impl Default for Connections {
-    /// As many as half of the descriptors that this process may have; the store and its blobs need the others.
+    /// Half of the process's file descriptors; the store and its blobs need the others.
     fn default() -> Self {
         let (descriptors, _) = getrlimit(Resource::RLIMIT_NOFILE).unwrap_or((1024, 1024));
         let most = usize::try_from(descriptors / 2).unwrap_or(usize::MAX).clamp(16, 8192);
-        Self { most, strangers: (most / 4).clamp(8, 512), idle: Duration::from_secs(20) }
+        let anonymous = (most / 4).clamp(8, 512);
+        Self { most, anonymous, clients: most / 2, of_token: (most / 8).clamp(8, 256), idle: Duration::from_secs(20) }
     }
 }
 
-/// Lets this process have as many descriptors as the system allows it.
+/// Raises the limit of open files to the maximum that the system allows.
 pub fn raise_descriptor_limit() {
     if let Ok((soft, hard)) = getrlimit(Resource::RLIMIT_NOFILE)
         && soft < hard
         && let Err(error) = setrlimit(Resource::RLIMIT_NOFILE, hard, hard)
     {
-        tracing::debug!(%error, "the limit of descriptors stays at {soft}");
+        tracing::debug!(%error, "cannot raise the limit of open files above {soft}");
     }
 }
 
-/// All connections.
+/// The set of open connections.
 #[derive(Debug)]
-struct Crowd {
+struct OpenConnections {
     limits: Connections,
     open: AtomicUsize,
     next: AtomicU64,
-    /// By arrival.
-    strangers: Mutex<BTreeMap<u64, Stranger>>,
+    /// Anonymous connections in order of arrival.
+    anonymous: Mutex<BTreeMap<u64, Anonymous>>,
+    clients: Mutex<Clients>,
+}
+
+/// Connections of callers other than workers.
+#[derive(Debug, Default)]
+struct Clients {
+    all: usize,
+    of_token: HashMap<String, usize>,
 }
 
 #[derive(Debug)]
-struct Stranger {
+struct Anonymous {
     since: Instant,
     leave: Arc<Notify>,
 }
 
-/// One connection, as its requests see it.
+/// A connection as its requests see it.
 #[derive(Debug)]
 pub(crate) struct Peer {
     id: u64,
-    crowd: Arc<Crowd>,
+    from: IpAddr,
+    encrypted: bool,
+    open_connections: Arc<OpenConnections>,
     leave: Arc<Notify>,
+    /// The token name whose limit it counts against. Workers have no such limit.
+    client: OnceLock<String>,
 }
 
-impl Crowd {
-    /// Takes a connection in, for which a stranger may have to go; `None` if everybody here is known.
-    fn enter(self: &Arc<Self>) -> Option<Arc<Peer>> {
-        let mut strangers = self.strangers.lock().unwrap_or_else(PoisonError::into_inner);
+impl OpenConnections {
+    /// Admits a connection, closing an anonymous one if necessary; `None` if all connections are authenticated.
+    fn admit(self: &Arc<Self>, from: IpAddr, encrypted: bool) -> Option<Arc<Peer>> {
+        let mut anonymous = self.anonymous.lock().unwrap_or_else(PoisonError::into_inner);
         let full = self.open.load(Ordering::Relaxed) >= self.limits.most;
-        if full || strangers.len() >= self.limits.strangers {
-            match strangers.pop_first() {
+        if full || anonymous.len() >= self.limits.anonymous {
+            match anonymous.pop_first() {
                 Some((_, oldest)) => oldest.leave.notify_one(),
                 None if full => return None,
                 None => {}
@@ -106,41 +129,88 @@ impl Crowd {
         }
         self.open.fetch_add(1, Ordering::Relaxed);
         let (id, leave) = (self.next.fetch_add(1, Ordering::Relaxed), Arc::new(Notify::new()));
-        strangers.insert(id, Stranger { since: Instant::now(), leave: Arc::clone(&leave) });
-        Some(Arc::new(Peer { id, crowd: Arc::clone(self), leave }))
+        anonymous.insert(id, Anonymous { since: Instant::now(), leave: Arc::clone(&leave) });
+        let open_connections = Arc::clone(self);
+        Some(Arc::new(Peer { id, from, encrypted, open_connections, leave, client: OnceLock::new() }))
     }
 
-    /// Sends the oldest stranger away.
+    /// Closes the oldest anonymous connection.
     fn make_room(&self) {
-        if let Some((_, oldest)) = self.strangers.lock().unwrap_or_else(PoisonError::into_inner).pop_first() {
+        if let Some((_, oldest)) = self.anonymous.lock().unwrap_or_else(PoisonError::into_inner).pop_first() {
             oldest.leave.notify_one();
         }
     }
 
-    /// How long the next newcomer waits so that the stranger who goes for it has had its time.
+    /// Time until the oldest anonymous connection may be closed for a new one.
     fn wait(&self) -> Option<Duration> {
-        let strangers = self.strangers.lock().unwrap_or_else(PoisonError::into_inner);
-        let full = strangers.len() >= self.limits.strangers || self.open.load(Ordering::Relaxed) >= self.limits.most;
-        let oldest = strangers.first_key_value().filter(|_| full)?.1;
+        let anonymous = self.anonymous.lock().unwrap_or_else(PoisonError::into_inner);
+        let full = anonymous.len() >= self.limits.anonymous || self.open.load(Ordering::Relaxed) >= self.limits.most;
+        let oldest = anonymous.first_key_value().filter(|_| full)?.1;
         GRACE.checked_sub(oldest.since.elapsed()).filter(|wait| !wait.is_zero())
     }
 }
 
 impl Peer {
-    /// A good token was shown: this is no stranger any more.
-    pub(crate) fn is_known(&self) {
-        self.crowd.strangers.lock().unwrap_or_else(PoisonError::into_inner).remove(&self.id);
+    /// The address of the remote end.
+    pub(crate) fn from(&self) -> IpAddr {
+        self.from
+    }
+
+    /// Returns true if the connection is encrypted.
+    pub(crate) fn is_encrypted(&self) -> bool {
+        self.encrypted
+    }
+
+    /// Marks the connection as authenticated.
+    ///
+    /// # Errors
+    /// The limit of connections for callers other than workers, or for this token, is reached.
+    pub(crate) fn authenticate(&self, caller: &Caller) -> Result<(), Failure> {
+        self.mark_authenticated();
+        if caller.scopes.allow(Scope::Worker) || self.client.get().is_some() {
+            return Ok(());
+        }
+        let limits = &self.open_connections.limits;
+        let mut clients = self.open_connections.clients.lock().unwrap_or_else(PoisonError::into_inner);
+        let own = clients.of_token.get(&caller.name).copied().unwrap_or_default();
+        if own >= limits.of_token {
+            let message = format!("the token of `{}` has {own} connections, which is its limit", caller.name);
+            return Err(Failure::busy(message)
+                .hint("close some, or start the server with a larger `--max-connections-per-token`"));
+        }
+        if clients.all >= limits.clients {
+            let message = format!("callers other than workers have {} connections, which is their limit", clients.all);
+            return Err(Failure::busy(message).hint("try again, or start the server with a higher limit of open files"));
+        }
+        if self.client.set(caller.name.clone()).is_ok() {
+            clients.all += 1;
+            clients.of_token.insert(caller.name.clone(), own + 1);
+        }
+        Ok(())
+    }
+
+    fn mark_authenticated(&self) {
+        self.open_connections.anonymous.lock().unwrap_or_else(PoisonError::into_inner).remove(&self.id);
     }
 }
 
 impl Drop for Peer {
     fn drop(&mut self) {
-        self.is_known();
-        self.crowd.open.fetch_sub(1, Ordering::Relaxed);
+        self.mark_authenticated();
+        self.open_connections.open.fetch_sub(1, Ordering::Relaxed);
+        let Some(token) = self.client.take() else { return };
+        let mut clients = self.open_connections.clients.lock().unwrap_or_else(PoisonError::into_inner);
+        clients.all -= 1;
+        if let Some(own) = clients.of_token.get_mut(&token) {
+            *own -= 1;
+            if *own == 0 {
+                clients.of_token.remove(&token);
+            }
+        }
     }
 }
 
-/// A bound address; with TLS if it has a configuration.
+/// A bound address, with an optional TLS configuration.
 pub(crate) struct Listener {
     tcp: TcpListener,
     tls: Option<TlsAcceptor>,
@@ -156,60 +226,71 @@ impl Listener {
     }
 }
 
-/// Answers at all `listeners` until `stopped`, then drops every connection.
+/// Serves all `listeners` until `stopped`, then drops every connection.
 pub(crate) async fn serve(
     listeners: Vec<Listener>,
     router: axum::Router,
     limits: Connections,
     mut stopped: watch::Receiver<bool>,
 ) {
-    let crowd =
-        Arc::new(Crowd { limits, open: AtomicUsize::new(0), next: AtomicU64::new(0), strangers: Mutex::default() });
+    let open_connections = Arc::new(OpenConnections {
+        limits,
+        open: AtomicUsize::new(0),
+        next: AtomicU64::new(0),
+        anonymous: Mutex::default(),
+        clients: Mutex::default(),
+    });
     let mut accepting = JoinSet::new();
     for listener in listeners {
-        accepting.spawn(accept(listener, router.clone(), Arc::clone(&crowd)));
+        accepting.spawn(accept(listener, router.clone(), Arc::clone(&open_connections)));
     }
-    // An error means that the handle is gone, which is a stop too.
+    // An error means that the handle was dropped, which counts as a stop.
     let _ = stopped.wait_for(|stop| *stop).await;
 }
 
-async fn accept(listener: Listener, router: axum::Router, crowd: Arc<Crowd>) {
+async fn accept(listener: Listener, router: axum::Router, open_connections: Arc<OpenConnections>) {
     let mut connections = JoinSet::new();
     loop {
-        let stream = match listener.tcp.accept().await {
-            Ok((stream, _)) => stream,
+        let (stream, from) = match listener.tcp.accept().await {
+            Ok(accepted) => accepted,
             Err(error) => {
-                // Mostly that there is no descriptor left.
-                tracing::warn!(%error, "cannot take a connection");
-                crowd.make_room();
+                // The usual cause is a lack of file descriptors.
+                tracing::warn!(%error, "cannot accept a connection");
+                open_connections.make_room();
                 tokio::time::sleep(PAUSE).await;
                 continue;
             }
         };
         while connections.try_join_next().is_some() {}
-        while let Some(wait) = crowd.wait() {
+        while let Some(wait) = open_connections.wait() {
             tokio::time::sleep(wait).await;
         }
-        let Some(peer) = crowd.enter() else {
+        let Some(peer) = open_connections.admit(from.ip(), listener.tls.is_some()) else {
             connections.spawn(async move {
-                let _ = tokio::time::timeout(HANDSHAKE, turn_away(stream)).await;
+                let _ = tokio::time::timeout(HANDSHAKE, refuse(stream)).await;
             });
             continue;
         };
-        let (router, tls, idle) = (router.clone(), listener.tls.clone(), crowd.limits.idle);
+        let (router, tls, idle) = (router.clone(), listener.tls.clone(), open_connections.limits.idle);
         connections.spawn(async move {
             let leave = Arc::clone(&peer.leave);
             tokio::select! {
-                () = greet(stream, tls, router, peer, idle) => {}
-                () = leave.notified() => tracing::debug!("a stranger's connection makes room"),
+                () = handshake_and_serve(stream, tls, router, peer, idle) => {}
+                () = leave.notified() => tracing::debug!("closed an anonymous connection to make room"),
             }
         });
     }
 }
 
-async fn greet(stream: TcpStream, tls: Option<TlsAcceptor>, router: axum::Router, peer: Arc<Peer>, idle: Duration) {
+async fn handshake_and_serve(
+    stream: TcpStream,
+    tls: Option<TlsAcceptor>,
+    router: axum::Router,
+    peer: Arc<Peer>,
+    idle: Duration,
+) {
     let _ = stream.set_nodelay(true);
-    let Some(tls) = tls else { return converse(stream, router, peer, idle).await };
+    let Some(tls) = tls else { return serve_connection(stream, router, peer, idle).await };
     let handshake = async {
         let mut first = [0];
         stream.peek(&mut first).await?;
@@ -217,22 +298,18 @@ async fn greet(stream: TcpStream, tls: Option<TlsAcceptor>, router: axum::Router
             return tls.accept(stream).await.map(Some);
         }
         let failure = Failure::new(StatusCode::BAD_REQUEST, "tls", "this server speaks TLS".to_owned());
-        answer_plainly(
-            stream,
-            failure.hint("ask it with `https://`, and with --ca FILE if its certificate is your own"),
-        )
-        .await?;
+        answer_plainly(stream, failure.hint("use `https://`, with --ca FILE if its certificate is your own")).await?;
         Ok(None)
     };
     match tokio::time::timeout(HANDSHAKE, handshake).await {
-        Ok(Ok(Some(stream))) => converse(stream, router, peer, idle).await,
+        Ok(Ok(Some(stream))) => serve_connection(stream, router, peer, idle).await,
         Ok(Ok(None)) => {}
         Ok(Err(error)) => tracing::debug!(%error, "no TLS"),
         Err(_) => tracing::debug!("a TLS handshake took too long"),
     }
 }
 
-async fn converse<S>(stream: S, router: axum::Router, peer: Arc<Peer>, idle: Duration)
+async fn serve_connection<S>(stream: S, router: axum::Router, peer: Arc<Peer>, idle: Duration)
 where
     S: AsyncRead + AsyncWrite + Unpin + Send + 'static,
 {
@@ -248,17 +325,17 @@ where
     }
 }
 
-async fn turn_away(stream: TcpStream) -> std::io::Result<()> {
-    let message = "this server has as many connections as it takes".to_owned();
+async fn refuse(stream: TcpStream) -> std::io::Result<()> {
+    let message = "this server has reached its limit of connections".to_owned();
     let failure = Failure::new(StatusCode::SERVICE_UNAVAILABLE, "busy", message);
-    answer_plainly(stream, failure.hint("try again; a server takes more with a higher limit of open files")).await
+    answer_plainly(stream, failure.hint("try again, or start the server with a higher limit of open files")).await
 }
 
-/// One answer to whatever is asked, and the end.
+/// Sends one answer to any request and closes the connection.
 async fn answer_plainly(mut stream: TcpStream, failure: Failure) -> std::io::Result<()> {
     stream.write_all(&failure.to_http()).await?;
     stream.shutdown().await?;
-    // Closing over unread bytes would take the answer back.
+    // Closing a connection with unread bytes would reset it and discard the answer.
     let mut rest = [0; 4096];
     while stream.read(&mut rest).await? > 0 {}
     Ok(())

@@ -1,36 +1,51 @@
-//! The thin half: server, clock, runner of effects. The only async code of the crate.
+//! HTTP server, clock and execution of effects. This is the only async code of the crate.
 //!
-//! One task, the `actor`, owns the state and decides events one by one: copy, decide, store, and only then publish the
-//! copy. What a refused transaction would have changed has therefore never been. Everybody else reads published copies.
+//! One task, the `actor`, owns the state and decides events one by one: it copies the state, decides, stores, and only
+//! then publishes the copy. A refused transaction therefore leaves no trace. All other tasks read published copies.
 
 mod actor;
 mod actor_handle;
+mod allowances;
 mod api;
+mod audit;
 mod auth;
 mod blocking;
 mod body;
 mod bundles;
 mod clock;
-mod door;
+mod curves;
 mod effects;
 mod failure;
 mod listener;
+mod meters;
 mod paced;
+mod page_files;
 mod polls;
 mod queries;
+mod rate;
 mod records;
+mod revocable;
 mod route;
+mod route_server;
+mod scrape;
+mod secrets;
+mod session_calls;
+mod sessions;
 mod start_error;
+mod storage;
+mod token_table;
 mod uploads;
 mod versions;
+mod vouching;
 
 use std::net::{Ipv4Addr, SocketAddr};
 use std::sync::Arc;
 
-use access::{Scopes, Token, Tokens};
-use protocol::message::{RunView, Submit};
-use protocol::{RunId, WorkerId};
+use access::{Caller, Scope, Scopes, Token, Tokens};
+use protocol::message::{FailureClass, ReportOutcome, RunView, Submit, TaskOutcome};
+use protocol::{Owner, RunId, WorkerId};
 use registry::Store;
+use registry::audit::AuditLog;
 use rustls::ServerConfig;
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
@@ -43,47 +58,55 @@ use crate::state::run::Control;
 use crate::view::WorkerView;
 
 use self::actor_handle::ActorHandle;
+pub use self::allowances::Allowances;
 pub use self::api::routes;
 use self::auth::Gate;
-pub use self::door::Door;
+pub use self::curves::{CurveSeries, Curves};
 use self::listener::Listener;
 pub use self::listener::{Connections, raise_descriptor_limit};
-pub use self::queries::{BlobStored, Submitted};
-pub use self::records::{Records, RecordsError, StageMetrics};
+pub use self::queries::Submitted;
+pub use self::records::{Records, RecordsError, StageCurves, StageMetrics};
 pub use self::route::Route;
+pub use self::route_server::RouteServer;
+use self::secrets::Secrets;
+use self::sessions::Sessions;
 pub use self::start_error::StartError;
+pub use self::token_table::Standing;
+use self::token_table::TokenTable;
 pub use self::versions::resolve_versions;
 
-/// How a coordinator is run.
+/// Settings of a coordinator.
 #[derive(Debug, Clone)]
 pub struct Config {
-    /// Where to listen; port 0 takes a free one.
+    /// The listening address; port 0 selects a free port.
     pub listen: SocketAddr,
-    /// Who may ask. One token more, for this machine's command line, is made at every start: [`Handle::token`].
+    /// Tokens of callers. Every start makes another one for commands on this machine: [`Handle::token`].
     pub tokens: Tokens,
-    /// Names by which callers know this server, besides the machine's own and its addresses.
+    /// Host names of this server, in addition to the machine's own name and its addresses.
     pub hosts: Vec<String>,
-    /// Encrypts all but what stays on this machine.
+    /// TLS for all connections from other machines.
     pub tls: Option<Arc<ServerConfig>>,
-    /// Whether tokens may cross a network as they are.
+    /// Allows tokens to cross a network unencrypted.
     pub insecure: bool,
-    /// How many connections there may be.
+    /// Limits of connections.
     pub connections: Connections,
-    /// Times and budgets.
+    /// Limits of runs and tokens.
+    pub allowances: Allowances,
     pub policy: Policy,
-    /// No worker of an earlier coordinator can reach this one (`trainer run` starts its own): theirs are gone for certain.
+    /// No worker of an earlier coordinator can reach this one, because `trainer run` starts its own; all of them count
+    /// as gone.
     pub alone: bool,
-    /// Runs of earlier are paused until they are asked for again.
+    /// Pauses runs of an earlier coordinator until a client resumes them.
     pub park: bool,
 }
 
 impl Config {
-    /// For `trainer run`: this machine only, any port, own workers.
+    /// Settings for `trainer run`: this machine only, any port, own workers.
     pub fn embedded() -> Self {
         Self { alone: true, park: true, ..Self::server(SocketAddr::from((Ipv4Addr::LOCALHOST, 0)), Tokens::default()) }
     }
 
-    /// For `trainer serve`: workers of before may still be at work and re-attach.
+    /// Settings for `trainer serve`: earlier workers may still be running and reconnect.
     pub fn server(listen: SocketAddr, tokens: Tokens) -> Self {
         Self {
             listen,
@@ -92,13 +115,14 @@ impl Config {
             tls: None,
             insecure: false,
             connections: Connections::default(),
+            allowances: Allowances::default(),
             policy: Policy::default(),
             alone: false,
             park: false,
         }
     }
 
-    /// Whether it may listen where it is to, as far as its callers are concerned.
+    /// Checks that callers at the listening address are authenticated and encrypted as required.
     pub fn check(&self) -> Result<(), StartError> {
         if self.listen.ip().is_loopback() {
             return Ok(());
@@ -113,97 +137,130 @@ impl Config {
     }
 }
 
-/// Why a coordinator does not go on.
+/// A reason why a coordinator makes no progress.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Trouble {
-    /// The store refused the newest write, for want of space or permission; it may take the next one.
+    /// The store refused the newest write, for lack of space or permission; it may accept the next one.
     Store(String),
-    /// A part of the coordinator has panicked: every request is refused from then on. What was acknowledged is stored, and
-    /// another process goes on from there.
+    /// A part of the coordinator panicked, and all further requests are refused. Acknowledged work is stored, and
+    /// another process can continue it.
     Failed(String),
 }
 
-/// Starts coordinators.
+/// Entry point for starting coordinators.
 #[derive(Debug)]
 pub struct Coordinator;
 
 impl Coordinator {
-    /// Recovers from the snapshot and the facts in `store`, then listens.
+    /// Recovers the state from `store` and starts listening.
     pub async fn start(store: Store, config: Config) -> Result<Handle, StartError> {
         config.check()?;
-        let state = journal::recover(config.policy.clone(), &store.recovery().await?)?;
+        let policy = Policy { live_runs: config.allowances.runs, ..config.policy.clone() };
+        let recovered = journal::recover_both(policy, &store.recovery().await?)?;
         let listen = |address| move |cause| StartError::Listen { address, cause };
         let main = Listener::bind(config.listen, config.tls.clone()).await.map_err(listen(config.listen))?;
         let address = main.address().map_err(listen(config.listen))?;
         let (mut listeners, mut local) = (vec![main], address);
         if config.tls.is_some() || !config.listen.ip().is_loopback() {
-            // For the commands of this machine, which know neither our names nor our certificate.
+            // For commands on this machine, which do not know the server's names or its certificate.
             let here = SocketAddr::from((Ipv4Addr::LOCALHOST, 0));
             let here = Listener::bind(here, None).await.map_err(listen(here))?;
             local = here.address().map_err(listen(config.listen))?;
             listeners.push(here);
         }
-        let (token, mut tokens) = (Token::random(), config.tokens.clone());
-        tokens.add(user(), Scopes::all(), &token);
+        let token = Token::random();
+        let worker_token = Token::random();
+        let own = vec![
+            (Caller::new(user(), Scopes::all()), token.clone()),
+            (Caller::new(OWN_WORKERS, Scopes::of(&[Scope::Worker])), worker_token.clone()),
+        ];
+        let tokens = Arc::new(TokenTable::new(config.tokens.clone(), own));
 
-        let (actor_handle, actor) = actor::start(store, state);
+        let log = AuditLog::of(store.dir());
+        let key = store.server_key().map_err(StartError::Key)?;
+        let (secrets, sessions) = (Secrets::new(key), Arc::new(Sessions::new(Secrets::new(key))));
+        let (actor_handle, actor) =
+            actor::start(store, recovered, secrets, Arc::clone(&tokens), config.allowances.clone());
         actor_handle.decide(Event::Started { alone: config.alone, park: config.park }).await?;
         effects::let_go(&actor_handle);
         let (stop, stopped) = watch::channel(false);
         let tick = effects::tick(actor_handle.clone(), config.policy.tick_ms, stopped.clone());
         let clock = actor_handle.spawn("the clock", tick);
-        let gate = Arc::new(Gate::new(tokens, &config.hosts));
+        let gate = Gate::new(tokens, &config.hosts, config.allowances.calls).with_sessions(Arc::clone(&sessions));
+        let gate = Arc::new(gate);
+        let audit = actor_handle.spawn("the audit log", audit::write(Arc::clone(&gate.audit), log, stopped.clone()));
         let router = api::router(actor_handle.clone(), &gate);
         let serve = listener::serve(listeners, router, config.connections.clone(), stopped);
         let server = actor_handle.spawn("the server", serve);
         tracing::info!(%address, "coordinator listens");
         let tls = config.tls.is_some();
-        Ok(Handle { address, local, tls, token, actor_handle, stop, tasks: vec![clock, server, actor] })
+        let tasks = vec![clock, server, audit, actor];
+        Ok(Handle { address, local, tls, token, worker_token, sessions, actor_handle, stop, tasks })
     }
 }
 
-/// The name of the user whom this process belongs to.
+/// The token name of workers started by this process. Token files cannot contain it, because names have no spaces.
+const OWN_WORKERS: &str = "own workers";
+
+/// The name of the process's user.
 fn user() -> String {
     let uid = nix::unistd::geteuid();
     nix::unistd::User::from_uid(uid).ok().flatten().map_or_else(|| format!("uid-{uid}"), |user| user.name)
 }
 
-/// A running coordinator. Dropping it stops it as `kill -9` would: nothing acknowledged is lost.
+/// A running coordinator. Dropping it stops it like `kill -9`: no acknowledged work is lost.
 #[derive(Debug)]
 pub struct Handle {
     address: SocketAddr,
     local: SocketAddr,
     tls: bool,
     token: Token,
+    worker_token: Token,
+    sessions: Arc<Sessions>,
     actor_handle: Arc<ActorHandle>,
     stop: watch::Sender<bool>,
     tasks: Vec<JoinHandle<()>>,
 }
 
 impl Handle {
-    /// Where it listens.
+    /// The listening address.
     pub fn address(&self) -> SocketAddr {
         self.address
     }
 
-    /// Its URL.
+    /// The server's URL.
     pub fn url(&self) -> String {
         format!("{}://{}", if self.tls { "https" } else { "http" }, self.address)
     }
 
-    /// Its URL for processes of this machine, never encrypted.
+    /// The server's URL for processes on this machine, never encrypted.
     pub fn local_url(&self) -> String {
         format!("http://{}", self.local)
     }
 
-    /// A token that allows everything and lasts as long as this coordinator. Its name is that of the user.
+    /// The address of its page, with a key in the fragment that signs this process's user in. It is good once, for an hour.
+    pub fn page_link(&self) -> String {
+        format!("{}/#key={}", self.url(), self.sessions.key())
+    }
+
+    /// A token with all scopes, valid for the life of this coordinator. Its name is the user's.
     pub fn token(&self) -> &Token {
         &self.token
     }
 
-    /// Submits a pipeline; durable once this returns.
+    /// A token with the scope `worker` for workers that this process starts, valid for the life of this coordinator.
+    pub fn worker_token(&self) -> &Token {
+        &self.worker_token
+    }
+
+    /// Submits a pipeline, which is stored when this returns.
     pub async fn submit(&self, submit: Submit) -> Result<RunId, Refused> {
-        self.actor_handle.submit(submit).await
+        self.actor_handle.submit(submit, Owner::local(user()), None).await
+    }
+
+    /// Replaces the table of tokens. Active calls with a removed token are aborted.
+    pub fn replace_tokens(&self, tokens: Tokens) {
+        self.actor_handle.tokens.replace(tokens);
     }
 
     /// Pauses, resumes or cancels a run.
@@ -211,48 +268,57 @@ impl Handle {
         self.actor_handle.control(run, action).await
     }
 
-    /// A run as clients see it, whether it goes on or has ended.
+    /// A run as clients see it, active or ended.
     pub async fn run_view(&self, run: &RunId) -> Result<RunView, Refused> {
         self.actor_handle.run_view(run).await
     }
 
-    /// All workers.
+    /// Views of all workers.
     pub fn workers(&self) -> Vec<WorkerView> {
         self.actor_handle.state().worker_views()
     }
 
-    /// The launcher saw a worker's process exit.
+    /// Reports that the launcher saw a worker's process exit. The name becomes free at once.
     pub async fn worker_gone(&self, worker: &WorkerId) -> Result<(), Refused> {
-        self.actor_handle.decide(Event::WorkerGone { worker: worker.clone() }).await.map(drop)
+        self.actor_handle.decide(Event::WorkerGone { worker: worker.clone(), incarnation: None }).await.map(drop)
     }
 
-    /// Asks all workers to save what they have and leave; no work is given any more.
+    /// Reports the end of an assignment for a worker whose process has exited. Does nothing if it held no task.
+    pub async fn fail_for(&self, worker: &WorkerId, class: FailureClass, message: String) -> Result<(), Refused> {
+        let state = self.actor_handle.state();
+        let (Some(known), Some((_, task))) = (state.workers.get(worker), state.held_by(worker)) else { return Ok(()) };
+        let grant = task.grant_of(worker, known.incarnation);
+        let report = ReportOutcome { grant, outcome: TaskOutcome::Failed { class, message } };
+        self.actor_handle.decide(Event::Outcome { report }).await.map(drop)
+    }
+
+    /// Asks all workers to save and leave, and grants no more work.
     pub async fn drain(&self) -> Result<(), Refused> {
         self.actor_handle.decide(Event::Drain).await.map(drop)
     }
 
-    /// Whether somebody still holds a task.
+    /// Returns true if an execution still has a busy worker.
     pub fn is_busy(&self) -> bool {
         self.actor_handle.state().executions.values().any(|execution| execution.is_busy())
     }
 
-    /// How many facts this coordinator has recorded since it started.
+    /// The number of facts recorded since this coordinator started.
     pub fn facts(&self) -> u64 {
         self.actor_handle.state().recorded
     }
 
-    /// Waits until something durable changed since the last call on this receiver.
+    /// A receiver that is notified of durable changes.
     pub fn changes(&self) -> watch::Receiver<u64> {
         self.actor_handle.changes()
     }
 
-    /// Why nothing goes on, if that is so: the process around the coordinator should say it and stop.
+    /// The current problem, if any. The surrounding process should report it and stop.
     pub fn trouble(&self) -> Option<Trouble> {
         let failure = self.actor_handle.failure().map(|failure| Trouble::Failed(failure.to_owned()));
         failure.or_else(|| self.actor_handle.trouble().map(Trouble::Store))
     }
 
-    /// Returns once a part of the coordinator has panicked, with what it said.
+    /// Waits for a panic in a part of the coordinator and returns its message.
     pub async fn failed(&self) -> String {
         let mut changes = self.changes();
         loop {
@@ -266,16 +332,17 @@ impl Handle {
         }
     }
 
-    /// Stops at once. What was acknowledged is in the store; a later start goes on from there, and from a snapshot of the end.
+    /// Stops at once and stores a snapshot of the final state. Acknowledged work is in the store, and a later start
+    /// continues it.
     pub async fn shutdown(mut self) {
         let _ = self.stop.send(true);
         self.actor_handle.stop();
         for task in std::mem::take(&mut self.tasks) {
-            // Ended tasks and cancelled ones alike are what we want here.
+            // It does not matter how the task ended.
             let _ = task.await;
         }
         effects::let_go(&self.actor_handle);
-        actor::snapshot(self.actor_handle.store.clone(), self.actor_handle.state()).await;
+        actor::snapshot(&self.actor_handle, &self.actor_handle.state()).await;
     }
 }
 

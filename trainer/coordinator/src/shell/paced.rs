@@ -1,4 +1,4 @@
-//! A body whose sender may not rest for long.
+//! A request body with a limit on pauses.
 
 use std::future::Future;
 use std::pin::Pin;
@@ -9,10 +9,10 @@ use axum::body::{Body, Bytes, HttpBody};
 use http_body::{Frame, SizeHint};
 use tokio::time::{Instant, Sleep};
 
-/// How long a body may say nothing.
+/// Longest pause of a body.
 const SILENCE: Duration = Duration::from_secs(30);
 
-/// A body that ends with an error when its sender pauses for too long.
+/// A body that ends with an error if its sender pauses for too long.
 #[derive(Debug)]
 pub(crate) struct Paced {
     body: Body,
@@ -37,7 +37,7 @@ impl HttpBody for Paced {
             }
             Poll::Pending => match self.silence.as_mut().poll(cx) {
                 Poll::Ready(()) => {
-                    let message = format!("nothing of the body came for {} s", SILENCE.as_secs());
+                    let message = format!("no data of the body arrived for {} s", SILENCE.as_secs());
                     Poll::Ready(Some(Err(axum::Error::new(std::io::Error::new(std::io::ErrorKind::TimedOut, message)))))
                 }
                 Poll::Pending => Poll::Pending,

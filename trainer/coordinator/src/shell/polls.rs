@@ -1,4 +1,4 @@
-//! Workers: joining, polling, and what their launcher saw.
+//! Calls of workers: join, poll, leave.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -6,26 +6,30 @@ use std::time::Duration;
 use axum::Json;
 use axum::extract::{Path, State};
 use protocol::WorkerId;
-use protocol::message::{DesiredAssignments, Join, Joined, PROTOCOL_VERSION, Poll};
+use protocol::message::{DesiredAssignments, Gone, Join, Joined, PROTOCOL_VERSION, Poll};
+use protocol::proof::Process;
 
 use super::actor_handle::ActorHandle;
 use super::body::Message;
 use super::failure::Failure;
+use super::secrets::Proof;
 use crate::event::{Effect, Event};
 use crate::rejected::Rejected;
 
 pub(crate) async fn join(
     State(actor_handle): State<Arc<ActorHandle>>,
+    proof: Proof,
     Message(join, _): Message<Join>,
 ) -> Result<Json<Joined>, Failure> {
     if join.protocol != PROTOCOL_VERSION {
         let message = format!(
-            "worker `{}` speaks version {} of the protocol, this coordinator speaks {PROTOCOL_VERSION}; use one build for both",
+            "worker `{}` uses version {} of the protocol, this coordinator uses {PROTOCOL_VERSION}; use one build for both",
             join.worker, join.protocol
         );
         return Err(Rejected::Invalid(message).into());
     }
-    let effects = actor_handle.decide(Event::Join { join }).await?;
+    let by = proof.of_join(&join.worker)?;
+    let effects = actor_handle.decide(Event::Join { join, by }).await?;
     let incarnation = effects.into_iter().find_map(|effect| match effect {
         Effect::Joined(incarnation) => Some(incarnation),
         _ => None,
@@ -35,20 +39,25 @@ pub(crate) async fn join(
     Ok(Json(Joined { incarnation, lease_ms: policy.lease_ms, poll_ms: policy.poll_ms }))
 }
 
-/// Answers at once when the worker's desired assignments are not those it knows, else within `poll_ms`.
+/// Answers at once if the worker's assignments have changed, otherwise after `poll_ms`.
 pub(crate) async fn poll(
     State(actor_handle): State<Arc<ActorHandle>>,
     Path(worker): Path<WorkerId>,
+    proof: Proof,
     Message(poll, _): Message<Poll>,
 ) -> Result<Json<DesiredAssignments>, Failure> {
     let (incarnation, version) = (poll.incarnation, poll.version);
+    proof.of_process(&actor_handle.state(), &Process { worker: worker.clone(), incarnation })?;
     let mut changes = actor_handle.changes();
     let mut stopped = actor_handle.stopped();
     let deadline = tokio::time::Instant::now() + Duration::from_millis(actor_handle.state().policy.poll_ms);
     actor_handle.poll(worker.clone(), poll).await?;
     loop {
         changes.mark_unchanged();
-        let desired = actor_handle.state().desired(&worker, incarnation)?;
+        let mut desired = actor_handle.state().desired(&worker, incarnation)?;
+        for assignment in &mut desired.assignments {
+            assignment.secret = actor_handle.secrets.of_grant(&proof.caller.name, &assignment.grant);
+        }
         if desired.version != version {
             return Ok(Json(desired));
         }
@@ -66,7 +75,12 @@ pub(crate) async fn poll(
 pub(crate) async fn gone(
     State(actor_handle): State<Arc<ActorHandle>>,
     Path(worker): Path<WorkerId>,
+    proof: Proof,
+    Message(gone, _): Message<Gone>,
 ) -> Result<Json<()>, Failure> {
-    actor_handle.decide(Event::WorkerGone { worker }).await?;
+    let process = Process { worker, incarnation: gone.incarnation };
+    proof.of_process(&actor_handle.state(), &process)?;
+    let Process { worker, incarnation } = process;
+    actor_handle.decide(Event::WorkerGone { worker, incarnation: Some(incarnation) }).await?;
     Ok(Json(()))
 }

@@ -1,12 +1,14 @@
-//! What there is to tell of runs: those that go on are in the coordinator's state, those that ended in the tables alone.
+//! Records of runs: active runs are in the coordinator's state, ended ones only in the tables.
 
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
 
-use protocol::message::RunView;
-use protocol::{Digest, RunId, StageName};
-use registry::{Curve, LogRow, OpenError, ReadStore, Write, WriteError};
+use protocol::message::{RunView, StageState};
+use protocol::{Digest, Group, RunId, StageName, limits};
+use registry::{
+    Buckets, Curve, HistoryQuery, HistoryRow, LogRow, OpenError, Page, ReadStore, Window, Write, WriteError,
+};
 
 use super::clock::wall_clock;
 use super::start_error::StartError;
@@ -16,12 +18,16 @@ use crate::event::{Effect, Event};
 use crate::policy::Policy;
 use crate::rejected::Rejected;
 use crate::state::State;
+use crate::state::run::Run;
 use crate::time::{Millis, Moment};
 use crate::view::WorkerView;
 use crate::{journal, state};
 
-/// The answer to `GET /v1/runs/{run}/metrics`: values by step, by key, by stage.
+/// The answer to `GET /v1/runs/{run}/metrics`: values by stage, key and step.
 pub type StageMetrics = BTreeMap<StageName, BTreeMap<String, Curve>>;
+
+/// Curves to draw, by key, by stage.
+pub type StageCurves = BTreeMap<StageName, BTreeMap<String, Buckets>>;
 
 /// A state and the tables beside it, for questions that change nothing.
 #[derive(Debug, Clone)]
@@ -29,40 +35,46 @@ pub struct Records {
     store: ReadStore,
     state: Arc<State>,
     now: Millis,
-    /// Runs that would end if a coordinator started here, as clients would see them. They are in no table yet.
+    /// Views of runs that the start of a coordinator would end; they are in no table yet.
     ending: BTreeMap<RunId, String>,
+    /// The group whose runs are shown; `None` shows all.
+    sees: Option<Group>,
 }
 
-/// Why there is nothing to read.
+/// An error on opening records.
 #[derive(Debug, thiserror::Error)]
 pub enum RecordsError {
-    /// The store.
+    /// The store cannot be opened.
     #[error(transparent)]
     Open(#[from] OpenError),
-    /// What was decided before.
+    /// The stored facts cannot be recovered.
     #[error(transparent)]
     Recover(#[from] StartError),
 }
 
 impl Records {
-    pub(super) fn new(store: ReadStore, state: Arc<State>, now: Millis) -> Self {
-        Self { store, state, now, ending: BTreeMap::new() }
+    pub(super) fn new(store: ReadStore, state: Arc<State>, now: Millis, sees: Option<Group>) -> Self {
+        Self { store, state, now, ending: BTreeMap::new(), sees }
     }
 
-    /// Opens the store in `dir`, which no coordinator holds. It is read as a coordinator would find it that started now: nobody is at
-    /// work, and what was interrupted waits to be resumed. Nothing is started and nothing is written.
+    fn shows(&self, run: &Run) -> bool {
+        self.sees.as_ref().is_none_or(|group| run.owner.group() == *group)
+    }
+
+    /// Opens the store in `dir`, which no coordinator holds. The records show the state after a start: no worker is
+    /// busy, and interrupted runs wait to be resumed. Nothing is started or written.
     ///
     /// # Errors
-    /// If there is no store to read, or what was decided before is not what this build understands.
+    /// If there is no store, or this build cannot read the stored facts.
     pub async fn open(dir: &Path) -> Result<Self, RecordsError> {
         let store = ReadStore::open(dir).await?;
         let stored = store.recovery().await.map_err(StartError::from)?;
         let mut state = journal::recover(Policy::default(), &stored).map_err(StartError::from)?;
         let now = wall_clock().max(state.now);
-        // No secret comes of it: nobody is granted anything.
+        // No secret is derived from it, because nothing is granted.
         let moment = Moment { now, entropy: Digest::of(b"") };
         let effects = decide(&mut state, moment, Event::Started { alone: true, park: true });
-        let mut records = Self::new(store, Arc::new(state), now);
+        let mut records = Self::new(store, Arc::new(state), now, None);
         for effect in effects.map_err(StartError::from)? {
             let Effect::Store(writes) = effect else { continue };
             records.ending.extend(writes.into_iter().filter_map(|write| match write {
@@ -73,41 +85,65 @@ impl Records {
         Ok(records)
     }
 
-    /// Lets go of the store.
+    /// Closes the store.
     pub async fn close(self) {
         self.store.close().await;
     }
 
-    /// The store that is read.
+    /// The store behind these records.
     pub fn store(&self) -> &ReadStore {
         &self.store
     }
 
-    /// Runs by submission, each as JSON: those that go on, and of those that ended the newest `limit`.
+    /// Runs by submission, each as JSON: the newest `limit`, or those before a given run.
     ///
     /// # Errors
-    /// If the tables do not read.
-    pub async fn run_views(&self, limit: u32) -> Result<Vec<String>, Refused> {
-        let ended = self.store.ended_views(limit).await.map_err(WriteError::from)?;
+    /// If the tables cannot be read.
+    pub async fn run_views(&self, before: Option<&RunId>, limit: u32) -> Result<Vec<String>, Refused> {
+        let limit = limit.min(limits::RUNS_LISTED);
+        let ended = self.store.ended_views(before, limit).await.map_err(WriteError::from)?;
         let place = |run: RunId| (state::run::number_of(&run), run);
         let mut views: BTreeMap<_, String> = ended.into_iter().map(|(run, view)| (place(run), view)).collect();
-        // A run that ended since the state was read, or goes on after an end, is in both.
-        views.extend(self.ending.iter().map(|(run, view)| (place(run.clone()), view.clone())));
-        for run in self.state.runs.values() {
+        let first_after = before.map_or(u64::MAX, |run| state::run::number_of(run).unwrap_or_default());
+        // A run that has ended since the state was read, or was resumed, is in both.
+        let ending = self.ending.iter().map(|(run, view)| (place(run.clone()), view.clone()));
+        views.extend(ending.filter(|((number, _), _)| number.is_some_and(|number| number < first_after)));
+        let live = self.state.runs.range(..first_after).rev().filter(|(_, run)| self.shows(run));
+        for (_, run) in live.take(limit as usize) {
             let view = serde_json::to_string(&self.state.view(run, self.now));
             let view = view.map_err(|e| Rejected::Invalid(format!("run `{}`: {e}", run.id)))?;
             views.insert(place(run.id.clone()), view);
         }
+        while views.len() > limit as usize {
+            views.pop_first();
+        }
         Ok(views.into_values().collect())
     }
 
-    /// A run as clients see it, whether it goes on or has ended.
+    /// A run as clients see it, active or ended.
     ///
     /// # Errors
-    /// If there is no such run, or what is kept of it does not read.
+    /// If the run does not exist, or its row cannot be read.
     pub async fn run_view(&self, run: &RunId) -> Result<RunView, Refused> {
+        let mut view = self.bare_view(run).await?;
+        let mut times = self.store.run_times(std::slice::from_ref(run)).await.map_err(WriteError::from)?;
+        view.times = times.remove(run).unwrap_or_default();
+        if view.stages.iter().any(|stage| !matches!(stage.state, StageState::Waiting | StageState::Cached)) {
+            let stages = self.store.stage_times(run).await.map_err(WriteError::from)?;
+            for stage in &mut view.stages {
+                if !matches!(stage.state, StageState::Waiting | StageState::Cached) {
+                    stage.times = stages.get(&stage.name).copied().unwrap_or_default();
+                }
+            }
+        }
+        Ok(view)
+    }
+
+    /// The view of a run as the coordinator has it, without times.
+    async fn bare_view(&self, run: &RunId) -> Result<RunView, Refused> {
         let unknown = match self.state.run(run) {
-            Ok(run) => return Ok(self.state.view(run, self.now)),
+            Ok(run) if self.shows(run) => return Ok(self.state.view(run, self.now)),
+            Ok(_) => return Err(Rejected::unknown_run(run).into()),
             Err(unknown) => unknown,
         };
         if let Some(view) = self.ending.get(run) {
@@ -119,15 +155,23 @@ impl Records {
         }
     }
 
-    /// All workers.
+    /// Views of all workers. The task of a worker is shown only to callers who see its run.
     pub fn workers(&self) -> Vec<WorkerView> {
-        self.state.worker_views()
+        let mut workers = self.state.worker_views();
+        for worker in &mut workers {
+            let task = worker.task.take();
+            worker.task = task.filter(|task| {
+                let run = self.state.task(task).ok().and_then(|(execution, _)| self.state.run(&execution.run).ok());
+                self.sees.is_none() || run.is_some_and(|run| self.shows(run))
+            });
+        }
+        workers
     }
 
-    /// Log lines of a run, or of one stage of it, that were stored after line `after`; at most `limit`.
+    /// Log lines of a run, or of one of its stages, stored after line `after`; at most `limit`.
     ///
     /// # Errors
-    /// If there is no such run or stage, or the tables do not read.
+    /// If the run or stage does not exist, or the tables cannot be read.
     pub async fn logs(
         &self,
         run: &RunId,
@@ -135,7 +179,7 @@ impl Records {
         after: i64,
         limit: u32,
     ) -> Result<Vec<LogRow>, Refused> {
-        let mut rows = Vec::new();
+        let (mut rows, limit) = (Vec::new(), limit.min(limits::LINES_READ));
         for (_, (run, stage)) in self.sources(run, stage).await? {
             rows.extend(self.store.logs(&run, Some(&stage), after, limit).await.map_err(WriteError::from)?);
         }
@@ -144,31 +188,75 @@ impl Records {
         Ok(rows)
     }
 
-    /// Values by step of a run, or of one stage of it; at most about `points` of each key.
+    /// The newest `limit` log lines of a run, or of one of its stages, in their order.
     ///
     /// # Errors
     /// If there is no such run or stage, or the tables do not read.
-    pub async fn metrics(
+    pub async fn last_logs(&self, run: &RunId, stage: Option<&StageName>, limit: u32) -> Result<Vec<LogRow>, Refused> {
+        let (mut rows, limit) = (Vec::new(), limit.min(limits::LINES_READ));
+        for (_, (run, stage)) in self.sources(run, stage).await? {
+            rows.extend(self.store.last_logs(&run, Some(&stage), limit).await.map_err(WriteError::from)?);
+        }
+        rows.sort_by_key(|row| row.id);
+        rows.drain(..rows.len().saturating_sub(limit as usize));
+        Ok(rows)
+    }
+
+    /// Values by step of a run, or of one stage of it; of all keys, or of those named.
+    ///
+    /// # Errors
+    /// If there is no such run or stage, or the tables do not read.
+    pub async fn points(
         &self,
         run: &RunId,
         stage: Option<&StageName>,
-        points: usize,
+        keys: Option<&[String]>,
+        page: Page,
     ) -> Result<StageMetrics, Refused> {
         let mut stages = StageMetrics::new();
         for (name, (run, stage)) in self.sources(run, stage).await? {
-            stages.insert(name, self.store.metrics(&run, &stage, None, points).await.map_err(WriteError::from)?);
+            stages.insert(name, self.store.points(&run, &stage, keys, page).await.map_err(WriteError::from)?);
         }
         Ok(stages)
     }
 
-    /// By the name of a stage in this run: the run and the stage under whose names its logs and values are stored. A stage that another
-    /// run computes has them under that run's name.
+    /// The curves of a run, or of one stage of it, in buckets.
+    ///
+    /// # Errors
+    /// If there is no such run or stage, or the tables do not read.
+    pub async fn buckets(
+        &self,
+        run: &RunId,
+        stage: Option<&StageName>,
+        keys: Option<&[String]>,
+        window: &Window,
+    ) -> Result<StageCurves, Refused> {
+        let mut stages = StageCurves::new();
+        for (name, (run, stage)) in self.sources(run, stage).await? {
+            stages.insert(name, self.store.buckets(&run, &stage, keys, window).await.map_err(WriteError::from)?);
+        }
+        Ok(stages)
+    }
+
+    /// Returns the events, oldest first.
+    ///
+    /// # Errors
+    /// If there is no run of that name, or the tables do not read.
+    pub async fn history(&self, asked: &HistoryQuery) -> Result<Vec<HistoryRow>, Refused> {
+        if let Some(run) = &asked.run {
+            self.bare_view(run).await?;
+        }
+        Ok(self.store.timeline(asked).await.map_err(WriteError::from)?)
+    }
+
+    /// For each stage of this run, the run and stage under which its logs and metrics are stored. A stage computed for
+    /// another run has them under that run.
     async fn sources(
         &self,
         run: &RunId,
         stage: Option<&StageName>,
     ) -> Result<Vec<(StageName, (RunId, StageName))>, Refused> {
-        let view = self.run_view(run).await?;
+        let view = self.bare_view(run).await?;
         if let Some(stage) = stage
             && !view.stages.iter().any(|known| known.name == *stage)
         {
@@ -191,10 +279,10 @@ impl Records {
     }
 }
 
-/// What the tables keep of a run that ended.
+/// Parses stored data of an ended run.
 pub(super) fn read<T: serde::de::DeserializeOwned>(run: &RunId, text: &str) -> Result<T, Refused> {
     serde_json::from_str(text).map_err(|error| {
-        Rejected::Conflict(format!("what is kept of run `{run}` does not read: {error}; use the build that wrote it"))
+        Rejected::Conflict(format!("cannot read the stored data of run `{run}`: {error}; use the build that wrote it"))
             .into()
     })
 }

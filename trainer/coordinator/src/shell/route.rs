@@ -1,17 +1,17 @@
-//! A call of the server, as the table in `api` and those who admit it know it.
+//! The description of a call, used by the table in `api` and by the code that admits callers.
 
 use std::time::Duration;
 
 use access::Scope;
 
-/// A call that can be made, and by whom.
+/// A call and the scopes that allow it.
 #[derive(Debug, Clone, Copy)]
 pub struct Route {
-    /// `GET`, `POST` or `PUT`.
+    /// `GET`, `POST`, `PUT` or `DELETE`.
     pub method: &'static str,
-    /// With `{names}` for what varies.
+    /// The path with `{names}` of parameters.
     pub path: &'static str,
-    /// A token needs one of these. For commands of the registry, each command then asks for its own.
+    /// Accepted scopes; a token needs one of them. Each registry command also checks a scope of its own.
     pub scopes: &'static [Scope],
     pub(crate) body: usize,
     pub(crate) time: Duration,

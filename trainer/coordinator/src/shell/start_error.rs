@@ -1,4 +1,4 @@
-//! Why a coordinator did not start.
+//! Errors of a coordinator's start.
 
 use std::net::SocketAddr;
 
@@ -8,34 +8,32 @@ use crate::batch::Refused;
 use crate::journal::RecoverError;
 use crate::rejected::Rejected;
 
-/// Why a coordinator did not start.
+/// An error that prevents a coordinator from starting.
 #[derive(Debug, thiserror::Error)]
 pub enum StartError {
-    /// Nobody could call it.
-    #[error("refusing to listen on {0} without a token: nobody beyond this machine could be let in")]
+    /// No caller could be authenticated.
+    #[error("refusing to listen on {0} without a token: no caller from another machine could be authenticated")]
     NoToken(SocketAddr),
-    /// Anybody who listens on the network would have the tokens.
-    #[error("refusing to listen on {0} without TLS: anybody who sees the traffic has the tokens")]
+    /// The tokens would be readable on the network.
+    #[error("refusing to listen on {0} without TLS: tokens would be readable on the network")]
     NoTls(SocketAddr),
-    /// The address is taken, or not ours.
+    /// The address is in use, or is not this machine's.
     #[error("cannot listen on {address}: {cause}")]
-    Listen {
-        /// Where.
-        address: SocketAddr,
-        /// Why not.
-        cause: std::io::Error,
-    },
-    /// What was decided before cannot be read.
-    #[error("cannot read what was decided before: {0}")]
+    Listen { address: SocketAddr, cause: std::io::Error },
+    /// The key that authenticates workers cannot be read or created.
+    #[error("cannot read the key that authenticates workers: {0}")]
+    Key(std::io::Error),
+    /// The stored facts cannot be read.
+    #[error("cannot read the stored decisions: {0}")]
     Read(#[from] QueryError),
-    /// What was decided before is not what this build understands.
+    /// The stored facts were written in a format that this build does not support.
     #[error("cannot recover: {0}")]
     Recover(#[from] RecoverError),
     /// The first event cannot be stored.
     #[error("cannot write to the store: {0}")]
     Store(#[from] WriteError),
-    /// A fault of ours.
-    #[error("{0}; this is a bug of Stride's")]
+    /// An internal error.
+    #[error("{0}; this is a bug in Stride")]
     Failed(String),
     /// The first event is refused.
     #[error("cannot recover: {0}")]
@@ -47,7 +45,7 @@ impl From<Refused> for StartError {
         match refused {
             Refused::Rejected(rejected) => Self::Rejected(rejected),
             Refused::Write(write) => Self::Store(write),
-            Refused::Stopped => Self::Rejected(Rejected::Conflict("it was stopped while it started".to_owned())),
+            Refused::Stopped => Self::Rejected(Rejected::Conflict("it was stopped during its start".to_owned())),
             Refused::Failed(failure) => Self::Failed(failure),
         }
     }

@@ -1,9 +1,11 @@
-//! What workers write. Every grant is checked twice: here against what the coordinator knows, which refuses most stale
-//! writers before their bytes are read, and again inside the transaction, which is what counts.
+//! Uploads of workers. Every grant is checked twice: here against the coordinator's state, which refuses most stale
+//! writers before their bytes are read, and again in the transaction, which is decisive.
 
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
 
+use access::Scope;
 use axum::Json;
 use axum::body::Body;
 use axum::extract::{Path, State};
@@ -11,84 +13,152 @@ use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
 use axum::response::Response;
 use checkpoint::BlobError;
 use futures::{StreamExt as _, stream};
-use protocol::message::{CommitCheckpoint, Grant, LogBatch, MetricBatch, ReportOutcome};
-use protocol::{Digest, limits};
+use protocol::message::{CommitCheckpoint, Grant, LogBatch, MetricBatch, ReportOutcome, TaskOutcome};
+use protocol::proof::{BlobStored, RECEIPT_HEADER, Vouched};
+use protocol::{Digest, RunId, limits};
 use registry::blob::{Arriving, PART_BYTES, ResumeError};
-use registry::{Write, WriteError};
+use registry::{Store, Write, WriteError};
 
 use super::actor_handle::ActorHandle;
-use super::blocking::blocking;
 use super::body::Message;
 use super::failure::Failure;
-use super::queries::BlobStored;
+use super::secrets::{self, Proof};
+use super::storage::ask;
 use crate::event::Event;
 
-/// The header that carries a blob's grant, as JSON.
-const GRANT_HEADER: &str = "x-stride-grant";
 /// The header with a blob's length.
 const BYTES_HEADER: &str = "x-stride-bytes";
-/// The header that says where in its blob a body begins; 0 without it.
+/// The header with the body's offset in its blob; 0 if absent.
 const OFFSET_HEADER: &str = "x-stride-offset";
-/// The largest blob.
+/// The largest size of a blob.
 const MAX_BLOB_BYTES: u64 = limits::BLOB_BYTES as u64;
-/// How long a body may rest before the upload counts as cut.
+/// Longest pause of a body before the upload counts as cut off.
 const BODY_IDLE: Duration = Duration::from_secs(30);
 
-/// Stores a batch of values or lines, unless too many wait for that already.
+/// Stores a batch of metric values or log lines, unless too many batches are already waiting.
 async fn write(actor_handle: &ActorHandle, write: Write) -> Result<Json<()>, Failure> {
     let Ok(_place) = actor_handle.batches.try_acquire() else {
         let most = limits::BATCHES_WAITING;
-        return Err(Failure::busy(format!("{most} batches of values and lines wait for the disk already")));
+        return Err(Failure::busy(format!("{most} batches of values and lines already wait for the disk")));
     };
-    let written = actor_handle.store.write(vec![write]).await;
+    let written = actor_handle.store.write_proven(vec![write]).await;
     actor_handle.wrote(&written);
     written?;
     Ok(Json(()))
 }
 
+/// The run of the grant's task.
+fn run_of(grant: &Grant) -> RunId {
+    RunId::new(grant.task.as_str().split('/').next().unwrap_or_default())
+}
+
+/// The refusal of data beyond a run's limit.
+fn used_up(message: String, option: &str) -> Failure {
+    let failure = Failure::new(StatusCode::PAYLOAD_TOO_LARGE, "used-up", message);
+    failure.hint(&format!("write less, or start the server with a larger `{option}`"))
+}
+
 pub(crate) async fn metrics(
     State(actor_handle): State<Arc<ActorHandle>>,
+    proof: Proof,
     Message(batch, _): Message<MetricBatch>,
 ) -> Result<Json<()>, Failure> {
+    proof.of_grant(&actor_handle.secrets, &batch.grant)?;
     actor_handle.state().check_telemetry(&batch.grant)?;
-    write(&actor_handle, Write::Metrics { grant: batch.grant, rows: batch.rows }).await
+    let (run, most) = (run_of(&batch.grant), actor_handle.allowances.values);
+    if actor_handle.store.usage(&run).await?.values + batch.rows.len() as u64 > most {
+        return Err(used_up(format!("run `{run}` has recorded {most} values, which is its limit"), "--max-values"));
+    }
+    let values = batch.rows.len();
+    let stored = write(&actor_handle, Write::Metrics { grant: batch.grant, rows: batch.rows }).await?;
+    actor_handle.meters.recorded(values, 0);
+    Ok(stored)
 }
 
 pub(crate) async fn logs(
     State(actor_handle): State<Arc<ActorHandle>>,
+    proof: Proof,
     Message(batch, _): Message<LogBatch>,
 ) -> Result<Json<()>, Failure> {
+    proof.of_grant(&actor_handle.secrets, &batch.grant)?;
     actor_handle.state().check_telemetry(&batch.grant)?;
-    write(&actor_handle, Write::Logs { grant: batch.grant, first: batch.first, lines: batch.lines }).await
+    let (run, most) = (run_of(&batch.grant), actor_handle.allowances.log_bytes);
+    let bytes: usize = batch.lines.iter().map(String::len).sum();
+    if actor_handle.store.usage(&run).await?.log_bytes + bytes as u64 > most {
+        let message = format!("run `{run}` has written {most} bytes of log lines, which is its limit");
+        return Err(used_up(message, "--max-log-mib"));
+    }
+    let lines = batch.lines.len();
+    let stored =
+        write(&actor_handle, Write::Logs { grant: batch.grant, first: batch.first, lines: batch.lines }).await?;
+    actor_handle.meters.recorded(0, lines);
+    Ok(stored)
 }
 
 pub(crate) async fn checkpoint(
     State(actor_handle): State<Arc<ActorHandle>>,
-    Message(commit, _): Message<CommitCheckpoint>,
+    proof: Proof,
+    Message(vouched, _): Message<Vouched<CommitCheckpoint>>,
 ) -> Result<Json<()>, Failure> {
+    let Vouched { what: commit, receipts } = vouched;
+    proof.of_grant(&actor_handle.secrets, &commit.grant)?;
+    check_blobs(&actor_handle, &proof, &commit.grant, commit.manifest, &receipts).await?;
     actor_handle.decide(Event::Checkpoint { commit }).await?;
     Ok(Json(()))
 }
 
 pub(crate) async fn outcome(
     State(actor_handle): State<Arc<ActorHandle>>,
-    Message(report, _): Message<ReportOutcome>,
+    proof: Proof,
+    Message(vouched, _): Message<Vouched<ReportOutcome>>,
 ) -> Result<Json<()>, Failure> {
+    let Vouched { what: report, receipts } = vouched;
+    proof.of_grant(&actor_handle.secrets, &report.grant)?;
+    if let TaskOutcome::Finished { output, .. } = report.outcome {
+        check_blobs(&actor_handle, &proof, &report.grant, output, &receipts).await?;
+    }
     actor_handle.decide(Event::Outcome { report }).await?;
     Ok(Json(()))
 }
 
-/// Whose upload a request is about. Asked of the state before a byte of the body is read.
-fn granted(actor_handle: &ActorHandle, headers: &HeaderMap) -> Result<Grant, Failure> {
-    let grant =
-        headers.get(GRANT_HEADER).ok_or_else(|| Failure::invalid(format!("header `{GRANT_HEADER}` is missing")))?;
-    let grant: Grant = serde_json::from_slice(grant.as_bytes())
-        .map_err(|e| Failure::invalid(format!("header `{GRANT_HEADER}` is no grant: {e}")))?;
+/// Checks that a manifest names only blobs that its worker uploaded for this task or may read.
+async fn check_blobs(
+    actor_handle: &ActorHandle,
+    proof: &Proof,
+    grant: &Grant,
+    manifest: Digest,
+    receipts: &BTreeMap<Digest, String>,
+) -> Result<(), Failure> {
+    let state = actor_handle.state();
+    // An invalid grant is left to the decision. Fences only grow, so it cannot become valid meanwhile.
+    let (Ok(()), Ok(roots)) = (state.check_write(grant), state.read_by(&grant.task)) else { return Ok(()) };
+    let caller = &proof.caller.name;
+    let is_own = |(digest, shown): &(&Digest, &String)| actor_handle.secrets.is_receipt(caller, grant, **digest, shown);
+    let own: BTreeSet<Digest> = receipts.iter().filter(is_own).map(|(digest, _)| *digest).collect();
+    let (blobs, reach) = (actor_handle.store.blobs().clone(), Arc::clone(&actor_handle.reach));
+    let looking = move || reach.foreign(&blobs, &roots, |digest| own.contains(&digest), manifest);
+    match ask(&actor_handle.store, looking).await? {
+        None => Ok(()),
+        Some(digest) => Err(Failure::new(
+            StatusCode::CONFLICT,
+            "unvouched",
+            format!(
+                "manifest {manifest} names blob {digest}, which this worker neither uploaded for the task nor may read"
+            ),
+        )
+        .hint("upload every blob under the task's grant and send the receipts")),
+    }
+}
+
+/// The grant of an upload, checked before the body is read.
+fn granted(actor_handle: &ActorHandle, proof: &Proof, headers: &HeaderMap) -> Result<Grant, Failure> {
+    let grant = secrets::grant(headers)?;
+    proof.of_grant(&actor_handle.secrets, &grant)?;
     actor_handle.state().check_write(&grant)?;
     Ok(grant)
 }
 
-/// A header that is a number.
+/// The value of a numeric header.
 fn number(headers: &HeaderMap, name: &str) -> Result<Option<u64>, Failure> {
     let Some(value) = headers.get(name) else { return Ok(None) };
     let number = value.to_str().ok().and_then(|text| text.parse().ok());
@@ -99,34 +169,44 @@ fn named(digest: &str) -> Result<Digest, Failure> {
     digest.parse().map_err(|e| Failure::invalid(format!("{e}")))
 }
 
-/// How much of a blob is there, in the name of a grant: a cut upload goes on from `staged`, and one of bytes that are stored
-/// already need not begin.
+/// Reports the progress of an upload under a grant. A cut-off upload continues from `staged`; bytes that are already
+/// stored need no upload.
 pub(crate) async fn staged(
     State(actor_handle): State<Arc<ActorHandle>>,
     Path(digest): Path<String>,
+    proof: Proof,
     headers: HeaderMap,
 ) -> Result<Json<BlobStored>, Failure> {
-    let grant = granted(&actor_handle, &headers)?;
+    let grant = granted(&actor_handle, &proof, &headers)?;
     let digest = named(&digest)?;
-    let blobs = actor_handle.store.blobs().clone();
-    blocking(move || {
-        blobs.hold(&grant.task, digest);
-        let stored = blobs.reuse(digest)?;
-        Ok(Json(BlobStored { digest, stored, staged: blobs.staged(&grant, digest)? }))
-    })
-    .await
+    let receipt = headers.get(RECEIPT_HEADER).and_then(|shown| shown.to_str().ok()).map(str::to_owned);
+    let receipt = receipt.filter(|shown| actor_handle.secrets.is_receipt(&proof.caller.name, &grant, digest, shown));
+    let roots = actor_handle.state().read_by(&grant.task)?;
+    let (blobs, reach) = (actor_handle.store.blobs().clone(), Arc::clone(&actor_handle.reach));
+    let looked = ask(&actor_handle.store, move || -> Result<_, Failure> {
+        // The existence of other blobs is not revealed: the worker either has their bytes or has no use for them.
+        let is_known = receipt.is_some() || reach.includes(&blobs, &roots, digest)?;
+        if is_known {
+            blobs.hold(&grant.task, digest);
+        }
+        let stored = is_known && blobs.reuse(digest)?;
+        let receipt = receipt.filter(|_| stored);
+        Ok(Json(BlobStored { digest, stored, staged: blobs.staged(&grant, digest)?, receipt }))
+    });
+    looked.await
 }
 
-/// Takes a blob, or the next part of one, as it comes.
+/// Stores a blob, or the next part of one, while it arrives.
 pub(crate) async fn put_blob(
     State(actor_handle): State<Arc<ActorHandle>>,
     Path(digest): Path<String>,
+    proof: Proof,
     headers: HeaderMap,
     body: Body,
 ) -> Result<Json<BlobStored>, Failure> {
-    let grant = granted(&actor_handle, &headers)?;
+    let grant = granted(&actor_handle, &proof, &headers)?;
     let digest = named(&digest)?;
-    let missing = || Failure::invalid(format!("header `{BYTES_HEADER}` is missing: the blob's length"));
+    let missing = || Failure::invalid(format!("header `{BYTES_HEADER}` with the blob's length is missing"));
     let bytes = match number(&headers, BYTES_HEADER)? {
         Some(bytes) => bytes,
         // The body is the whole blob.
@@ -134,16 +214,18 @@ pub(crate) async fn put_blob(
     };
     let offset = number(&headers, OFFSET_HEADER)?.unwrap_or_default();
     if bytes > MAX_BLOB_BYTES {
-        return Err(Failure::invalid(format!(
-            "a blob of {bytes} bytes is too large: at most {MAX_BLOB_BYTES} are taken"
-        )));
+        let message = format!("a blob of {bytes} bytes is too large: expected at most {MAX_BLOB_BYTES}");
+        let failure = Failure::new(StatusCode::PAYLOAD_TOO_LARGE, "too-large", message);
+        return Err(failure.hint("train a smaller network: its state is one file"));
     }
-    let blobs = actor_handle.store.blobs().clone();
+    let (store, blobs) = (&actor_handle.store, actor_handle.store.blobs().clone());
+    let receipt = actor_handle.secrets.receipt(&proof.caller.name, &grant, digest);
     let stored = async {
-        let arriving = blocking(move || blobs.take_up(&grant, digest, offset, bytes)).await?;
-        receive(arriving, body, digest).await
+        let arriving = ask(store, move || blobs.take_up(&grant, digest, offset, bytes)).await?;
+        let (stored, staged) = receive(store, arriving, body).await?;
+        Ok(Json(BlobStored { digest, stored, staged, receipt: stored.then_some(receipt) }))
     };
-    stored.await.map_err(|error| {
+    stored.await.map_err(|error: Unstored| {
         if let Unstored::Resume(ResumeError::Blob(BlobError::Storage(message))) = &error {
             actor_handle.wrote::<()>(&Err(WriteError::Storage(message.clone())));
         }
@@ -151,11 +233,12 @@ pub(crate) async fn put_blob(
     })
 }
 
-async fn receive(mut arriving: Arriving, body: Body, digest: Digest) -> Result<Json<BlobStored>, Unstored> {
+/// Receives a body; returns whether the blob is complete, and the number of bytes received.
+async fn receive(store: &Store, mut arriving: Arriving, body: Body) -> Result<(bool, u64), Unstored> {
     let mut body = body.into_data_stream();
     let mut ended = false;
     while !ended {
-        // A slow sender holds no thread, and no more memory than this.
+        // A slow sender occupies no thread, and no more memory than one part.
         let (mut parts, mut length) = (Vec::new(), 0);
         while length < PART_BYTES {
             match tokio::time::timeout(BODY_IDLE, body.next()).await {
@@ -168,11 +251,11 @@ async fn receive(mut arriving: Arriving, body: Body, digest: Digest) -> Result<J
                     ended = true;
                     break;
                 }
-                Err(_) => return Err(Unstored::Cut(format!("nothing came for {} s", BODY_IDLE.as_secs()))),
+                Err(_) => return Err(Unstored::Cut(format!("no data arrived for {} s", BODY_IDLE.as_secs()))),
             }
         }
-        // Comes back dropped if this request is: what has arrived is kept.
-        arriving = blocking(move || -> Result<Arriving, BlobError> {
+        // If the request is dropped, `arriving` is dropped too, which keeps the bytes received.
+        arriving = ask(store, move || -> Result<Arriving, BlobError> {
             for part in parts {
                 arriving.write(&part)?;
             }
@@ -182,15 +265,15 @@ async fn receive(mut arriving: Arriving, body: Body, digest: Digest) -> Result<J
         .map_err(ResumeError::Blob)?;
     }
     let staged = arriving.written();
-    let stored = blocking(move || arriving.finish()).await.map_err(ResumeError::Blob)?;
-    Ok(Json(BlobStored { digest, stored, staged }))
+    let stored = ask(store, move || arriving.finish()).await.map_err(ResumeError::Blob)?;
+    Ok((stored, staged))
 }
 
-/// Why a blob was not taken.
+/// The reason why a blob was not stored.
 enum Unstored {
     /// The body ended early.
     Cut(String),
-    /// The store refuses it.
+    /// The store refused it.
     Resume(ResumeError),
 }
 
@@ -203,7 +286,7 @@ impl From<ResumeError> for Unstored {
 impl From<Unstored> for Failure {
     fn from(error: Unstored) -> Self {
         let message = match &error {
-            Unstored::Cut(message) => format!("the blob was cut short: {message}"),
+            Unstored::Cut(message) => format!("the blob was cut off: {message}"),
             Unstored::Resume(error) => error.to_string(),
         };
         match error {
@@ -212,39 +295,50 @@ impl From<Unstored> for Failure {
                 Self::new(StatusCode::RANGE_NOT_SATISFIABLE, "offset", message)
             }
             Unstored::Resume(ResumeError::Busy | ResumeError::TooMany(_)) => Self::busy(message),
-            // These bytes came damaged, which says nothing about what is stored.
+            // The bytes were damaged in transit, which implies nothing about stored ones.
             Unstored::Resume(ResumeError::Blob(BlobError::Corrupt { .. } | BlobError::Refused(_))) => {
-                Self::invalid(message)
+                Self::new(StatusCode::UNPROCESSABLE_ENTITY, "arrived-damaged", message)
             }
             Unstored::Resume(ResumeError::Blob(error)) => error.into(),
         }
     }
 }
 
-/// A blob, or what follows `range: bytes=N-` of one. The last bytes of a damaged blob are never sent: the answer breaks off.
+/// Sends a blob, or the rest of one from `range: bytes=N-`. The last bytes of a damaged blob are never sent; the answer
+/// is aborted.
 pub(crate) async fn get_blob(
     State(actor_handle): State<Arc<ActorHandle>>,
     Path(digest): Path<String>,
+    proof: Proof,
     headers: HeaderMap,
 ) -> Result<Response, Failure> {
     let digest = named(&digest)?;
     let from = from(&headers)?;
+    if !proof.caller.scopes.allow(Scope::Read) {
+        check_read(&actor_handle, &proof, &headers, digest).await?;
+    }
     let blobs = actor_handle.store.blobs().clone();
-    let opened = blocking(move || -> Result<_, BlobError> {
+    let opened = ask(&actor_handle.store, move || -> Result<_, Failure> {
         let mut reader = match from {
             None => blobs.read(digest)?,
-            Some(from) => blobs.read_from(digest, from)?,
+            Some(from) => {
+                let bytes = blobs.verify(digest)?.bytes;
+                if from > bytes {
+                    return Err(past_the_end(digest, from, bytes));
+                }
+                blobs.read_from(digest, from)?
+            }
         };
-        // A small blob is whole by now, or refused.
+        // A small blob has been verified at this point.
         let first = reader.next_part()?;
         Ok((first, reader))
     });
     let (first, reader) = opened.await?;
     let bytes = reader.bytes();
     let length = bytes - from.unwrap_or_default();
-    let rest = stream::try_unfold(reader, |mut reader| async {
-        let (part, reader) = blocking(move || (reader.next_part(), reader)).await;
-        Ok::<_, BlobError>(part?.map(|part| (part, reader)))
+    let rest = stream::try_unfold((reader, actor_handle.store.clone()), |(mut reader, store)| async {
+        let (part, reader) = ask(&store, move || Ok::<_, BlobError>((reader.next_part()?, reader))).await?;
+        Ok::<_, BlobError>(part.map(|part| (part, (reader, store))))
     });
     let body = Body::from_stream(stream::iter(first.map(Ok)).chain(rest));
     let mut response = Response::new(body);
@@ -261,7 +355,40 @@ pub(crate) async fn get_blob(
     Ok(response)
 }
 
-/// Where a download goes on.
+/// Checks that a worker reads only blobs of its task's inputs, checkpoints and uploads, or of the tasks that it
+/// prepares for.
+async fn check_read(
+    actor_handle: &ActorHandle,
+    proof: &Proof,
+    headers: &HeaderMap,
+    digest: Digest,
+) -> Result<(), Failure> {
+    let process = secrets::process(headers)?;
+    let state = actor_handle.state();
+    // All errors look the same: a worker must not take them for information about the blob.
+    proof
+        .of_process(&state, &process)
+        .map_err(|_| secrets::unproven("the call does not show the secret of its worker"))?;
+    // A stage may read its own uploads, such as its last checkpoint.
+    let task = state.held_by(&process.worker).map(|(_, task)| task.id.clone());
+    if task.is_some_and(|task| actor_handle.store.blobs().has_stored(&task, digest)) {
+        return Ok(());
+    }
+    let roots = state.readable_by(&process.worker);
+    let (blobs, reach) = (actor_handle.store.blobs().clone(), Arc::clone(&actor_handle.reach));
+    if ask(&actor_handle.store, move || reach.includes(&blobs, &roots, digest)).await? {
+        return Ok(());
+    }
+    let message = format!("the tasks of worker `{}` do not read blob {digest}", process.worker);
+    Err(Failure::new(StatusCode::FORBIDDEN, "forbidden", message))
+}
+
+fn past_the_end(digest: Digest, from: u64, bytes: u64) -> Failure {
+    let message = format!("header `range`: blob {digest} has {bytes} bytes; byte {from} is past its end");
+    Failure::new(StatusCode::RANGE_NOT_SATISFIABLE, "invalid", message)
+}
+
+/// The first byte of a continued download.
 fn from(headers: &HeaderMap) -> Result<Option<u64>, Failure> {
     let Some(range) = headers.get(header::RANGE) else { return Ok(None) };
     let text = range.to_str().ok().and_then(|text| text.strip_prefix("bytes=")?.strip_suffix('-'));

@@ -1,7 +1,7 @@
-//! The versions of the registry that a pipeline names in the place of stages, as they are when it is submitted.
+//! Resolution of registry versions that a pipeline uses in place of stages, at the time of submission.
 //!
-//! What is found stands in the pipeline from then on, beside the digests of folders: keys are made of it, a run that is resumed keeps it, and
-//! an alias that moves meanwhile changes nothing.
+//! The resolved digests become part of the pipeline, like those of folders. Keys include them and a resumed run keeps
+//! them, so that a later move of an alias has no effect.
 
 use checkpoint::model::{Model, part_of_kind};
 use protocol::pipeline::Pipeline;
@@ -9,12 +9,10 @@ use protocol::stage::VersionInput;
 use protocol::{ArtifactKind, Digest};
 use registry::{BlobStore, QueryError, ReadStore};
 
-use super::blocking::blocking;
-
-/// Fills in what the pipeline's versions stand for: a whole model, or its part of the kind that the stage reads.
+/// Adds the digests of the pipeline's versions: of a whole model, or of its part that the stage reads.
 ///
 /// # Errors
-/// Every version that there is not or that has no such part, a line for each; else what keeps the store from answering.
+/// All versions that do not exist or lack the part, one per line; otherwise the error of the store.
 pub async fn resolve_versions(pipeline: &mut Pipeline, store: &ReadStore) -> Result<(), QueryError> {
     let mut wrong = Vec::new();
     for stage in &mut pipeline.stages {
@@ -22,7 +20,7 @@ pub async fn resolve_versions(pipeline: &mut Pipeline, store: &ReadStore) -> Res
             let found = match store.resolve(&input.version).await {
                 Ok(version) => {
                     let (blobs, input) = (store.blobs().clone(), input.clone());
-                    blocking(move || part(&blobs, version.artifact, &input)).await
+                    store.ask_blobs(move || part(&blobs, version.artifact, &input)).await
                 }
                 Err(error) => Err(error),
             };
@@ -44,7 +42,7 @@ fn damaged(error: impl std::fmt::Display) -> QueryError {
     QueryError::Blob(error.to_string())
 }
 
-/// What a stage reads of the version that is registered as `artifact`.
+/// The artifact or part that a stage reads of the version registered as `artifact`.
 fn part(blobs: &BlobStore, artifact: Digest, input: &VersionInput) -> Result<Digest, QueryError> {
     let manifest = blobs.manifest(artifact).map_err(damaged)?;
     let model = Model::read(&manifest).map_err(|e| QueryError::Invalid(e.to_string()))?;

@@ -1,6 +1,6 @@
-//! Facts put into the state. Total and without rules: nothing here asks whether a fact is wise, only whether what it is about is there.
+//! Application of facts to the state. It has no rules: it checks only that the objects of a fact exist.
 
-use std::collections::BTreeMap;
+use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use protocol::{Digest, WorkerId};
@@ -8,54 +8,130 @@ use protocol::{Digest, WorkerId};
 use super::State;
 use super::execution::StageExecution;
 use super::run::{Run, Status};
+use super::shared::{Map, Set};
 use super::task::Task;
 use crate::fact::Fact;
 
-/// A fact about something that is not there.
+/// A fact about an object that does not exist.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("a fact is about {0}, which is not known")]
-pub struct Misfit(String);
+#[error("a fact refers to {0}, which does not exist")]
+pub struct UnknownObject(String);
 
-type Result<T = ()> = std::result::Result<T, Misfit>;
+type Result<T = ()> = std::result::Result<T, UnknownObject>;
 
 impl State {
-    /// Makes the state what `fact` says. An error changes nothing.
+    /// Applies `fact` to the state. An error changes nothing.
     pub fn apply(&mut self, fact: &Fact) -> Result {
+        let mut concerned = self.concerned(fact);
+        self.apply_alone(fact)?;
+        concerned.append(&mut self.concerned(fact));
+        for key in concerned {
+            self.requeue(key);
+        }
+        Ok(())
+    }
+
+    /// Executions whose position or need in the queue `fact` may change.
+    fn concerned(&self, fact: &Fact) -> BTreeSet<Digest> {
+        let mut keys = BTreeSet::new();
+        match fact {
+            Fact::Run { run } => keys.extend(run.stages.iter().filter_map(Status::key)),
+            Fact::RunState { run, .. } => {
+                keys.extend(self.runs.get(run).into_iter().flat_map(|run| run.all_active()).map(|(_, key)| key));
+            }
+            Fact::Stages { run, stages } => {
+                let known = |i: &usize| self.runs.get(run)?.stages.get(*i)?.key();
+                keys.extend(stages.iter().filter_map(|(i, _)| known(i)));
+            }
+            Fact::RunForgotten { run } => {
+                keys.extend(self.runs.get(run).into_iter().flat_map(|run| &run.stages).filter_map(Status::key));
+            }
+            Fact::Execution { execution } => drop(keys.insert(execution.key)),
+            Fact::ExecutionState { key, .. }
+            | Fact::ExecutionPlacement { key, .. }
+            | Fact::ExecutionInstructions { key, .. }
+            | Fact::Tasks { key, .. }
+            | Fact::Task { key, .. }
+            | Fact::ExecutionForgotten { key } => drop(keys.insert(*key)),
+            Fact::Resolved { .. }
+            | Fact::StagesAdded { .. }
+            | Fact::SweepBegun { .. }
+            | Fact::SweepMoved { .. }
+            | Fact::ExecutionSource { .. }
+            | Fact::ExecutionTime { .. }
+            | Fact::ExecutionResumed { .. }
+            | Fact::Worker { .. }
+            | Fact::WorkerForgotten { .. }
+            | Fact::Draining { .. } => {}
+        }
+        if !self.mends.is_empty() {
+            // The position of a recomputed input depends on its readers and on their other inputs.
+            let waiting: Vec<Digest> = keys.iter().flat_map(|key| self.waiting_for(*key)).collect();
+            keys.extend(waiting);
+            let mended: Vec<Digest> = keys.iter().flat_map(|key| self.mended_for(*key)).collect();
+            keys.extend(mended);
+        }
+        keys
+    }
+
+    fn apply_alone(&mut self, fact: &Fact) -> Result {
         match fact {
             Fact::Run { run } => {
                 self.submitted = self.submitted.max(run.number);
                 let run = Arc::new(Run::clone(run));
-                run.stages.iter().for_each(|status| self.use_execution(run.number, status, true));
-                self.runs.insert(run.number, run);
+                for (i, status) in run.stages.iter().enumerate() {
+                    self.use_execution(run.number, i, status, true);
+                }
+                if let Some(key) = &run.idempotency_key {
+                    self.idempotent.insert_mut(key.clone(), run.number);
+                }
+                self.note_parked(run.number, run.parked);
+                self.runs.insert_mut(run.number, run);
             }
-            Fact::RunState { run, state, parked } => {
-                let run = self.run_mut(*run)?;
+            Fact::RunState { run: number, state, parked } => {
+                let run = self.run_mut(*number)?;
                 (run.state, run.parked) = (*state, *parked);
+                self.note_parked(*number, *parked);
             }
             Fact::Stages { run: number, stages } => {
                 let run = self.run_mut(*number)?;
                 if let Some((i, _)) = stages.iter().find(|(i, _)| *i >= run.stages.len()) {
-                    return Err(Misfit(format!("stage {i} of run {number}")));
+                    return Err(UnknownObject(format!("stage {i} of run {number}")));
                 }
-                let before: Vec<Status> = stages.iter().map(|(i, _)| run.stages[*i].clone()).collect();
+                let before: Vec<(usize, Status)> = stages.iter().map(|(i, _)| (*i, run.stages[*i].clone())).collect();
                 stages.iter().for_each(|(i, status)| run.set(*i, status.clone()));
-                stages.iter().for_each(|(_, status)| self.use_execution(*number, status, true));
-                before.iter().for_each(|status| self.use_execution(*number, status, false));
+                before.iter().for_each(|(i, status)| self.use_execution(*number, *i, status, false));
+                stages.iter().for_each(|(i, status)| self.use_execution(*number, *i, status, true));
+            }
+            Fact::Resolved { run, stage, digests } => {
+                let run = self.run_mut(*run)?;
+                match digests.is_empty() {
+                    true => drop(run.resolved.remove(stage)),
+                    false => drop(run.resolved.insert(*stage, digests.clone())),
+                }
             }
             Fact::StagesAdded { run, stages } => self.run_mut(*run)?.add_stages(stages.clone()),
             Fact::SweepBegun { run, sweep } => self.run_mut(*run)?.sweeps.push(Arc::new((**sweep).clone())),
             Fact::SweepMoved { run: number, stage, progress, places, failures } => {
                 let run = self.run_mut(*number)?;
                 let sweep = run.sweeps.iter_mut().find(|sweep| sweep.stage == *stage);
-                let sweep = sweep.ok_or_else(|| Misfit(format!("the sweep of stage {stage} of run {number}")))?;
+                let sweep =
+                    sweep.ok_or_else(|| UnknownObject(format!("the sweep of stage {stage} of run {number}")))?;
                 let sweep = Arc::make_mut(sweep);
                 sweep.search.follow(progress);
                 sweep.places.extend(places);
                 sweep.failures.extend(failures.iter().cloned());
             }
             Fact::RunForgotten { run: number } => {
-                let run = self.runs.remove(number).ok_or_else(|| Misfit(format!("run {number}")))?;
-                run.stages.iter().for_each(|status| self.use_execution(*number, status, false));
+                let run = self.runs.get(number).cloned().ok_or_else(|| UnknownObject(format!("run {number}")))?;
+                self.runs.remove_mut(number);
+                for (i, status) in run.stages.iter().enumerate() {
+                    self.use_execution(*number, i, status, false);
+                }
+                if let Some(key) = &run.idempotency_key {
+                    self.idempotent.remove_mut(key);
+                }
+                self.note_parked(*number, false);
             }
             Fact::Execution { .. }
             | Fact::ExecutionState { .. }
@@ -73,17 +149,17 @@ impl State {
                 let mut process = process.clone();
                 process.holds = holds;
                 if holds.is_none() && !self.unused.contains(name) {
-                    Arc::make_mut(&mut self.unused).insert(name.clone());
+                    self.unused.insert_mut(name.clone());
                 }
-                Arc::make_mut(&mut self.workers).insert(name.clone(), process);
+                self.workers.insert_mut(name.clone(), process);
             }
             Fact::WorkerForgotten { worker: name } => {
                 if self.workers.get(name).is_none_or(|worker| worker.holds.is_some()) {
-                    return Err(Misfit(format!("worker `{name}` without a task")));
+                    return Err(UnknownObject(format!("worker `{name}` without a task")));
                 }
-                Arc::make_mut(&mut self.workers).remove(name);
-                Arc::make_mut(&mut self.unused).remove(name);
-                Arc::make_mut(&mut self.heard.workers).remove(name);
+                self.workers.remove_mut(name);
+                self.unused.remove_mut(name);
+                self.heard.workers.remove_mut(name);
             }
             Fact::Draining { draining } => self.draining = *draining,
         }
@@ -94,9 +170,14 @@ impl State {
         match fact {
             Fact::Execution { execution } => {
                 self.place_tasks(execution.key, &execution.tasks);
-                self.executions.insert(execution.key, Arc::new((**execution).clone()));
+                self.executions.insert_mut(execution.key, Arc::new((**execution).clone()));
+                self.note_mending(execution.key, &execution.state, true);
             }
-            Fact::ExecutionState { key, state } => self.execution_mut(*key)?.state = state.clone(),
+            Fact::ExecutionState { key, state } => {
+                let before = std::mem::replace(&mut self.execution_mut(*key)?.state, state.clone());
+                self.note_mending(*key, &before, false);
+                self.note_mending(*key, state, true);
+            }
             Fact::ExecutionPlacement { key, placement } => self.execution_mut(*key)?.placement = placement.clone(),
             Fact::ExecutionSource { key, run, stage } => {
                 let execution = self.execution_mut(*key)?;
@@ -117,94 +198,110 @@ impl State {
             Fact::Task { key, task, change } => {
                 let execution = self.execution_mut(*key)?;
                 if *task >= execution.tasks.len() {
-                    return Err(Misfit(format!("task {task} of execution {key}")));
+                    return Err(UnknownObject(format!("task {task} of execution {key}")));
                 }
                 self.fence = self.fence.max(change.fence.unwrap_or_default());
                 self.change(*key, *task, |task| change.apply(task));
             }
             Fact::ExecutionForgotten { key } => {
                 let known = self.executions.get(key).filter(|execution| !execution.tasks.is_any_held());
-                let known = known.ok_or_else(|| Misfit(format!("execution {key} that nobody works on")))?;
-                if !known.tasks.is_empty() {
-                    let (tasks, heard) = (Arc::make_mut(&mut self.tasks), Arc::make_mut(&mut self.heard.progress));
-                    for task in &known.tasks {
-                        tasks.remove(&task.id);
-                        heard.remove(&task.id);
-                    }
+                let known = known.ok_or_else(|| UnknownObject(format!("an idle execution {key}")))?;
+                let known = Arc::clone(known);
+                for task in &known.tasks {
+                    self.tasks.remove_mut(&task.id);
+                    self.heard.progress.remove_mut(&task.id);
                 }
-                self.executions.remove(key);
+                self.note_mending(*key, &known.state, false);
+                self.executions.remove_mut(key);
             }
             other => unreachable!("{other:?} is not about an execution"),
         }
         Ok(())
     }
 
-    /// Makes anew what is known twice, after runs, executions and workers were put in as a whole.
+    /// Rebuilds all derived data after loading runs, executions and workers.
     pub(crate) fn index(&mut self) {
-        let mut tasks = BTreeMap::new();
-        let workers = Arc::make_mut(&mut self.workers);
+        self.tasks = Map::default();
         for (key, execution) in &self.executions {
             for (i, task) in execution.tasks.iter().enumerate() {
-                tasks.insert(task.id.clone(), (*key, i));
+                self.tasks.insert_mut(task.id.clone(), (*key, i));
                 for member in task.holders() {
-                    if let Some(worker) = workers.get_mut(&member.worker) {
+                    if let Some(worker) = self.workers.get_mut(&member.worker) {
                         worker.holds = Some((*key, i));
                     }
                 }
             }
         }
-        let unused = workers.iter().filter(|(_, worker)| worker.holds.is_none()).map(|(name, _)| name.clone());
-        self.unused = Arc::new(unused.collect());
-        self.tasks = Arc::new(tasks);
+        let unused = self.workers.iter().filter(|(_, worker)| worker.holds.is_none()).map(|(name, _)| name.clone());
+        self.unused = unused.collect();
+        let keys = self.runs.values().filter_map(|run| Some((run.idempotency_key.clone()?, run.number)));
+        self.idempotent = keys.collect();
+        self.parked = self.runs.values().filter(|run| run.parked).map(|run| run.number).collect::<Set<u64>>();
+        self.index_queue();
+    }
+
+    fn note_parked(&mut self, run: u64, parked: bool) {
+        if parked {
+            self.parked.insert_mut(run);
+        } else {
+            self.parked.remove_mut(&run);
+        }
     }
 
     fn run_mut(&mut self, number: u64) -> Result<&mut Run> {
-        self.runs.get_mut(&number).map(Arc::make_mut).ok_or_else(|| Misfit(format!("run {number}")))
+        self.runs.get_mut(&number).map(Arc::make_mut).ok_or_else(|| UnknownObject(format!("run {number}")))
     }
 
     /// Changes an execution; other copies of the state keep theirs.
     fn execution_mut(&mut self, key: Digest) -> Result<&mut StageExecution> {
-        self.executions.get_mut(&key).map(Arc::make_mut).ok_or_else(|| Misfit(format!("execution {key}")))
+        self.executions.get_mut(&key).map(Arc::make_mut).ok_or_else(|| UnknownObject(format!("execution {key}")))
     }
 
-    fn place_tasks(&mut self, key: Digest, tasks: &[Task]) {
-        if let Some(fence) = tasks.iter().map(|task| task.fence).max() {
-            self.fence = self.fence.max(fence);
-            Arc::make_mut(&mut self.tasks)
-                .extend(tasks.iter().enumerate().map(|(i, task)| (task.id.clone(), (key, i))));
+    fn place_tasks<'a>(&mut self, key: Digest, tasks: impl IntoIterator<Item = &'a Task>) {
+        for (i, task) in tasks.into_iter().enumerate() {
+            self.fence = self.fence.max(task.fence);
+            self.tasks.insert_mut(task.id.clone(), (key, i));
         }
     }
 
-    /// Takes note that a run has one stage more, or one less, with the key of `status`.
-    fn use_execution(&mut self, run: u64, status: &Status, more: bool) {
+    /// Adds or removes a stage of a run as a user of the execution in `status`.
+    fn use_execution(&mut self, run: u64, stage: usize, status: &Status, has: bool) {
         let Some(execution) = status.key().and_then(|key| self.executions.get_mut(&key)) else { return };
         let users = &mut Arc::make_mut(execution).users;
-        let count = users.entry(run).or_default();
-        *count = if more { *count + 1 } else { count.saturating_sub(1) };
-        if *count == 0 {
-            users.remove(&run);
+        if has {
+            users.insert_mut((run, stage));
+        } else {
+            users.remove_mut(&(run, stage));
         }
     }
 
-    /// Changes a task; the only way to.
+    /// Changes a task. This is the only way to change one.
     fn change(&mut self, key: Digest, i: usize, change: impl FnOnce(&mut Task)) {
         let Some(execution) = self.executions.get_mut(&key).map(Arc::make_mut) else { return };
         let before = execution.tasks[i].holders().to_vec();
         execution.tasks.change(i, change);
         let after = execution.tasks[i].holders();
         if before != after {
-            let (workers, unused) = (Arc::make_mut(&mut self.workers), Arc::make_mut(&mut self.unused));
-            let mut set = |name: &WorkerId, holds| {
-                let Some(worker) = workers.get_mut(name) else { return };
-                worker.holds = holds;
-                if holds.is_none() {
-                    unused.insert(name.clone())
-                } else {
-                    unused.remove(name)
-                };
-            };
-            before.iter().for_each(|member| set(&member.worker, None));
-            after.iter().for_each(|member| set(&member.worker, Some((key, i))));
+            let after = after.to_vec();
+            before.iter().for_each(|member| self.set_held(&member.worker, None));
+            if before.iter().any(|member| !after.contains(member) && self.heard.words.contains_key(&member.worker)) {
+                let words = Arc::make_mut(&mut self.heard.words);
+                before
+                    .iter()
+                    .filter(|member| !after.contains(member))
+                    .for_each(|member| drop(words.remove(&member.worker)));
+            }
+            after.iter().for_each(|member| self.set_held(&member.worker, Some((key, i))));
+        }
+    }
+
+    fn set_held(&mut self, name: &WorkerId, holds: Option<(Digest, usize)>) {
+        let Some(worker) = self.workers.get_mut(name) else { return };
+        worker.holds = holds;
+        if holds.is_none() {
+            self.unused.insert_mut(name.clone());
+        } else {
+            self.unused.remove_mut(name);
         }
     }
 }

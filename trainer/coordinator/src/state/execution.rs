@@ -1,4 +1,4 @@
-//! The work of one stage, by the stage's key: done once however many runs wait for it.
+//! The work of one stage, identified by the stage's key and done once for all runs that wait for it.
 //!
 //! | progress \ event | looked up: known | looked up: unknown | all tasks done | bundled | failed for good | wanted again | an input is damaged | inputs are whole |
 //! |---|---|---|---|---|---|---|---|---|
@@ -9,10 +9,11 @@
 //! | Done | - | - | - | - | - | Looking | - | - |
 //! | Failed | - | - | - | - | - | Looking | - | - |
 //!
-//! What gave a damaged input is wanted again, and so `Looking`: the store finds what of it is not whole.
+//! The producer of a damaged input is wanted again and so becomes `Looking`: the store checks which of its blobs are
+//! intact.
 //!
-//! A run owns its statuses, not the work: cancelling one of two runs that want the same stage does not disturb the other,
-//! and a run that is submitted again after a failure finds tasks, checkpoints and the seconds already spent.
+//! A run owns its statuses, not the work. Cancelling one of two runs with the same stage does not disturb the other. A
+//! run that is submitted again after a failure finds the tasks, checkpoints and working time of the earlier one.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -21,6 +22,7 @@ use protocol::stage::{Backend, Placement, Shape, StageSettings, WorkerRange};
 use protocol::{Attempt, Digest, Fence, RunId, Seed, StageName, TaskId};
 use serde::{Deserialize, Serialize};
 
+use super::shared::Set;
 use super::task::{Part, Task};
 use super::tasks::Tasks;
 use super::worker::Worker;
@@ -28,34 +30,33 @@ use crate::register::Registration;
 use crate::time::Millis;
 use crate::value::Known;
 
-/// How far the work is.
+/// The state of an execution.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum ExecutionState {
-    /// The store is asked whether it has the value.
+    /// A lookup of the value in the store is pending.
     Looking,
-    /// Tasks are to be done.
+    /// Some tasks are not done.
     Open,
-    /// It waits for inputs that a worker found damaged or missing to be made again.
+    /// The execution waits for the recomputation of damaged or missing inputs.
     Mending {
-        /// The executions that give them.
+        /// The executions that produce these inputs.
         inputs: BTreeSet<Digest>,
     },
     /// The coordinator itself makes the model bundles.
     Bundling,
-    /// Done.
+    /// The value is known.
     Done {
-        /// The value.
         #[serde(with = "super::shared")]
         known: Arc<Known>,
-        /// The store had it already.
+        /// Set if the store already had the value.
         cached: bool,
     },
-    /// Failed for good, or until somebody wants it again.
+    /// Failed until a run wants it again.
     Failed {
-        /// Why.
+        /// The reason, as text for the user.
         message: String,
-        /// It would fail again wherever it ran: because of its settings and inputs, not of the machines or the store.
+        /// Set if the failure is due to the stage's settings and inputs and would recur on any machine.
         own: bool,
     },
 }
@@ -63,46 +64,53 @@ pub enum ExecutionState {
 /// The work of one stage.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct StageExecution {
-    /// The stage's key.
     pub key: Digest,
-    /// The run that wanted it first; tasks bear its name.
+    /// The run that wanted it first; the ids of its tasks contain this run's id.
     pub run: RunId,
     pub stage: StageName,
-    /// What keys its randomness: its name, but for a trial of a sweep.
+    /// The name that keys its randomness: the stage's own, except for a trial of a sweep.
     pub keyed_as: StageName,
-    /// Its settings, as written.
+    /// The stage's settings as written.
     pub settings: StageSettings,
-    /// Artifacts by the field that names them.
+    /// Digests of the inputs, by the field that names them.
     pub inputs: BTreeMap<String, Digest>,
     pub seed: Seed,
-    /// Where it must be computed.
+    /// The backend that computes it.
     pub backend: Backend,
-    /// Workers and checkpoints, as the run that wanted it last asks.
+    /// Set if it only digests files that the settings name outside the store, so that the stage gets a key. This
+    /// execution's own key belongs to one stage of one run, and no value is stored under it.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub resolves: bool,
+    /// Number of workers and of checkpoints, from the run that wanted it last.
     pub placement: Placement,
-    /// What a register stage registers.
+    /// The models to register, for a register stage.
     pub registration: Option<Registration>,
-    /// How far it is.
     pub state: ExecutionState,
-    /// Its tasks: none, one, or the shards and their merge.
+    /// No task, one task, or the shards and their merge.
     pub tasks: Tasks,
-    /// Milliseconds of work, up to `busy_since`.
+    /// Milliseconds of work before `busy_since`.
     pub wall_ms: u64,
-    /// Set while some task is held.
+    /// The start of the current period in which a task is held.
     pub busy_since: Option<Millis>,
-    /// It went on from something that an earlier try had saved.
+    /// Set if it continued from data of an earlier try.
     pub resumed: bool,
-    /// The instruction set of who worked on it last.
+    /// The instruction set of the last workers.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub instruction_set: Option<String>,
-    /// The runs in memory that have stages with this key, and how many: those that came to it while it was in memory itself.
-    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
-    pub users: BTreeMap<u64, usize>,
+    /// Stages of runs in memory that have this key, by run and index. A stage is added if it gets the key while this
+    /// execution is in memory.
+    #[serde(default, skip_serializing_if = "Set::is_empty")]
+    pub users: Set<(u64, usize)>,
 }
 
 impl StageExecution {
-    /// The tasks that it consists of. Their fences begin above `fence`, so that a name that was used before and forgotten never bears a
-    /// fence again that somebody may still hold.
+    /// Creates the tasks. Their fences start above `fence`, because a forgotten task with the same id may have had a
+    /// lower fence that a worker still holds.
     pub fn new_tasks(&self, fence: Fence) -> Vec<Task> {
+        if self.resolves {
+            let id = TaskId::of_resolving(&self.run, &self.stage);
+            return vec![Task { fence, ..Task::new(id, Part::Resolve) }];
+        }
         let task = |shard, part| Task { fence, ..Task::new(TaskId::of(&self.run, &self.stage, shard), part) };
         match self.settings.shape() {
             Shape::Plain => vec![task(None, Part::Alone)],
@@ -117,7 +125,16 @@ impl StageExecution {
         }
     }
 
-    /// How many workers may train it together: a member without a slice of the batch would have nothing to do.
+    /// Inputs that are in the store.
+    pub fn artifacts(&self) -> BTreeMap<String, Digest> {
+        let folders = self.settings.folders();
+        let is_stored = |field: &String| folders.iter().all(|folder| folder.field != *field);
+        let stored = self.inputs.iter().filter(|(field, _)| is_stored(field));
+        stored.map(|(field, digest)| (field.clone(), *digest)).collect()
+    }
+
+    /// Number of workers that may train it together, limited by the number of slices: further members would have no
+    /// work.
     pub fn range(&self) -> WorkerRange {
         let WorkerRange { min, max } = self.placement.workers;
         let Some(training) = self.settings.training() else { return self.placement.workers };
@@ -126,36 +143,47 @@ impl StageExecution {
         WorkerRange { min: min.min(slices), max }
     }
 
-    /// The instruction set that all who work on it must have: that of those who work on it now, or of what an earlier try left.
+    /// Returns true if it has no gang, or a gang with enough members. A smaller gang saves and ends its attempt.
+    pub fn is_enough(&self) -> bool {
+        let min = self.range().min.max(1);
+        self.tasks.held().all(|i| self.tasks[i].part != Part::Gang || self.tasks[i].holders().len() >= min)
+    }
+
+    /// The instruction set that its workers must have: that of its current workers or of data that an earlier try left.
     pub fn bound_to(&self) -> Option<&str> {
         self.instruction_set.as_deref().filter(|_| self.is_busy() || self.has_something())
     }
 
-    /// Whether a worker may work on it.
+    /// Returns true if a worker may work on it.
     pub fn takes(&self, worker: &Worker) -> bool {
         worker.backend == self.backend && self.bound_to().is_none_or(|set| worker.instruction_set == set)
     }
 
-    /// The shards' artifacts in order, once all are there.
+    /// The shards' artifacts in order, once all are done.
     pub fn shards(&self) -> Option<Vec<Digest>> {
         self.tasks.iter().filter(|task| matches!(task.part, Part::Shard { .. })).map(Task::output).collect()
     }
 
-    /// Whether a task can be done now, given that it is free: a merge needs its shards.
+    /// Returns true if a free task can be done now: a merge needs its shards.
     pub fn is_ready(&self, task: &Task) -> bool {
         match task.part {
-            // All but the merge itself.
+            // Only the merge is left.
             Part::Merge => self.tasks.open() == 1,
-            Part::Alone | Part::Gang | Part::Shard { .. } => true,
+            Part::Alone | Part::Resolve | Part::Gang | Part::Shard { .. } => true,
         }
     }
 
-    /// Whether somebody works on it.
+    /// Returns true if a gang computes it.
+    pub fn is_gang(&self) -> bool {
+        self.tasks.first().is_some_and(|task| task.part == Part::Gang)
+    }
+
+    /// Returns true if a worker or the coordinator is working on it.
     pub fn is_busy(&self) -> bool {
         self.state == ExecutionState::Bundling || self.tasks.is_any_held()
     }
 
-    /// Whether it is over, one way or the other.
+    /// Returns true if it is done or failed.
     pub fn is_over(&self) -> bool {
         match self.state {
             ExecutionState::Done { .. } | ExecutionState::Failed { .. } => true,
@@ -166,18 +194,18 @@ impl StageExecution {
         }
     }
 
-    /// Seconds of work up to `now`.
+    /// Seconds of work until `now`.
     pub fn wall_s(&self, now: Millis) -> f64 {
         let running = self.busy_since.map_or(0, |since| now.since(since));
         (self.wall_ms + running) as f64 / 1000.0
     }
 
-    /// The newest try of any task.
+    /// The highest attempt number of all tasks.
     pub fn attempt(&self) -> Attempt {
         self.tasks.iter().map(|task| task.attempt).max().unwrap_or_default()
     }
 
-    /// Whether an earlier try left something to go on from.
+    /// Returns true if an earlier attempt left an output or a checkpoint.
     pub fn has_something(&self) -> bool {
         self.tasks.iter().any(|task| task.output().is_some() || task.newest().is_some())
     }

@@ -1,117 +1,141 @@
-//! All that the coordinator knows. Changed by facts alone ([`apply`](State::apply)) and, for what need not survive a restart, by
-//! `observe`; read by everybody.
+//! The coordinator's complete state. Only facts change it ([`apply`](State::apply)), except for data that need not
+//! survive a restart, which `observe` changes.
 //!
-//! What is known twice, for speed, follows from the facts as well: who waits and who is held in an execution (`tasks::Tasks`), what a
-//! worker holds and which workers hold nothing, which runs use an execution, which stages of a run are active. Invariant C14.
+//! Indexes are derived from the facts as well:
+//! - waiting and held tasks of an execution (`tasks::Tasks`);
+//! - the task that a worker holds, and the workers without a task;
+//! - the runs that use an execution, and the active stages of a run;
+//! - the executions that need workers (`queue::Queue`);
+//! - the runs that are parked or have an idempotency key.
 //!
-//! In memory is what may still matter: runs that have not ended, executions that one of them uses or that somebody works on, workers that
-//! were heard of lately. The rest is in the store's tables. Numbers of runs, incarnations and fences come from counters that only grow, so
-//! that nothing that was forgotten is mistaken for something new.
+//! Invariant C14 checks them.
+//!
+//! Copies share unchanged data (`shared::Map`): a decision on a copy costs only its changes, regardless of the size of
+//! the state.
+//!
+//! Memory has only data that may still matter: runs that have not ended, executions that one of them uses or a worker
+//! is busy with, and workers that polled lately. The rest is in the store's tables. Numbers of runs, incarnations and
+//! fences come from counters that only grow, so that a forgotten object cannot be mistaken for a new one.
 
 mod apply;
+pub mod evidence;
 pub mod execution;
 pub mod gang;
+pub mod queue;
+mod queueing;
 pub mod run;
-pub(crate) mod shared;
+pub mod shared;
 pub mod task;
 pub mod tasks;
 pub mod worker;
 
-use std::collections::{BTreeMap, BTreeSet, HashSet};
+use std::collections::HashSet;
 use std::sync::Arc;
 
 use protocol::message::{Grant, Progress};
 use protocol::{Digest, Fence, Incarnation, RunId, StageName, TaskId, WorkerId};
 
-pub use self::apply::Misfit;
+pub use self::apply::UnknownObject;
+use self::evidence::Words;
 use self::execution::{ExecutionState, StageExecution};
+use self::queue::Queue;
 use self::run::Run;
+use self::shared::{Map, Set};
 use self::task::Task;
 use self::worker::Worker;
 use crate::policy::Policy;
 use crate::rejected::Rejected;
 use crate::time::Millis;
 
-/// What is merely heard: lost with the process, and no loss.
+/// Data from polls. It is lost with the process, which does no harm.
 #[derive(Debug, Clone, Default)]
 pub struct Heard {
-    /// When each worker was last heard of.
-    pub workers: Arc<BTreeMap<WorkerId, Millis>>,
-    /// What was last said about each task that is all of its work.
-    pub progress: Arc<BTreeMap<TaskId, Arc<Progress>>>,
+    /// Time of each worker's last poll.
+    pub workers: Map<WorkerId, Millis>,
+    /// The last reported progress of each task that is its execution's only task.
+    pub progress: Map<TaskId, Arc<Progress>>,
+    /// Reports of gang members about their state and about each other. A worker that loses its task also loses its
+    /// report.
+    pub words: Arc<Words>,
 }
 
-/// All that the coordinator knows. What may be large is shared between copies until one changes it, so a copy is cheap.
+/// The coordinator's complete state. A copy is cheap, because it shares the contents of the maps.
 #[derive(Debug, Clone, Default)]
 pub struct State {
-    /// Times and budgets.
     pub policy: Policy,
-    /// Decisions so far, which is the number of the newest.
+    /// The number of decisions so far, which is also the newest decision's number.
     pub seq: u64,
     /// The time of the newest decision.
     pub now: Millis,
-    /// Runs that were ever submitted.
+    /// The number of runs ever submitted.
     pub submitted: u64,
     /// The newest incarnation of any worker.
     pub incarnation: Incarnation,
     /// The newest fence of any task.
     pub fence: Fence,
     /// Workers by name.
-    pub workers: Arc<BTreeMap<WorkerId, Worker>>,
-    /// Those of them that hold no task.
-    pub unused: Arc<BTreeSet<WorkerId>>,
+    pub workers: Map<WorkerId, Worker>,
+    /// Workers that hold no task.
+    pub unused: Set<WorkerId>,
     /// Runs that have not ended, by number, which is the order of submission.
-    pub runs: BTreeMap<u64, Arc<Run>>,
+    pub runs: Map<u64, Arc<Run>>,
     /// Executions by the stage's key.
-    pub executions: BTreeMap<Digest, Arc<StageExecution>>,
-    /// Which execution a task is of, and its place there.
-    pub tasks: Arc<BTreeMap<TaskId, (Digest, usize)>>,
-    /// About to stop: no grants, workers save and leave.
+    pub executions: Map<Digest, Arc<StageExecution>>,
+    /// The execution of each task, and the task's index in it.
+    pub tasks: Map<TaskId, (Digest, usize)>,
+    /// Executions that running runs wait for, by their needs.
+    pub queue: Queue,
+    /// For each recomputed execution, the executions that wait for it.
+    pub mends: Map<Digest, Set<Digest>>,
+    /// Runs by the client's idempotency key.
+    pub idempotent: Map<String, u64>,
+    /// Runs that a restart paused.
+    pub parked: Set<u64>,
+    /// Set before a shutdown: no grants, and workers save and leave.
     pub draining: bool,
-    /// What was merely heard.
     pub heard: Heard,
-    /// How many facts decisions have recorded since this process started.
+    /// The number of facts recorded since this process started.
     pub recorded: u64,
-    /// Gangs that could take in workers which have nothing to do: what those should prepare for. Made anew by each decision.
+    /// Gangs that could admit idle workers, which prepare for them. Rebuilt by each decision.
     pub open_gangs: Arc<Vec<(Digest, usize)>>,
-    /// How many runs, executions and workers decisions have looked at: what they cost, for tests that count it.
+    /// The number of runs, executions and workers inspected by decisions; tests use it to measure cost.
     pub visits: u64,
 }
 
 impl State {
-    /// A coordinator that knows nothing yet.
+    /// Creates an empty state.
     pub fn new(policy: Policy) -> Self {
         Self { policy, ..Self::default() }
     }
 
-    /// A run by name, if it has not ended.
+    /// A run by id, if it has not ended.
     pub fn run(&self, run: &RunId) -> Result<&Arc<Run>, Rejected> {
         run::number_of(run)
             .and_then(|number| self.runs.get(&number))
             .filter(|known| known.id == *run)
-            .ok_or_else(|| Rejected::NotFound(format!("run `{run}` is not known; `trainer status --all` lists runs")))
+            .ok_or_else(|| Rejected::unknown_run(run))
     }
 
-    /// The execution and the task that a grant is about.
+    /// The task of a grant, with its execution.
     pub fn task(&self, task: &TaskId) -> Result<(&StageExecution, &Task), Rejected> {
         let (key, i) = self.place(task)?;
         let execution = &self.executions[&key];
         Ok((execution, &execution.tasks[i]))
     }
 
-    /// The key of the execution that a task is of, and its place there.
+    /// The key of a task's execution, and the task's index in it.
     pub(crate) fn place(&self, task: &TaskId) -> Result<(Digest, usize), Rejected> {
-        self.tasks.get(task).copied().ok_or_else(|| Rejected::NotFound(format!("task `{task}` is not known, or over")))
+        self.tasks.get(task).copied().ok_or_else(|| Rejected::NotFound(format!("task `{task}` is unknown or over")))
     }
 
-    /// Checks that a write's grant has not been superseded and that its process is not known to be over.
+    /// Checks that a write's grant has not been superseded and that its process is not known to have ended.
     pub fn check_write(&self, grant: &Grant) -> Result<(), Rejected> {
         let (_, task) = self.task(&grant.task)?;
         task.check_fence(grant)
     }
 
-    /// As [`check_write`](Self::check_write), for what a worker has to say about work that it has just ended: of a task that has left
-    /// memory the store alone knows the fence, and checks it.
+    /// Like [`check_write`](Self::check_write), for reports about work that has just ended. If the task has left
+    /// memory, only the store knows its fence and checks it.
     pub fn check_telemetry(&self, grant: &Grant) -> Result<(), Rejected> {
         match self.check_write(grant) {
             Err(Rejected::NotFound(_)) => Ok(()),
@@ -127,11 +151,17 @@ impl State {
             .ok_or_else(|| Rejected::NotFound(format!("worker `{worker}` is not known; join first")))?;
         if known.incarnation != incarnation {
             return Err(Rejected::Conflict(format!(
-                "worker `{worker}` is now another process (incarnation {}, the call is from {incarnation})",
-                known.incarnation
+                "incarnation {incarnation} is not the newest process of worker `{worker}`"
             )));
         }
         Ok(known)
+    }
+
+    /// The run for which an execution registers: the one that started it, or else the oldest other run that waits for
+    /// it.
+    pub fn registrant(&self, execution: &StageExecution) -> Option<&Arc<Run>> {
+        let users = || execution.users.iter().filter_map(|(number, _)| self.runs.get(number));
+        users().find(|run| run.id == execution.run).or_else(|| users().next())
     }
 
     /// The task that a worker holds.
@@ -141,8 +171,8 @@ impl State {
         Some((execution, &execution.tasks[i]))
     }
 
-    /// The keys of executions that a running run waits for, in the order in which they are served: runs as submitted, stages
-    /// as in the pipeline. What is made again for one of them comes before it.
+    /// The keys of executions that a running run waits for, in the order of service: by submission of the run, then by
+    /// stage. Recomputed inputs precede their readers.
     pub fn wanted(&self) -> Vec<Digest> {
         let mut seen = HashSet::new();
         let active = self.runs.values().flat_map(|run| run.active());
@@ -157,15 +187,12 @@ impl State {
         wanted
     }
 
-    /// Whether a running run waits for an execution.
+    /// Returns true if a running run waits for an execution.
     pub fn is_wanted(&self, execution: &StageExecution) -> bool {
-        let waits_for = |key| key == execution.key || self.mended_for(key).contains(&execution.key);
-        let waits = |run: &Arc<Run>| run.active().any(|(_, key)| waits_for(key));
-        execution.users.keys().filter_map(|number| self.runs.get(number)).any(waits)
+        self.queue.rank(&execution.key).is_some()
     }
 
-    /// What is made again so that an execution can go on, and what for that; what comes first is waited for by what comes later. Mostly
-    /// nothing.
+    /// Executions recomputed so that `key` can continue, dependencies first. Usually empty.
     pub(crate) fn mended_for(&self, key: Digest) -> Vec<Digest> {
         let mut all = Vec::new();
         if let Some(ExecutionState::Mending { inputs }) = self.executions.get(&key).map(|execution| &execution.state) {
@@ -177,7 +204,7 @@ impl State {
         all
     }
 
-    /// The execution behind a stage of a run, if it has begun or was done here before.
+    /// The execution of a stage of a run, if it has started or its value was already known here.
     pub fn execution_of(&self, run: &Run, stage: &StageName) -> Option<&Arc<StageExecution>> {
         self.executions.get(&run.status(stage)?.key()?)
     }

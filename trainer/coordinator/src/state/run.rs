@@ -1,4 +1,4 @@
-//! One execution of a pipeline.
+//! One run of a pipeline.
 //!
 //! | state \ event | pause | resume | cancel | a stage failed | all wanted stages done |
 //! |---|---|---|---|---|---|
@@ -8,66 +8,64 @@
 //! | Failed | - | Running | - | - | - |
 //! | Cancelled | - | Running | Cancelled | - | - |
 //!
-//! `-` is refused when a client asks for it. There is no state from which a run cannot be ended or, short of `Finished`,
-//! taken up again: finished stages are remembered by their keys, unfinished ones by their checkpoints.
+//! `-` refuses a client's request. A run can be ended from every state and resumed from every state except `Finished`.
+//! Finished stages are found again by their keys, unfinished ones by their checkpoints.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
 
-use protocol::message::{RunState, StageState};
+use protocol::message::{RunState, StageState, StageView};
 use protocol::pipeline::{Pipeline, PipelineStage};
 use protocol::sweep::STATE_OUTPUT;
-use protocol::{ArtifactKind, Attempt, Digest, RunId, StageName};
+use protocol::{ArtifactKind, Attempt, Digest, Owner, RunId, StageName};
 use serde::{Deserialize, Serialize};
 
 use crate::search::Search;
 use crate::value::Known;
 
-/// What a client asks of a run.
+/// A client's request to a run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Control {
-    /// Lease back; work yields.
+    /// Pause the run; its workers save and yield.
     Pause,
-    /// Go on: after a pause, a failure or a cancellation.
+    /// Continue after a pause, a failure or a cancellation.
     Resume,
-    /// End it.
+    /// End the run.
     Cancel,
 }
 
-/// Where a stage of a run stands.
+/// The status of a stage in a run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Status {
-    /// Its inputs are not there yet.
+    /// Some inputs are not available yet.
     Waiting,
-    /// Its trials are under way; the searcher is in [`Run::sweeps`].
+    /// Its trials are in progress; the searcher is in [`Run::sweeps`].
     Sweeping,
-    /// Its work is under way, under the stage's key.
+    /// Its execution, which has the stage's key, is in progress.
     Active { key: Digest },
-    /// It has its value.
+    /// Its value is known.
     Done {
         key: Digest,
         /// `Ran`, `Cached` or `Resumed`.
         how: StageState,
-        /// The value.
         #[serde(with = "super::shared")]
         known: Arc<Known>,
         /// Seconds of work.
         wall_s: f64,
-        /// The try that made it.
+        /// The number of the attempt that computed it.
         attempt: Attempt,
     },
     /// It failed for good.
     Failed {
         key: Digest,
-        /// Why.
+        /// The reason, as text for the user.
         message: String,
     },
-    /// It will not run.
+    /// It will not be computed.
     Skipped {
-        /// Its key, if it had begun.
+        /// The stage's key, if it had started.
         key: Option<Digest>,
-        /// Why.
         reason: String,
     },
 }
@@ -91,55 +89,59 @@ impl Status {
     }
 }
 
-/// A sweep under way or over.
+/// A sweep in progress or complete.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Sweeping {
-    /// The place of the swept stage.
+    /// The index of the swept stage.
     pub stage: usize,
-    /// Who is tried next.
+    /// The searcher that chooses the next trials.
     pub search: Search,
-    /// By ticket: the place of the training stage that was made for it, with its evaluation behind it. `None` for a ticket that asks for
-    /// nothing, or for what cannot be.
+    /// For each ticket, the index of its training stage, which its evaluation stage follows. `None` for a ticket
+    /// without work or with impossible settings.
     pub places: Vec<Option<usize>>,
-    /// Why trials failed, by trial.
+    /// Reasons of failed trials, by trial.
     pub failures: BTreeMap<usize, String>,
 }
 
-/// A run that may go on. One that has ended is in the tables, and here no more.
+/// A run that has not ended. Ended runs are in the tables and not in memory.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(from = "Stored", into = "Stored")]
 pub struct Run {
-    /// Its name.
     pub id: RunId,
-    /// Its place in the order of submission.
+    /// Its number in the order of submission.
     pub number: u64,
-    /// What it was asked to execute.
+    /// The submitting token's owner, with its permissions at that time.
+    pub owner: Owner,
+    /// The pipeline as submitted.
     pub submitted: Arc<Pipeline>,
-    /// What it executes: what was submitted, and behind it the stages that sweeps made.
+    /// The pipeline that is executed: the submitted one, followed by the stages that sweeps made.
     pub pipeline: Arc<Pipeline>,
-    /// The client's key.
     pub idempotency_key: Option<String>,
-    /// The last stage asked for.
+    /// The last stage to run.
     pub until: Option<StageName>,
-    /// Where it stands.
     pub state: RunState,
-    /// Paused by a restart of the coordinator, not by a user.
+    /// Set if a restart of the coordinator paused it, not a user.
     pub parked: bool,
-    /// Stage by stage, as in the pipeline.
+    /// The status of each stage of the pipeline.
     pub stages: Vec<Status>,
-    /// Sweeps that have begun.
+    /// Sweeps that have started.
     pub sweeps: Vec<Arc<Sweeping>>,
-    /// Places by name. Follows from the pipeline.
+    /// Digests of files outside the store, by stage index and field. A worker computed them for stages submitted
+    /// without digests.
+    pub resolved: BTreeMap<usize, BTreeMap<String, Digest>>,
+    /// Stage indexes by name. Derived from the pipeline.
     places: Arc<HashMap<StageName, usize>>,
-    /// Places of active stages. Follows from the stages.
+    /// Indexes of active stages. Derived from the stages.
     active: BTreeSet<usize>,
 }
 
-/// A run as it is kept.
+/// A run as it is stored.
 #[derive(Serialize, Deserialize)]
 struct Stored {
     id: RunId,
     number: u64,
+    #[serde(default)]
+    owner: Owner,
     submitted: Pipeline,
     /// Stages that sweeps made.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
@@ -154,6 +156,8 @@ struct Stored {
     stages: Vec<Status>,
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     sweeps: Vec<Sweeping>,
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    resolved: BTreeMap<usize, BTreeMap<String, Digest>>,
 }
 
 impl From<Run> for Stored {
@@ -162,6 +166,7 @@ impl From<Run> for Stored {
         Self {
             id: run.id,
             number: run.number,
+            owner: run.owner,
             submitted: Arc::unwrap_or_clone(run.submitted),
             made,
             idempotency_key: run.idempotency_key,
@@ -170,6 +175,7 @@ impl From<Run> for Stored {
             parked: run.parked,
             stages: run.stages,
             sweeps: run.sweeps.into_iter().map(Arc::unwrap_or_clone).collect(),
+            resolved: run.resolved,
         }
     }
 }
@@ -180,6 +186,7 @@ impl From<Stored> for Run {
         let mut run = Self {
             id: stored.id,
             number: stored.number,
+            owner: stored.owner,
             pipeline: Arc::clone(&submitted),
             submitted,
             idempotency_key: stored.idempotency_key,
@@ -188,6 +195,7 @@ impl From<Stored> for Run {
             parked: stored.parked,
             stages: Vec::new(),
             sweeps: stored.sweeps.into_iter().map(Arc::new).collect(),
+            resolved: stored.resolved,
             places: Arc::default(),
             active: BTreeSet::new(),
         };
@@ -201,7 +209,7 @@ impl From<Stored> for Run {
     }
 }
 
-/// The number in a run's name, which ends in it.
+/// The number at the end of a run's id.
 pub fn number_of(run: &RunId) -> Option<u64> {
     run.as_str().rsplit('-').next()?.parse().ok()
 }
@@ -211,8 +219,14 @@ fn places(stages: &[PipelineStage], first: usize) -> impl Iterator<Item = (Stage
 }
 
 impl Run {
-    /// A run that has just been submitted.
-    pub fn new(number: u64, pipeline: Arc<Pipeline>, key: Option<String>, until: Option<StageName>) -> Self {
+    /// Creates a submitted run.
+    pub fn new(
+        number: u64,
+        owner: Owner,
+        pipeline: Arc<Pipeline>,
+        key: Option<String>,
+        until: Option<StageName>,
+    ) -> Self {
         let digest = pipeline.digest();
         let id = RunId::new(format!("{}-{}-{number}", pipeline.name, &digest.hex()[..8]));
         let wanted = wanted(&pipeline, until.as_ref());
@@ -222,6 +236,7 @@ impl Run {
         Self {
             id,
             number,
+            owner,
             submitted: Arc::clone(&pipeline),
             places: Arc::new(places(&pipeline.stages, 0).collect()),
             pipeline,
@@ -231,18 +246,19 @@ impl Run {
             parked: false,
             stages,
             sweeps: Vec::new(),
+            resolved: BTreeMap::new(),
             active: BTreeSet::new(),
         }
     }
 
-    /// Adds stages that a sweep made. Their statuses are added as well; they wait.
+    /// Appends stages that a sweep made, with the status `Waiting`.
     pub(crate) fn add_stages(&mut self, made: Vec<PipelineStage>) {
         Arc::make_mut(&mut self.places).extend(places(&made, self.pipeline.stages.len()));
         self.stages.resize(self.stages.len() + made.len(), Status::Waiting);
         Arc::make_mut(&mut self.pipeline).stages.extend(made);
     }
 
-    /// Where a stage stands from now on; the only way to change it.
+    /// Sets the status of a stage. This is the only way to change it.
     pub(crate) fn set(&mut self, stage: usize, status: Status) {
         match status {
             Status::Active { .. } => self.active.insert(stage),
@@ -256,13 +272,13 @@ impl Run {
         self.stages.iter().enumerate().filter_map(is_active).collect()
     }
 
-    /// Whether what is known twice agrees; invariant C14.
+    /// Returns true if the derived fields agree with the others; invariant C14.
     pub fn is_indexed(&self) -> bool {
         let placed = |(i, stage): (usize, &PipelineStage)| self.places.get(&stage.name) == Some(&i);
         self.active == self.active_places() && self.pipeline.stages.iter().enumerate().all(placed)
     }
 
-    /// The place of a stage in the pipeline.
+    /// The index of a stage in the pipeline.
     pub fn position(&self, stage: &StageName) -> Option<usize> {
         self.places.get(stage).copied()
     }
@@ -272,21 +288,24 @@ impl Run {
         self.stages.get(self.position(stage)?)
     }
 
-    /// The stages that this run has work under way for, with their keys. Paused and ended runs have none.
+    /// The active stages with their keys. Paused and ended runs have none.
     pub fn active(&self) -> impl Iterator<Item = (usize, Digest)> + '_ {
         let places = (self.state == RunState::Running).then_some(&self.active);
         places.into_iter().flatten().filter_map(|i| Some((*i, self.stages[*i].key()?)))
     }
 
-    /// As [`active`](Self::active), whatever state the run is in.
+    /// Like [`active`](Self::active), in every state of the run.
     pub fn all_active(&self) -> impl Iterator<Item = (usize, Digest)> + '_ {
         self.active.iter().filter_map(|i| Some((*i, self.stages[*i].key()?)))
     }
 
-    /// The values of a stage's inputs by the field that names them, or `None` while one is missing.
+    /// The values of a stage's inputs by field, or `None` while one is missing.
     pub fn inputs(&self, stage: usize) -> Option<BTreeMap<String, Digest>> {
+        let resolved = self.resolved.get(&stage);
         let stage = &self.pipeline.stages[stage];
-        let mut inputs = stage.external.clone();
+        let mut inputs = resolved.cloned().unwrap_or_default();
+        // Digests from the submission override digests found by a worker.
+        inputs.extend(stage.external.iter().map(|(field, digest)| (field.clone(), *digest)));
         for input in &stage.inputs {
             let known = self.status(&input.stage)?.known()?;
             let output = match input.kind {
@@ -298,7 +317,13 @@ impl Run {
         Some(inputs)
     }
 
-    /// What `action` makes of the run's state; `None` if it is refused.
+    /// Returns true if `inputs` has a digest for each file that the stage reads outside the store.
+    pub fn is_resolved(&self, stage: usize, inputs: &BTreeMap<String, Digest>) -> bool {
+        let folders = self.pipeline.stages[stage].settings.folders();
+        folders.iter().all(|folder| inputs.contains_key(&folder.field))
+    }
+
+    /// The run's state after `action`; `None` if it is refused.
     pub fn after(&self, action: Control) -> Option<RunState> {
         match (self.state, action) {
             (RunState::Running | RunState::Paused, Control::Pause) => Some(RunState::Paused),
@@ -312,7 +337,7 @@ impl Run {
         }
     }
 
-    /// What the stages make of the run's state.
+    /// The run's state as implied by its stages.
     pub fn state_by_stages(&self) -> RunState {
         match self.state {
             RunState::Running | RunState::Paused => {
@@ -329,7 +354,13 @@ impl Run {
         }
     }
 
-    /// The stages of the pipeline as submitted: what counts for the run. A failed trial is a result of its sweep.
+    /// Returns true if a restart of the coordinator paused it, not a user.
+    pub fn is_interrupted(&self) -> bool {
+        self.parked && self.state == RunState::Paused
+    }
+
+    /// The stages of the submitted pipeline. Only these determine the run's state; a failed trial is just a result of
+    /// its sweep.
     pub fn asked(&self) -> &[Status] {
         &self.stages[..self.submitted.stages.len()]
     }
@@ -339,12 +370,12 @@ impl Run {
         self.asked().iter().position(|status| matches!(status, Status::Failed { .. }))
     }
 
-    /// The sweep of a stage, if it has begun.
+    /// The sweep of a stage, if it has started.
     pub fn sweep(&self, stage: usize) -> Option<&Arc<Sweeping>> {
         self.sweeps.iter().find(|sweep| sweep.stage == stage)
     }
 
-    /// Skips everything that is not over.
+    /// Skips all stages that are not over.
     pub fn skip_rest(&mut self, reason: &str) {
         for i in 0..self.stages.len() {
             match self.stages[i] {
@@ -356,10 +387,10 @@ impl Run {
         }
     }
 
-    /// Takes up again whatever was asked for and is not done.
+    /// Resets all wanted stages that are not done.
     pub fn reopen(&mut self) {
         let mut wanted = wanted(&self.submitted, self.until.as_ref());
-        // A trial whose result counts already is not tried again.
+        // A trial that already has a result is not repeated.
         for sweep in self.sweeps.iter().filter(|sweep| wanted.contains(&sweep.stage)).collect::<Vec<_>>() {
             for (ticket, place) in sweep.places.iter().enumerate() {
                 if let (Some(place), None) = (place, sweep.search.score(ticket)) {
@@ -369,7 +400,11 @@ impl Run {
         }
         for i in 0..self.stages.len() {
             match self.stages[i] {
-                Status::Failed { .. } | Status::Skipped { .. } if wanted.contains(&i) => self.set(i, Status::Waiting),
+                Status::Failed { .. } | Status::Skipped { .. } if wanted.contains(&i) => {
+                    // The files that it reads may have been repaired since.
+                    self.resolved.remove(&i);
+                    self.set(i, Status::Waiting);
+                }
                 Status::Failed { .. }
                 | Status::Skipped { .. }
                 | Status::Waiting
@@ -381,16 +416,16 @@ impl Run {
     }
 }
 
-/// What a stage gives, among its outputs.
+/// The value of a stage, selected from its outputs.
 pub(crate) fn value(known: &Known) -> Option<&Digest> {
     known.outputs.iter().find(|(name, _)| *name != STATE_OUTPUT).map(|(_, output)| output)
 }
 
 fn not_asked_for() -> Status {
-    Status::Skipped { key: None, reason: "not asked for".to_owned() }
+    Status::Skipped { key: None, reason: StageView::NOT_ASKED_FOR.to_owned() }
 }
 
-/// `until` and all that it needs; everything without it.
+/// Indexes of `until` and all of its dependencies; all stages if it is `None`.
 fn wanted(pipeline: &Pipeline, until: Option<&StageName>) -> BTreeSet<usize> {
     let Some(until) = until else { return (0..pipeline.stages.len()).collect() };
     let mut names = BTreeSet::from([until]);
@@ -430,7 +465,7 @@ mod tests {
             stages: vec![stage],
             code_versions: BTreeMap::new(),
         };
-        Run::new(1, Arc::new(pipeline), None, None)
+        Run::new(1, Owner::local("me"), Arc::new(pipeline), None, None)
     }
 
     #[test]

@@ -1,4 +1,4 @@
-//! One task: the right to do it, its tries, its newest checkpoints.
+//! A task: its lease, its attempts and its newest checkpoints.
 //!
 //! | hold \ event | grant | regroup | release | finish | back-off over | drain |
 //! |---|---|---|---|---|---|---|
@@ -6,9 +6,9 @@
 //! | Held | - | Held | Waiting | Done | - | Held |
 //! | Done | - | - | - | - | - | - |
 //!
-//! `-` is never asked for by `decide`, and panics. The fence grows with each grant and regroup, and again with each
-//! release, so that the store refuses a writer from the moment it lost the task and not only once another has it. The
-//! attempt grows with each grant: a grant starts from a checkpoint or from nothing, a regroup from live state.
+//! `-` panics; `decide` never requests it. The fence grows with each grant, regroup and release. The store therefore
+//! refuses a writer as soon as it loses the task, even before another worker gets it. The attempt number grows with
+//! each grant: a grant starts from a checkpoint or from nothing, a regroup from live state.
 
 use std::collections::BTreeMap;
 
@@ -21,7 +21,7 @@ use serde::{Deserialize, Serialize};
 use crate::rejected::Rejected;
 use crate::time::Millis;
 
-/// What part of a stage a task is.
+/// The part of a stage that a task computes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Part {
@@ -31,36 +31,38 @@ pub enum Part {
     Gang,
     /// One shard of a map stage.
     Shard {
-        /// Which, from 0.
+        /// Number of the shard, from 0.
         index: u32,
-        /// Of how many.
+        /// Number of shards.
         of: u32,
     },
     /// The merge of a map stage's shards.
     Merge,
+    /// Digesting the files that a stage's settings name outside the store.
+    Resolve,
 }
 
-/// Who has the right to a task.
+/// The right to a task.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Lease {
-    /// Nobody.
+    /// No worker holds the task.
     Waiting {
-        /// Not to be granted before this.
+        /// The end of the back-off.
         not_before: Option<Millis>,
     },
-    /// These workers; one unless the task is a gang's.
+    /// These workers hold the task; more than one only for a gang.
     Held {
-        /// Rank by rank.
+        /// The members by rank.
         holders: Vec<Member>,
-        /// Proves to a peer that one is of this generation.
+        /// The secret by which peers of this generation authenticate each other.
         secret: String,
-        /// Asked to drain; released by force at this time.
+        /// The time at which the task is released by force, if it is asked to drain.
         drain_by: Option<Millis>,
     },
-    /// Done.
+    /// The task is done.
     Done {
-        /// The artifact.
+        /// The resulting artifact.
         output: Digest,
     },
 }
@@ -68,43 +70,40 @@ pub enum Lease {
 /// A committed checkpoint.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Saved {
-    /// Steps applied.
+    /// Number of training steps applied.
     pub step: u64,
     pub manifest: Digest,
-    /// What retention may rank by.
+    /// Values that retention may rank by.
     pub metrics: BTreeMap<String, f64>,
 }
 
-/// A task.
+/// A unit of work for one worker or one gang.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Task {
-    /// Its name.
     pub id: TaskId,
-    /// What part of the stage it is.
     pub part: Part,
-    /// Who has it.
     pub lease: Lease,
-    /// The newest try; 0 before the first.
+    /// The number of the newest attempt; 0 before the first.
     pub attempt: Attempt,
     /// The newest fence; 0 before the first.
     pub fence: Fence,
-    /// Faults since it was last opened.
+    /// Number of faults since it was last opened.
     pub faults: u32,
-    /// Losses since something was last achieved: a task that makes progress may lose any number of workers.
+    /// Number of losses since the last progress: a task that makes progress may lose any number of workers.
     pub losses: u32,
-    /// Failures since something was last achieved.
+    /// Number of failures since the last progress.
     pub streak: u32,
-    /// Workers that have not enough memory for it; they are not given it again.
+    /// Workers without enough memory for it; they do not get it again.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub too_small: Vec<WorkerId>,
     /// Kept checkpoints, oldest first.
     pub checkpoints: Vec<Saved>,
-    /// The report that was last accepted: a report that is sent twice is answered twice.
+    /// The last accepted report. A repeated report gets the same answer.
     pub reported: Option<ReportOutcome>,
 }
 
 impl Task {
-    /// A task that nobody has tried.
+    /// Creates a task without attempts.
     pub fn new(id: TaskId, part: Part) -> Self {
         Self {
             id,
@@ -129,12 +128,12 @@ impl Task {
         }
     }
 
-    /// Whether somebody has it.
+    /// Returns true if a worker holds it.
     pub fn is_held(&self) -> bool {
         matches!(self.lease, Lease::Held { .. })
     }
 
-    /// Its artifact, once done.
+    /// The resulting artifact, if done.
     pub fn output(&self) -> Option<Digest> {
         match self.lease {
             Lease::Done { output } => Some(output),
@@ -142,7 +141,7 @@ impl Task {
         }
     }
 
-    /// Whether it may be granted now.
+    /// Returns true if it may be granted now.
     pub fn is_free(&self, now: Millis) -> bool {
         match self.lease {
             Lease::Waiting { not_before } => not_before.is_none_or(|time| time <= now),
@@ -160,14 +159,14 @@ impl Task {
         Grant { task: self.id.clone(), attempt: self.attempt, fence: self.fence, worker: worker.clone(), incarnation }
     }
 
-    /// Gives it away: a new try.
+    /// Starts a new attempt with these holders.
     pub fn grant(&mut self, holders: Vec<Member>, secret: impl FnOnce(Fence) -> String) -> Write {
         assert!(matches!(self.lease, Lease::Waiting { .. }) && !holders.is_empty(), "grant of {self:?}");
         self.attempt = self.attempt.next();
         self.lease_to(holders, secret)
     }
 
-    /// Changes who has it without a new try.
+    /// Changes the holders within the same attempt.
     pub fn regroup(&mut self, holders: Vec<Member>, secret: impl FnOnce(Fence) -> String) -> Write {
         assert!(self.is_held() && self.part == Part::Gang && !holders.is_empty(), "regroup of {self:?}");
         self.lease_to(holders, secret)
@@ -183,34 +182,46 @@ impl Task {
         fence
     }
 
-    /// Takes it away: its holders can write no more.
+    /// Ends the back-off if it is over at `now`; returns true if so.
+    pub fn end_backoff(&mut self, now: Millis) -> bool {
+        match &mut self.lease {
+            Lease::Waiting { not_before } if not_before.is_some_and(|time| time <= now) => {
+                *not_before = None;
+                true
+            }
+            Lease::Waiting { .. } | Lease::Held { .. } | Lease::Done { .. } => false,
+        }
+    }
+
+    /// Takes the task from its holders, which can no longer write.
     pub fn release(&mut self, not_before: Option<Millis>) -> Write {
         assert!(self.is_held(), "release of {self:?}");
         self.lease = Lease::Waiting { not_before };
         self.raise()
     }
 
-    /// Takes note that its holders gave it back themselves. What they still have to say about it they may.
+    /// Records that the holders returned the task themselves. Their fence stays valid, so that they can still report on
+    /// it.
     pub fn give_back(&mut self, not_before: Option<Millis>) {
         assert!(self.is_held(), "giving back of {self:?}");
         self.lease = Lease::Waiting { not_before };
     }
 
-    /// Takes note of its artifact.
+    /// Records the resulting artifact.
     pub fn finish(&mut self, output: Digest) {
         assert!(self.is_held(), "finish of {self:?}");
         self.lease = Lease::Done { output };
         self.streak = 0;
     }
 
-    /// Forgets everything but its numbers, which only grow.
+    /// Resets everything except the fence and the attempt number, which only grow.
     pub fn reopen(&mut self) {
         self.reset_budgets();
         self.checkpoints.clear();
         self.lease = Lease::Waiting { not_before: None };
     }
 
-    /// Gives it its restart budgets back.
+    /// Resets the budgets for restarts.
     pub fn reset_budgets(&mut self) {
         (self.faults, self.losses, self.streak) = (0, 0, 0);
         self.too_small.clear();
@@ -219,7 +230,7 @@ impl Task {
         }
     }
 
-    /// Asks its holders to drain until `deadline`, or (`None`) to carry on.
+    /// Asks the holders to drain until `deadline`, or to continue if it is `None`.
     pub fn drain(&mut self, deadline: Option<Millis>) {
         if let Lease::Held { drain_by, .. } = &mut self.lease {
             *drain_by = match (*drain_by, deadline) {
@@ -234,7 +245,7 @@ impl Task {
         Write::Fence { task: self.id.clone(), fence: self.fence }
     }
 
-    /// Checks a grant: current, and its bearer's. Returns the bearer's rank.
+    /// Checks that a grant is current and that its sender holds the task. Returns the sender's rank.
     pub fn check(&self, grant: &Grant) -> Result<usize, Rejected> {
         self.check_fence(grant)?;
         self.holders()
@@ -248,15 +259,15 @@ impl Task {
             })
     }
 
-    /// Checks only that a grant has not been superseded: what a worker says about work that it has just ended still counts.
+    /// Checks only that a grant has not been superseded; reports on work that has just ended still count.
     pub fn check_fence(&self, grant: &Grant) -> Result<(), Rejected> {
         if grant.fence != self.fence || grant.attempt != self.attempt {
-            return Err(Rejected::StaleFence { task: self.id.clone(), current: self.fence, carried: grant.fence });
+            return Err(Rejected::StaleFence { task: self.id.clone(), carried: grant.fence });
         }
         Ok(())
     }
 
-    /// Adds a checkpoint and drops those that `keep` does not keep; returns the dropped ones.
+    /// Adds a checkpoint and removes the ones that `keep` does not retain; returns the removed ones.
     pub fn save(&mut self, saved: Saved, keep: &Keep) -> Vec<Saved> {
         (self.streak, self.losses) = (0, 0);
         self.checkpoints.retain(|old| old.step < saved.step);

@@ -1,4 +1,4 @@
-//! A worker by name, and whether its newest process can be given work.
+//! A worker name and the presence of its newest process.
 //!
 //! | presence \ event | Join | WorkerBack | LeaseExpired | PeersLost | WorkerGone |
 //! |---|---|---|---|---|---|
@@ -7,45 +7,46 @@
 //! | Silent | Here | Here | Silent | Silent | Gone |
 //! | Gone | Here | Gone | Gone | Gone | Gone |
 //!
-//! Unknown is not dead: a silent worker may well be computing, and its next poll brings it back. Only the launcher of
-//! the process can say that it is gone, and only a new process (a join, with the next incarnation) returns from that.
-//! Whatever a worker held it loses on leaving `Here`; that is the business of `decide`.
+//! Unknown is not dead: a silent worker may still be computing, and its next poll brings it back. Only the launcher of
+//! the process can report it gone. Only a new process returns from that, by a join with the next incarnation. A worker
+//! that leaves `Here` loses its tasks, which `decide` handles.
+//!
+//! A name belongs to the token that joined with it until the name is forgotten. While its process may be working
+//! (`Here`, `Suspect`), only the same process can join again: it presents the same secret.
 
 use std::collections::BTreeSet;
 
 use protocol::message::{Join, Member};
 use protocol::stage::Backend;
-use protocol::{Digest, Incarnation, TaskId};
+use protocol::{Digest, Incarnation, TaskId, WorkerId};
 
 use serde::{Deserialize, Serialize};
 
+use crate::rejected::Rejected;
 use crate::time::Millis;
 
-/// Whether a worker can be given work.
+/// Availability of a worker for work.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Presence {
-    /// Polls.
+    /// The worker polls.
     Here,
     /// Peers could not reach it; it must poll again after a penalty.
-    Suspect {
-        /// Since when.
-        since: Millis,
-    },
-    /// Its lease ran out.
+    Suspect { since: Millis },
+    /// Its lease expired.
     Silent,
     /// Its process is known to have ended.
     Gone,
 }
 
-/// What may change a worker's presence.
+/// An event that may change a worker's presence.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Sign {
-    /// A new process took the name.
+    /// A new process joined with the name.
     Join,
-    /// It polled again.
+    /// The worker polled again.
     Back,
-    /// It did not.
+    /// The worker did not poll for the length of its lease.
     LeaseExpired,
     /// Peers could not reach it.
     PeersLost,
@@ -54,7 +55,6 @@ pub enum Sign {
 }
 
 impl Presence {
-    /// The presence after `sign`.
     #[must_use]
     pub fn after(self, sign: Sign, now: Millis) -> Self {
         match (self, sign) {
@@ -68,7 +68,7 @@ impl Presence {
         }
     }
 
-    /// Its name in the table above.
+    /// The name in the table above.
     pub fn name(self) -> &'static str {
         match self {
             Self::Here => "Here",
@@ -79,49 +79,71 @@ impl Presence {
     }
 }
 
+/// The authenticated identity of a joining process.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Identity {
+    /// The name in the token's line.
+    pub caller: String,
+    /// The digest of the secret that the process presents; the secret itself is not stored.
+    pub secret: Digest,
+}
+
 /// A worker's newest process.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Worker {
-    /// Which process of that name.
+    /// The number of this process.
     pub incarnation: Incarnation,
-    /// Its process id, for people.
+    /// The owner of the name. `None`: the worker joined before names belonged to tokens, and any process may replace
+    /// it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub identity: Option<Identity>,
+    /// The operating system's process id, for display.
     pub pid: u32,
-    /// Where it computes.
+    /// The backend that it computes on.
     pub backend: Backend,
-    /// What its kernels dispatch to.
+    /// The instruction set that its kernels use.
     #[serde(default)]
     pub instruction_set: String,
-    /// Where peers reach it.
+    /// The address at which peers reach it.
     pub peer_address: String,
-    /// Whether it can be given work.
     pub presence: Presence,
-    /// How often peers could not reach this process; each time it stays out for longer.
+    /// Number of times that this process was removed from a gang, or was the only one to complain of a removed member.
+    /// Each time it is shunned for longer. The number decreases with time.
     pub suspicions: u32,
-    /// Gang tasks whose inputs it has said that it has. Some may be over.
+    /// The time of the last suspicion.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub suspected: Option<Millis>,
+    /// The end of the period in which it joins no other members of a gang. It may work alone meanwhile.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub shunned: Option<Millis>,
+    /// Gang tasks whose inputs it has reported to have. Some may be over.
     #[serde(default, skip_serializing_if = "BTreeSet::is_empty")]
     pub ready: BTreeSet<TaskId>,
-    /// What it holds: the key of an execution, and a task's place there. Follows from the tasks.
+    /// The held task: its execution's key and its index there. Derived from the tasks.
     #[serde(skip)]
     pub holds: Option<(Digest, usize)>,
 }
 
 impl Worker {
-    /// The process that `join` announces.
-    pub fn joined(join: &Join, incarnation: Incarnation) -> Self {
+    /// Creates the process that `join` announces.
+    pub fn joined(join: &Join, by: Identity, incarnation: Incarnation) -> Self {
         Self {
             incarnation,
+            identity: Some(by),
             pid: join.pid,
             backend: join.backend,
             instruction_set: join.instruction_set.clone(),
             peer_address: join.peer_address.clone(),
             presence: Presence::Here,
             suspicions: 0,
+            suspected: None,
+            shunned: None,
             ready: BTreeSet::new(),
             holds: None,
         }
     }
 
-    /// Whether it is not there, as far as anybody knows.
+    /// Returns true if the worker is not known to be alive.
     pub fn is_away(&self) -> bool {
         match self.presence {
             Presence::Silent | Presence::Gone => true,
@@ -129,8 +151,25 @@ impl Worker {
         }
     }
 
-    /// The worker as a holder of a task.
-    pub fn member(&self, name: &protocol::WorkerId) -> Member {
+    /// Checks that a process of identity `by` may take over the name.
+    pub fn gives_way_to(&self, name: &WorkerId, by: &Identity) -> Result<(), Rejected> {
+        let Some(own) = &self.identity else { return Ok(()) };
+        if own.caller != by.caller {
+            return Err(Rejected::Forbidden(format!(
+                "worker name `{name}` belongs to another token; choose another name with `--name`"
+            )));
+        }
+        match self.presence {
+            Presence::Silent | Presence::Gone => Ok(()),
+            Presence::Here | Presence::Suspect { .. } if own.secret == by.secret => Ok(()),
+            Presence::Here | Presence::Suspect { .. } => Err(Rejected::NameHeld(format!(
+                "another process has joined as worker `{name}`; the name is free once that process leaves or its lease ends"
+            ))),
+        }
+    }
+
+    /// The worker as a member that holds a task.
+    pub fn member(&self, name: &WorkerId) -> Member {
         Member { worker: name.clone(), incarnation: self.incarnation, peer_address: self.peer_address.clone() }
     }
 }

@@ -1,11 +1,11 @@
-//! The pure half with a clock of its own, for tests that say exactly when what happens.
+//! The pure half with a virtual clock, for tests that control every moment.
 
 #[path = "../simulation/pipelines.rs"]
 pub(crate) mod pipelines;
 #[path = "../simulation/store.rs"]
 pub(crate) mod store;
 
-use coordinator::state::worker::Worker;
+use coordinator::state::worker::{Identity, Worker};
 use coordinator::{
     Control, Effect, Event, Millis, Moment, Observation, Policy, Rejected, State, decide, invariants, journal, observe,
 };
@@ -15,13 +15,13 @@ use protocol::message::{
 use protocol::stage::{Backend, WorkerRange};
 use protocol::{Digest, Incarnation, RunId, WorkerId};
 
-/// A coordinator without a shell: one call after the other, at the times that the test says.
+/// A coordinator without a shell: one call after the other, at times chosen by the test.
 pub(crate) struct PureCoordinator {
     pub(crate) state: State,
     pub(crate) store: store::FakeStore,
     pub(crate) now: u64,
     pub(crate) entropy: Digest,
-    /// Workers have what they are asked to fetch as soon as they are asked.
+    /// Set if workers have requested inputs at once.
     pub(crate) quick: bool,
 }
 
@@ -36,7 +36,7 @@ impl PureCoordinator {
         }
     }
 
-    /// Decides and stores; lookups find nothing.
+    /// Decides and stores an event; lookups query the fake store.
     pub(crate) fn happen(&mut self, event: Event) -> Result<Vec<Effect>, Rejected> {
         let moment = Moment { now: Millis(self.now), entropy: self.entropy };
         let before = self.state.clone();
@@ -57,7 +57,7 @@ impl PureCoordinator {
         Ok(effects)
     }
 
-    /// A worker says that it has all that it is asked to fetch.
+    /// Reports all requested inputs of a worker as fetched.
     pub(crate) fn prepare(&mut self, name: &str) {
         let worker = WorkerId::from(name);
         let Worker { incarnation, ready, .. } = self.state.workers[&worker].clone();
@@ -68,7 +68,7 @@ impl PureCoordinator {
         }
     }
 
-    /// What a worker is asked to fetch.
+    /// The inputs that a worker is asked to fetch.
     pub(crate) fn asked(&self, name: &str) -> Vec<Prepare> {
         let worker = WorkerId::from(name);
         let incarnation = self.state.workers[&worker].incarnation;
@@ -81,7 +81,7 @@ impl PureCoordinator {
         }
     }
 
-    /// `kill -9`, and a new coordinator on the same store.
+    /// Simulates `kill -9` and a new coordinator on the same store.
     pub(crate) fn restart(&mut self, alone: bool) {
         let policy = self.state.policy.clone();
         self.state = journal::recover(policy, &self.store.recovery).expect("what is stored can be recovered");
@@ -94,6 +94,7 @@ impl PureCoordinator {
             source: String::new(),
             idempotency_key: None,
             until: Some(until.into()),
+            owner: protocol::Owner::local("me"),
         };
         let effects = self.happen(event).expect("submitted");
         let run = effects.into_iter().find_map(|effect| match effect {
@@ -116,7 +117,9 @@ impl PureCoordinator {
             instruction_set: instruction_set.into(),
             peer_address: format!("{name}:1"),
         };
-        let effects = self.happen(Event::Join { join }).expect("joined");
+        // Always the same process, with the same secret.
+        let by = Identity { caller: "t".into(), secret: Digest::of(name.as_bytes()) };
+        let effects = self.happen(Event::Join { join, by }).expect("joined");
         let joined = effects.into_iter().find_map(|effect| match effect {
             Effect::Joined(incarnation) => Some(incarnation),
             _ => None,
@@ -169,7 +172,7 @@ pub(crate) fn failed(class: FailureClass) -> TaskOutcome {
     TaskOutcome::Failed { class, message: "made up".into() }
 }
 
-/// A gang trains: its task's members by rank.
+/// Starts a gang of three in training; returns the incarnations of its members by rank.
 pub(crate) fn gang_of_three(coordinator: &mut PureCoordinator) -> (RunId, [Incarnation; 3]) {
     let run = coordinator.submit("vae", WorkerRange { min: 1, max: 3 });
     let a = coordinator.join("a");

@@ -1,4 +1,4 @@
-//! A coordinator with its shell, for tests that call it over HTTP.
+//! A coordinator with its shell, for tests over HTTP.
 
 use std::path::Path;
 
@@ -10,9 +10,12 @@ use registry::{Holder, Store};
 
 pub(crate) type TestResult<T = ()> = Result<T, Box<dyn std::error::Error + Send + Sync>>;
 
+/// The secret of worker `a`.
+pub(crate) const SECRET: &str = "the-secret-of-worker-a-of-the-tests";
+
 const TEXT: &str = "name: p\nseed: 1\ndataset: {format: synthetic}\nstages: {vae: {kind: train.vae}}\n";
 
-/// A server whose polls wait for `poll_ms`, and a client of it.
+/// Starts a server whose polls wait for `poll_ms`, and a client of it.
 pub(crate) async fn start(dir: &Path, poll_ms: u64) -> TestResult<(Handle, Server)> {
     let store = Store::open(dir, Holder::this_process("a test")).await?;
     let mut config = Config { alone: false, park: false, ..Config::embedded() };
@@ -27,7 +30,7 @@ pub(crate) fn submission() -> TestResult<Submit> {
     Ok(Submit { pipeline: serde_json::to_value(pipeline)?, source: TEXT.into(), idempotency_key: None, until: None })
 }
 
-/// Worker `a` offers itself.
+/// The join message of worker `a`.
 pub(crate) fn offer() -> Join {
     Join {
         protocol: PROTOCOL_VERSION,

@@ -1,11 +1,11 @@
-//! The real `decide` and the batches of the real actor among fake workers, a fake store and virtual time, all driven by one seed: calls
-//! are dropped, doubled, delayed and so reordered, workers die, hang, are slow or cannot reach each other, the clock is late, the store
-//! fills up and is collected, the coordinator is killed between any two events and while a commit is in flight, with the power or
-//! without, and comes back by replay. [`INJECTED`] lists it all. Invariants are checked after every event; in the end
-//! everything that was submitted is done exactly once.
+//! Simulation of the real `decide` and the actor's real batches with fake workers, a fake store and virtual time,
+//! driven by one seed. Calls are lost, duplicated, delayed and reordered. Workers die, hang, run slowly or lose contact
+//! with each other. The clock is late; the store fills up and collects garbage. The coordinator is killed between any
+//! two events or during a commit, with or without a loss of power, and recovers by replay. [`INJECTED`] lists all
+//! faults. Invariants are checked after every event, and in the end every submitted task is done exactly once.
 //!
-//! `SIM_SEED=n` replays one seed; `SIM_SEEDS=n` runs so many instead of the 500 of every `cargo test`, or the 2,000 with
-//! `STRIDE_LONG_TESTS=1`. A seed that fails is added to `seeds.txt` beside this file, which is run first ever after.
+//! `SIM_SEED=n` replays one seed. `SIM_SEEDS=n` sets the number of seeds; the default is 500, or 2,000 with
+//! `STRIDE_LONG_TESTS=1`. Failed seeds are added to `seeds.txt` beside this file, which always runs first.
 
 mod pipelines;
 mod random;
@@ -26,14 +26,14 @@ use protocol::stage::WorkerRange;
 
 use crate::world::{CHAOS_MS, INJECTED, World};
 
-/// Seeds of every run of the tests, beside those that once failed.
+/// Number of new seeds in every run of the tests; permanent seeds run as well.
 const SEEDS: u64 = 500;
-/// The same of long tests.
+/// Number of seeds in long tests.
 const MANY_SEEDS: u64 = 2_000;
-/// Of so many seeds at least one has each thing that goes wrong.
+/// Number of seeds among which every kind of fault must occur.
 const ENOUGH: usize = 100;
 
-/// What a seed came to.
+/// Statistics of a seed.
 #[derive(Debug, Default)]
 struct Tally {
     events: u64,
@@ -64,7 +64,7 @@ fn seeds_file() -> std::path::PathBuf {
     std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/simulation/seeds.txt")
 }
 
-/// Those of `seeds.txt`, then fresh ones.
+/// Seeds of `seeds.txt`, then new ones.
 fn seeds() -> Vec<u64> {
     let number = |text: String| text.trim().parse::<u64>().unwrap_or_else(|_| panic!("`{text}` is not a seed"));
     if let Ok(seed) = std::env::var("SIM_SEED") {
@@ -77,7 +77,7 @@ fn seeds() -> Vec<u64> {
     kept.map(|line| number(line.to_owned())).chain(1000..1000 + count).collect()
 }
 
-/// All cores take seeds from one list; a seed is a world of its own, so nothing depends on who takes which.
+/// All cores take seeds from one list. A seed is a world of its own, so the assignment to threads has no effect.
 #[test]
 fn whatever_happens_every_run_ends_and_every_task_is_done_once() {
     let (seeds, begun) = (seeds(), std::time::Instant::now());
@@ -118,7 +118,7 @@ fn whatever_happens_every_run_ends_and_every_task_is_done_once() {
     }
 }
 
-/// Adds seeds that failed to those that are always run.
+/// Adds failed seeds to the list of permanent seeds.
 fn keep(failed: &[u64]) {
     let kept = std::fs::read_to_string(seeds_file()).unwrap_or_default();
     let new: Vec<String> =
@@ -140,13 +140,19 @@ fn every_event_in_every_state_is_taken_or_refused() {
     }
 }
 
-/// What a stage reads is made again while it waits, and all stages end with the values that they had.
+/// A damaged input is recomputed while its reader waits, and all stages keep their values.
 #[test]
 fn a_damaged_input_is_made_again_within_the_run() {
     let mut world = World::new(7);
     world.now = Millis(CHAOS_MS);
     let pipeline = Box::new(pipelines::quickstart(9, WorkerRange::default(), &[]));
-    let submit = Event::Submit { pipeline, source: String::new(), idempotency_key: None, until: None };
+    let submit = Event::Submit {
+        pipeline,
+        source: String::new(),
+        idempotency_key: None,
+        until: None,
+        owner: protocol::Owner::local("me"),
+    };
     world.submissions = vec![(Millis(0), submit)];
     let damaged = loop {
         world.step();
@@ -182,6 +188,7 @@ fn two_runs_of_one_pipeline_compute_once_and_a_third_finds_everything() {
         source: String::new(),
         idempotency_key: None,
         until: None,
+        owner: protocol::Owner::local("me"),
     };
     world.submissions = vec![(Millis(0), submit()), (Millis(0), submit())];
     world.run();

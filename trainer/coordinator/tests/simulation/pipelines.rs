@@ -1,15 +1,15 @@
-//! Pipelines of the quickstart's shape.
+//! Pipelines with the stages of the quickstart.
 
 use std::collections::BTreeMap;
 
 use protocol::pipeline::{Pipeline, PipelineStage, StageInput};
 use protocol::stage::{
     Backend, CheckpointPolicy, DataSynthetic, DistillLcm, DistillPcm, EncodeLatents, EvaluateLatentFid, Keep,
-    Placement, Promote, Register, StageSettings, TextEmbed, TrainMld, TrainVae, WorkerRange,
+    Placement, Promote, Register, StageSettings, TextEmbed, TextEncoder, TrainMld, TrainVae, WorkerRange,
 };
 use protocol::{ArtifactKind, Seed, Steps};
 
-/// The whole way from clips to a promoted student.
+/// All stages from clips to a promoted student.
 pub(crate) fn quickstart(seed: u64, workers: WorkerRange, require: &[&str]) -> Pipeline {
     let evaluate = |model: &str| {
         StageSettings::EvaluateLatentFid(EvaluateLatentFid { model: model.into(), shards: 3, ..Default::default() })
@@ -62,7 +62,16 @@ pub(crate) fn quickstart(seed: u64, workers: WorkerRange, require: &[&str]) -> P
     Pipeline { name, seed: Seed(seed), backend: Backend::Flex, stages, code_versions: BTreeMap::new() }
 }
 
-/// A sweep of `trials` trials with three rungs, and what goes on from its best.
+/// The same pipeline with a text encoder in a folder without a known digest.
+#[allow(dead_code, reason = "not every test that shares this file reads files")]
+pub(crate) fn reading_files(mut pipeline: Pipeline) -> Pipeline {
+    let text = pipeline.stages.iter_mut().find(|stage| stage.name.as_str() == "text").expect("a stage `text`");
+    let encoder = TextEmbed { encoder: TextEncoder::Clip, path: "models/clip".into(), ..TextEmbed::default() };
+    text.settings = encoder.into();
+    pipeline
+}
+
+/// A sweep of `trials` trials with three rungs, and stages that read its best trial.
 #[allow(dead_code, reason = "not every test that shares this file sweeps")]
 pub(crate) fn swept(seed: u64, trials: u64) -> Pipeline {
     let text = format!(

@@ -1,4 +1,4 @@
-//! A small generator with a seed: what a simulation does is a function of it.
+//! A small seeded generator that determines a whole simulation.
 
 use protocol::Digest;
 
@@ -10,7 +10,7 @@ impl Random {
         Self(seed)
     }
 
-    /// SplitMix64.
+    /// Source: the SplitMix64 algorithm.
     pub(crate) fn next(&mut self) -> u64 {
         self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
         let mut z = self.0;

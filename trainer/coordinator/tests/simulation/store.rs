@@ -1,55 +1,57 @@
-//! A store in memory: a transaction is taken whole or not at all, fences are checked inside. Blobs are names that are there or not.
+//! A store in memory. Transactions are atomic and check fences; blobs are only names.
 
 use std::collections::{BTreeMap, BTreeSet};
 
 use coordinator::event::Event;
+use coordinator::journal::ChangedPart;
 use coordinator::state::run::Run;
 use coordinator::value::Known;
 use coordinator::{State, journal};
 use protocol::message::{Grant, RunView};
 use protocol::{Digest, Fence, RunId, StageName, TaskId};
-use registry::{Recovery, Write};
+use registry::{HistoryEntry, Recovery, Write};
 
 #[derive(Debug, Clone, Default)]
 pub(crate) struct FakeStore {
-    /// What a coordinator comes back from.
+    /// Data for the recovery of a coordinator.
     pub(crate) recovery: Recovery,
     pub(crate) fences: BTreeMap<TaskId, Fence>,
+    pub(crate) history: Vec<HistoryEntry>,
     pub(crate) results: BTreeMap<Digest, (Known, RunId, StageName)>,
     pub(crate) runs: BTreeMap<RunId, String>,
     pub(crate) keys: BTreeMap<String, RunId>,
-    /// Views and archives of runs that ended.
+    /// Views and archives of ended runs.
     pub(crate) ended: BTreeMap<RunId, (String, String)>,
     pub(crate) executions: BTreeMap<Digest, String>,
     pub(crate) shards: BTreeMap<TaskId, Digest>,
     pub(crate) versions: u64,
     pub(crate) promotions: u64,
-    /// How often each task's end was accepted.
+    /// Number of accepted ends of each task.
     pub(crate) accepted: BTreeMap<TaskId, u64>,
-    /// How often what a task gave was found damaged: so often it may be accepted besides.
+    /// Number of times that a task's output was found damaged; the task may be accepted again as often.
     pub(crate) remade: BTreeMap<TaskId, u64>,
     pub(crate) checkpoints: BTreeMap<(TaskId, u64), Digest>,
-    /// What was collected between its upload and the report that names it: the report is refused.
+    /// Blobs collected between their upload and the report that names them; such a report is refused.
     pub(crate) collected: BTreeSet<Digest>,
 }
 
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) enum Refusal {
-    /// Gates hold unless they say `never`.
+    /// A gate does not hold; in this store, gates with `never` in their text.
     Gate,
-    /// A blob that is named is not there.
+    /// A named blob does not exist.
     Missing(Digest),
 }
 
 impl FakeStore {
     pub(crate) fn write(&mut self, writes: &[Write]) -> Result<(), Refusal> {
-        // What is refused changes nothing.
+        // A refused transaction changes nothing.
         writes.iter().try_for_each(|write| self.takes(write))?;
         writes.iter().for_each(|write| self.apply(write));
         Ok(())
     }
 
-    /// Whether it can be stored.
+    /// Checks that a write can be stored.
     fn takes(&self, write: &Write) -> Result<(), Refusal> {
         match write {
             Write::Checkpoint { manifest, .. } => self.is_there(*manifest),
@@ -63,11 +65,11 @@ impl FakeStore {
     }
 
     fn check(&self, grant: &Grant) {
-        // The coordinator's own check came first; had it let a stale grant pass, this is where it would show.
+        // The coordinator has already checked the grant; this assertion detects a stale grant that passed.
         assert_eq!(self.fences.get(&grant.task), Some(&grant.fence), "a stale write got this far: {grant:?}");
     }
 
-    /// What a worker uploaded is there, unless it was collected before it was named; the next upload brings it back.
+    /// Uploaded blobs exist unless they were collected before they were named; the next upload restores them.
     fn is_there(&self, digest: Digest) -> Result<(), Refusal> {
         if self.collected.contains(&digest) { Err(Refusal::Missing(digest)) } else { Ok(()) }
     }
@@ -75,7 +77,9 @@ impl FakeStore {
     fn apply(&mut self, write: &Write) {
         match write {
             Write::Facts { seq, facts } => self.recovery.facts.push((*seq, facts.clone())),
-            Write::Snapshot { .. } => unreachable!("the world takes snapshots by `snapshot`"),
+            Write::SnapshotParts { .. } | Write::Snapshot { .. } => {
+                unreachable!("the world takes snapshots by `snapshot`")
+            }
             Write::Fence { task, fence } => {
                 let before = self.fences.insert(task.clone(), *fence);
                 assert!(before.is_none_or(|before| before < *fence), "the fence of {task} fell to {fence}");
@@ -88,6 +92,7 @@ impl FakeStore {
                     assert!(before.is_none(), "two runs have the key {key}");
                 }
             }
+            Write::RunOwner { .. } | Write::ModelOwner { .. } => {}
             Write::RunState { run, state } => drop(self.runs.insert(run.clone(), state.clone())),
             Write::RunEnded { run, state, view, archive } => {
                 self.runs.insert(run.clone(), state.clone());
@@ -97,6 +102,7 @@ impl FakeStore {
                 Some(execution) => drop(self.executions.insert(*key, execution.clone())),
                 None => drop(self.executions.remove(key)),
             },
+            Write::History(entries) => self.history.extend(entries.iter().cloned()),
             Write::Metrics { grant, .. } | Write::Logs { grant, .. } => self.check(grant),
             Write::Checkpoint { grant, step, manifest, .. } => {
                 self.check(grant);
@@ -122,7 +128,7 @@ impl FakeStore {
         }
     }
 
-    /// An artifact is found damaged: what gave it is not known any more, and may be done once more.
+    /// Marks an artifact as damaged: its value is no longer known, and its tasks may be accepted again.
     #[allow(dead_code, reason = "not every test that shares this file damages anything")]
     pub(crate) fn damage(&mut self, digest: Digest) {
         let gave = |(known, ..): &(Known, RunId, StageName)| known.outputs.values().any(|output| *output == digest);
@@ -139,7 +145,7 @@ impl FakeStore {
         }
     }
 
-    /// Whether something that is stored names it.
+    /// Returns true if a stored row names the blob.
     #[allow(dead_code, reason = "not every test that shares this file collects")]
     pub(crate) fn is_rooted(&self, digest: Digest) -> bool {
         let mut outputs = self.results.values().flat_map(|(known, ..)| known.outputs.values());
@@ -147,15 +153,23 @@ impl FakeStore {
         outputs.any(|known| *known == digest) || others.any(|known| *known == digest)
     }
 
-    /// The newest decision.
+    /// The number of the newest decision.
     #[allow(dead_code, reason = "not every test that shares this file asks")]
     pub(crate) fn seq(&self) -> u64 {
         let snapshot = self.recovery.snapshot.as_ref().map_or(0, |(seq, _)| *seq);
         self.recovery.facts.last().map_or(snapshot, |(seq, _)| snapshot.max(*seq))
     }
 
-    /// The state as a whole; the facts before it go.
+    /// Stores the state as a snapshot and deletes the facts before it.
     pub(crate) fn snapshot(&mut self, state: &State) {
+        let stored = Recovery { facts: Vec::new(), ..self.recovery.clone() };
+        let before = journal::recover(state.policy.clone(), &stored).expect("the snapshot before");
+        for (part, text) in journal::changed_parts(&before, state).iter().map(ChangedPart::stored) {
+            match text {
+                Some(text) => drop(self.recovery.parts.insert(part, text)),
+                None => assert!(self.recovery.parts.remove(&part).is_some(), "{part} was there"),
+            }
+        }
         self.recovery.snapshot = Some((state.seq, journal::snapshot(state)));
         self.recovery.facts.retain(|(seq, _)| *seq > state.seq);
     }
@@ -171,19 +185,19 @@ impl FakeStore {
         Event::LookedUp { key, known, source, archived }
     }
 
-    /// All that a coordinator goes on from, as JSON.
+    /// Serialises the data that a coordinator recovers from.
     pub(crate) fn to_json(&self) -> String {
         let results: Vec<_> = self.results.iter().map(|(key, (known, run, stage))| (key, known, run, stage)).collect();
         let checkpoints: Vec<_> = self.checkpoints.iter().map(|((task, step), digest)| (task, step, digest)).collect();
         let stored = serde_json::json!({
-            "snapshot": self.recovery.snapshot, "facts": self.recovery.facts, "fences": self.fences, "results": results,
+            "snapshot": self.recovery.snapshot, "parts": self.recovery.parts, "facts": self.recovery.facts, "fences": self.fences, "results": results,
             "runs": self.runs, "keys": self.keys, "ended": self.ended, "executions": self.executions, "shards": self.shards,
             "accepted": self.accepted, "checkpoints": checkpoints,
         });
         serde_json::to_string_pretty(&stored).expect("JSON") + "\n"
     }
 
-    /// What [`to_json`](Self::to_json) wrote.
+    /// Reads the output of [`to_json`](Self::to_json).
     pub(crate) fn from_json(text: &str) -> Self {
         type Result = (Digest, Known, RunId, StageName);
         fn part<T: serde::de::DeserializeOwned>(stored: &mut serde_json::Value, name: &str) -> T {
@@ -193,7 +207,11 @@ impl FakeStore {
         let results = part::<Vec<Result>>(&mut stored, "results").into_iter();
         let checkpoints = part::<Vec<(TaskId, u64, Digest)>>(&mut stored, "checkpoints").into_iter();
         Self {
-            recovery: Recovery { snapshot: part(&mut stored, "snapshot"), facts: part(&mut stored, "facts") },
+            recovery: Recovery {
+                snapshot: part(&mut stored, "snapshot"),
+                parts: part(&mut stored, "parts"),
+                facts: part(&mut stored, "facts"),
+            },
             fences: part(&mut stored, "fences"),
             results: results.map(|(key, known, run, stage)| (key, (known, run, stage))).collect(),
             runs: part(&mut stored, "runs"),
@@ -207,7 +225,7 @@ impl FakeStore {
         }
     }
 
-    /// A run as it was archived when it ended.
+    /// The archived state of an ended run.
     pub(crate) fn archived(&self, run: &RunId) -> Option<Box<Run>> {
         let (_, archive) = self.ended.get(run)?;
         Some(Box::new(serde_json::from_str(archive).expect("a run")))

@@ -1,4 +1,4 @@
-//! A sweep decides the same no matter which workers it has and where the coordinator is killed.
+//! Decisions of a sweep, independent of the number of workers and of restarts of the coordinator.
 
 use coordinator::search::{Score, Ticket};
 use coordinator::state::run::Status;
@@ -11,7 +11,7 @@ use crate::world::{CHAOS_MS, World};
 
 const TRIALS: u64 = 50;
 
-/// All that a sweep decided.
+/// All decisions of a sweep.
 type Decisions = (Vec<Ticket>, Vec<Option<Score>>, Option<(usize, f64)>, Status);
 
 fn world(workers: usize, seed: u64) -> World {
@@ -24,7 +24,13 @@ fn sized(workers: usize, seed: u64, trials: u64) -> World {
     world.workers = (0..workers).map(|i| FakeWorker::new(&format!("w{i}"))).collect();
     let pipeline = Box::new(pipelines::swept(3, trials));
     let idempotency_key = Some("once".to_owned());
-    let submit = Event::Submit { pipeline, source: String::new(), idempotency_key, until: None };
+    let submit = Event::Submit {
+        pipeline,
+        source: String::new(),
+        idempotency_key,
+        until: None,
+        owner: protocol::Owner::local("me"),
+    };
     world.submissions = vec![(Millis(0), submit)];
     world
 }
@@ -64,7 +70,7 @@ fn p19_a_sweep_decides_the_same_with_any_workers() {
 #[test]
 fn p19_a_sweep_decides_the_same_wherever_the_coordinator_is_killed() {
     let (reference, events) = reference();
-    // After every event; then once each, at events spread over the whole of it.
+    // First a kill after every event; then single kills at events spread over the whole run.
     let single = (0..8).map(|i| ((1, i * events / 8), true));
     for (i, ((every, from), once)) in [((1, 0), false)].into_iter().chain(single).enumerate() {
         let mut world = world(1 + i % 4, 10 + i as u64);
@@ -84,12 +90,13 @@ fn a_sweep_is_found_again_and_shows_what_became_of_its_trials() {
         source: String::new(),
         idempotency_key: None,
         until: None,
+        owner: protocol::Owner::local("me"),
     };
     world.submissions = vec![(Millis(0), again)];
     world.run();
     assert_eq!(world.store.results.len(), results, "nothing is computed twice");
     let views = world.views();
-    // How far a trial had got when it failed is heard or not.
+    // The last reported progress of a failed trial may or may not have arrived.
     let trials = |run: usize| {
         let mut trials = views[run].sweeps[0].trials.clone();
         trials.iter_mut().filter(|trial| trial.state == TrialState::Failed).for_each(|trial| trial.steps = 0);
@@ -116,8 +123,13 @@ fn a_metric_that_nobody_reports_ends_the_run_at_once() {
     let mut pipeline = pipelines::swept(3, TRIALS);
     let stage = pipeline.stages.iter_mut().find(|stage| stage.sweep.is_some()).expect("the swept stage");
     stage.sweep.as_mut().expect("a sweep").metric = "fdi".into();
-    let submit =
-        Event::Submit { pipeline: Box::new(pipeline), source: String::new(), idempotency_key: None, until: None };
+    let submit = Event::Submit {
+        pipeline: Box::new(pipeline),
+        source: String::new(),
+        idempotency_key: None,
+        until: None,
+        owner: protocol::Owner::local("me"),
+    };
     world.submissions = vec![(Millis(0), submit)];
     while !world.is_over() {
         world.step();
@@ -131,8 +143,8 @@ fn a_metric_that_nobody_reports_ends_the_run_at_once() {
     );
 }
 
-/// What a sweep costs the coordinator for each of `trials` trials: decisions, facts, bytes of facts, and what decisions looked at. Counted, not
-/// timed, so that it is the same on every machine.
+/// The coordinator's cost per trial of a sweep of `trials`: decisions, facts, bytes of facts, and objects inspected by
+/// decisions. Counts do not depend on the machine, unlike times.
 fn cost(trials: u64) -> [u64; 4] {
     let mut world = sized(4, 9, trials);
     while !world.is_over() {

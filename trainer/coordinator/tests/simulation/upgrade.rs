@@ -1,8 +1,8 @@
-//! A store as another build left it: under another policy and another order of grants it opens and goes on to the end.
+//! Upgrades: a store of another build opens under another policy and another order of grants, and its run finishes.
 //!
-//! `testdata/store.json` is what a sweep with three workers had stored when one of them had been lost and another held a training task with
-//! a checkpoint. `make_the_store` wrote it. It is written again only when the major number of `journal::FORMAT` changes: that what is
-//! stored stays readable is what is tested.
+//! `testdata/store.json` is the store of a sweep with three workers. One worker was lost, and another held a training
+//! task with a checkpoint. `make_the_store` wrote it. It is rewritten only if the major number of `journal::FORMAT`
+//! changes, because the test shows that stored data stays readable.
 
 use std::path::PathBuf;
 
@@ -30,7 +30,7 @@ fn world(seed: u64) -> World {
     world
 }
 
-/// Somebody trains and has a checkpoint.
+/// Returns true if a worker holds a training task with a checkpoint.
 fn holds_with_a_checkpoint(state: &State) -> bool {
     let mut tasks = state.executions.values().flat_map(|execution| &execution.tasks);
     tasks.any(|task| task.part == Part::Gang && task.is_held() && task.newest().is_some())
@@ -41,7 +41,13 @@ fn holds_with_a_checkpoint(state: &State) -> bool {
 fn make_the_store() {
     let mut world = world(3);
     let pipeline = Box::new(pipelines::swept(3, TRIALS));
-    let submit = Event::Submit { pipeline, source: String::new(), idempotency_key: Some("once".into()), until: None };
+    let submit = Event::Submit {
+        pipeline,
+        source: String::new(),
+        idempotency_key: Some("once".into()),
+        until: None,
+        owner: protocol::Owner::local("me"),
+    };
     world.submissions = vec![(world.now, submit)];
     let trials_done =
         |world: &World| world.state().runs.values().flat_map(|run| &run.sweeps).any(|s| s.search.score(14).is_some());
@@ -52,12 +58,12 @@ fn make_the_store() {
         }
     }
     let lost = world.state().workers.iter().find(|(_, worker)| worker.holds.is_some()).expect("one works").0.clone();
-    world.happen(Event::WorkerGone { worker: lost }).expect("taken");
+    world.happen(Event::WorkerGone { worker: lost, incarnation: None }).expect("taken");
     while !holds_with_a_checkpoint(world.state()) {
         world.step();
     }
     let first = world.store.recovery.facts.len() / 2;
-    let half = registry::Recovery { snapshot: None, facts: world.store.recovery.facts[..first].to_vec() };
+    let half = registry::Recovery { facts: world.store.recovery.facts[..first].to_vec(), ..Default::default() };
     let half = journal::recover(world.policy.clone(), &half).expect("half of it");
     world.store.snapshot(&half);
     std::fs::create_dir_all(file().parent().expect("a folder")).expect("a folder");

@@ -1,9 +1,10 @@
-//! Every kind of event, for everything that a state knows and for some things that it does not.
+//! Every kind of event, for every object in a state and for some that do not exist.
 
 use std::collections::BTreeMap;
 
 use coordinator::state::execution::StageExecution;
 use coordinator::state::run::Run;
+use coordinator::state::worker::Identity;
 use coordinator::value::Known;
 use coordinator::{Control, Event, State};
 use protocol::message::{CommitCheckpoint, FailureClass, Grant, Join, PROTOCOL_VERSION, ReportOutcome, TaskOutcome};
@@ -20,6 +21,7 @@ pub(crate) fn events(state: &State, ended: &[Run]) -> Vec<Event> {
             source: String::new(),
             idempotency_key: None,
             until: Some("nowhere".into()),
+            owner: protocol::Owner::local("me"),
         },
     ];
     let nobody: WorkerId = "nobody".into();
@@ -34,13 +36,20 @@ pub(crate) fn events(state: &State, ended: &[Run]) -> Vec<Event> {
             instruction_set: "avx2".into(),
             peer_address,
         };
-        events.push(Event::Join { join });
+        for caller in ["t", "another"] {
+            for secret in [format!("{worker} 1"), "another".to_owned()] {
+                let by = Identity { caller: caller.into(), secret: Digest::of(secret.as_bytes()) };
+                events.push(Event::Join { join: join.clone(), by });
+            }
+        }
         events.push(Event::WorkerBack { worker: worker.clone() });
         let tasks = state.tasks.keys().take(3).cloned().chain(["none".into()]).collect();
         events.push(Event::WorkerReady { worker: worker.clone(), incarnation, tasks });
         events.push(Event::LeaseExpired { worker: worker.clone(), incarnation });
         events.push(Event::LeaseExpired { worker: worker.clone(), incarnation: Incarnation(0) });
-        events.push(Event::WorkerGone { worker: worker.clone() });
+        for incarnation in [None, Some(incarnation), Some(Incarnation(0))] {
+            events.push(Event::WorkerGone { worker: worker.clone(), incarnation });
+        }
         events.push(Event::WorkerForgotten { worker: worker.clone(), incarnation });
     }
     let no_run: RunId = "no-run".into();
@@ -71,7 +80,8 @@ pub(crate) fn events(state: &State, ended: &[Run]) -> Vec<Event> {
         events.push(Event::BackoffOver { task: task.clone() });
         for grant in grants(state, task, &nobody) {
             events.push(Event::GraceOver { task: task.clone(), fence: grant.fence });
-            events.push(Event::PeersLost { grant: grant.clone(), lost: state.workers.keys().cloned().collect() });
+            events.push(Event::GangDivided { task: task.clone(), fence: grant.fence });
+            events.push(Event::GangStalled { task: task.clone(), fence: grant.fence });
             let commit = CommitCheckpoint {
                 grant: grant.clone(),
                 step: 2,
@@ -98,7 +108,7 @@ pub(crate) fn events(state: &State, ended: &[Run]) -> Vec<Event> {
     events
 }
 
-/// Those of the holders, an old one, one from the future, and a stranger's.
+/// Grants of the holders, an outdated one, one from the future, and a stranger's.
 fn grants(state: &State, task: &TaskId, nobody: &WorkerId) -> Vec<Grant> {
     let stranger = Grant {
         task: task.clone(),

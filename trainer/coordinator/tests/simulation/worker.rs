@@ -1,22 +1,22 @@
-//! A worker that does not compute: it joins, polls, steps, saves and reports, over a network that delays, loses and
-//! doubles what it says.
+//! A worker that does not compute. It joins, polls, steps, saves and reports over a network that delays, loses and
+//! duplicates messages.
 
 use std::collections::{BTreeMap, BTreeSet};
 
 use coordinator::Millis;
 use protocol::message::{
-    Assignment, CommitCheckpoint, DesiredAssignments, Doing, FailureClass, Grant, Join, PROTOCOL_VERSION, Poll,
-    Progress, ReportOutcome, Role, TaskOutcome,
+    Assignment, CommitCheckpoint, DesiredAssignments, Doing, FailureClass, Grant, Join, LossCause, LostPeer, Member,
+    PROTOCOL_VERSION, Poll, Prepare, Progress, ReportOutcome, Role, TaskOutcome,
 };
 use protocol::stage::Backend;
 use protocol::{Attempt, Digest, Incarnation, TaskId, WorkerId};
 
 use crate::random::Random;
 
-/// Steps of a training stage.
+/// Number of steps of a training stage.
 pub(crate) const STEPS: u64 = 10;
 
-/// What travels to the coordinator.
+/// A message to the coordinator.
 #[derive(Debug, Clone)]
 pub(crate) enum Call {
     Join(Join),
@@ -26,36 +26,37 @@ pub(crate) enum Call {
 }
 
 impl Call {
-    /// What was uploaded before.
+    /// The blob that was uploaded before the call.
     pub(crate) fn uploaded(&self) -> Option<Digest> {
         match self {
             Self::Join(_) | Self::Poll(_) => None,
             Self::Commit(commit) => Some(commit.manifest),
             Self::Report(report) => match report.outcome {
                 TaskOutcome::Finished { output, .. } => Some(output),
-                TaskOutcome::Yielded { .. } | TaskOutcome::Failed { .. } => None,
+                TaskOutcome::Resolved { .. } | TaskOutcome::Yielded { .. } | TaskOutcome::Failed { .. } => None,
             },
         }
     }
 }
 
-/// What travels back.
+/// A message from the coordinator.
 #[derive(Debug, Clone)]
 pub(crate) enum Answer {
     Joined(Incarnation),
-    DesiredAssignments(DesiredAssignments),
-    /// To this commit or report: stored.
+    /// The desired assignments after this number of decisions.
+    DesiredAssignments(DesiredAssignments, u64),
+    /// The commit or report is stored.
     Done(Saving),
-    /// To this commit or report: never.
+    /// The commit or report is refused for good.
     Refused(Saving),
-    /// Of any call: later.
+    /// Any call may be repeated later.
     Later,
 }
 
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum Saving {
     No,
-    /// Until the answer comes, nothing goes on.
+    /// The worker waits for the answer.
     Commit(CommitCheckpoint),
     Report(ReportOutcome),
     Over,
@@ -64,24 +65,35 @@ pub(crate) enum Saving {
 #[derive(Debug, Clone)]
 pub(crate) struct FakeWorker {
     pub(crate) name: WorkerId,
-    /// The process is there.
+    /// Set while the process exists.
     pub(crate) alive: bool,
-    /// Stopped by a signal until then.
+    /// The process is stopped by a signal until this time.
     pub(crate) hung_until: Millis,
+    /// The stage hangs until this time, while the process still polls.
+    pub(crate) stuck_until: Millis,
+    /// The peer port refuses connections until this time.
+    pub(crate) refuses_until: Millis,
+    /// Complains of all peers, although it reaches them.
+    pub(crate) lies: bool,
     pub(crate) process: u32,
     incarnation: Option<Incarnation>,
     desired: Option<DesiredAssignments>,
-    /// Steps of the state in memory, and of which try.
+    /// The number of decisions behind the newest received answer.
+    newest: u64,
+    /// The steps of the state in memory, with its task and attempt.
     live: Option<(TaskId, Attempt, u64)>,
+    /// The state that it discarded because of an answer that a newer one had overtaken. Real workers never receive such
+    /// an answer: they have one poll in progress and ignore answers to abandoned polls.
+    misled: Option<(TaskId, Attempt, u64)>,
     saved_at: u64,
     saving: Saving,
     next_call: Millis,
     silent_peers_since: Option<Millis>,
-    /// How long this process takes to fetch a task's inputs. Milliseconds.
+    /// Time for this process to fetch a task's inputs. Milliseconds.
     fetches_ms: u64,
-    /// When those will be there that it was asked for.
+    /// Completion times of requested inputs.
     fetching: BTreeMap<TaskId, Millis>,
-    /// Tasks of which it has said that their inputs are there.
+    /// Tasks whose inputs it has reported as fetched.
     said_ready: BTreeSet<TaskId>,
 }
 
@@ -91,10 +103,15 @@ impl FakeWorker {
             name: name.into(),
             alive: false,
             hung_until: Millis(0),
+            stuck_until: Millis(0),
+            refuses_until: Millis(0),
+            lies: false,
             process: 0,
             incarnation: None,
             desired: None,
+            newest: 0,
             live: None,
+            misled: None,
             saved_at: 0,
             saving: Saving::No,
             next_call: Millis(0),
@@ -105,25 +122,36 @@ impl FakeWorker {
         }
     }
 
-    /// Its host's kernels: two kinds of hosts.
+    /// The instruction set of its host; there are two kinds of hosts.
     fn instruction_set(&self) -> String {
         let is_odd = self.name.as_str().ends_with(['1', '3']);
         if is_odd { "avx512".to_owned() } else { "avx2".to_owned() }
     }
 
-    /// A new process; `true` if it is slow to fetch what a task needs.
+    /// Starts a new process; returns `true` if it fetches inputs slowly.
     pub(crate) fn launch(&mut self) -> bool {
-        // Half of them are on a slow line.
+        // Half of the processes have a slow connection.
         let fetches_ms = match lot(&format!("{} {}", self.name, self.process)) {
             quick @ 0..128 => u64::from(quick),
             slow => u64::from(slow) * 100,
         };
-        *self = Self { process: self.process + 1, alive: true, fetches_ms, ..Self::new(self.name.as_str()) };
+        let lies = lot(&format!("lies {} {}", self.name, self.process)) < 26;
+        *self = Self { process: self.process + 1, alive: true, fetches_ms, lies, ..Self::new(self.name.as_str()) };
         fetches_ms >= 10_000
     }
 
     pub(crate) fn runs(&self, now: Millis) -> bool {
         self.alive && self.hung_until <= now
+    }
+
+    /// Returns true if it is the process of this member.
+    pub(crate) fn is(&self, member: &Member) -> bool {
+        self.alive && self.name == member.worker && self.incarnation == Some(member.incarnation)
+    }
+
+    /// Returns true if the stage hangs while the process still polls.
+    pub(crate) fn is_stuck(&self, now: Millis) -> bool {
+        self.stuck_until > now
     }
 
     fn assignment(&self) -> Option<&Assignment> {
@@ -134,9 +162,19 @@ impl FakeWorker {
         self.assignment().map(|assignment| &assignment.grant)
     }
 
-    /// Steps in memory, if they are of this try.
+    /// Steps in memory, if they belong to this attempt.
     pub(crate) fn live(&self, grant: &Grant) -> Option<u64> {
-        self.live.as_ref().filter(|(task, attempt, _)| (task, attempt) == (&grant.task, &grant.attempt)).map(|l| l.2)
+        self.live_of(&grant.task, grant.attempt)
+    }
+
+    pub(crate) fn live_of(&self, task: &TaskId, attempt: Attempt) -> Option<u64> {
+        self.live.as_ref().filter(|(of, at, _)| (of, *at) == (task, attempt)).map(|live| live.2)
+    }
+
+    /// Steps in memory, including steps discarded because of an overtaken answer.
+    pub(crate) fn has_or_was_misled_out_of(&self, task: &TaskId, attempt: Attempt) -> Option<u64> {
+        let misled = self.misled.as_ref().filter(|(of, at, _)| (of, *at) == (task, attempt));
+        self.live_of(task, attempt).max(misled.map(|misled| misled.2))
     }
 
     pub(crate) fn hear(&mut self, process: u32, answer: Answer) {
@@ -147,9 +185,19 @@ impl FakeWorker {
             Answer::Joined(incarnation) => {
                 self.incarnation.get_or_insert(incarnation);
             }
-            Answer::DesiredAssignments(desired) => {
+            Answer::DesiredAssignments(desired, decisions) => {
+                let is_overtaken = decisions < self.newest;
+                self.newest = self.newest.max(decisions);
                 let held = self.grant().cloned();
                 self.desired = Some(desired);
+                if self.grant().is_none_or(|grant| held.as_ref().is_some_and(|held| held.task != grant.task)) {
+                    let dropped = self.live.take();
+                    if !is_overtaken {
+                        self.misled = None;
+                    } else if dropped.is_some() {
+                        self.misled = dropped;
+                    }
+                }
                 if let Some(Assignment { grant, role: Role::Member { .. }, .. }) = self.assignment() {
                     assert!(self.said_ready.contains(&grant.task), "`{}` got {grant:?} without its inputs", self.name);
                 }
@@ -165,23 +213,24 @@ impl FakeWorker {
                 }
                 Saving::Report(_) | Saving::Over | Saving::No => self.saving = Saving::Over,
             },
-            // Whatever we hold is not ours any more.
+            // The worker no longer holds its task.
             Answer::Refused(what) if what == self.saving => self.saving = Saving::Over,
-            // An answer to what was said long ago.
+            // An answer to an earlier call.
             Answer::Done(_) | Answer::Refused(_) | Answer::Later => {}
         }
     }
 
-    /// The process was replaced or is unknown: join again.
+    /// Resets the worker so that it joins again, after its process was replaced or forgotten.
     pub(crate) fn forget(&mut self) {
         self.incarnation = None;
         self.desired = None;
         self.live = None;
+        self.misled = None;
         self.saving = Saving::No;
     }
 
-    /// What it sends now, if anything.
-    pub(crate) fn speak(&mut self, now: Millis, unreachable: &[WorkerId]) -> Vec<Call> {
+    /// The calls that it sends now, given unreachable and hung peers.
+    pub(crate) fn speak(&mut self, now: Millis, unreachable: &[WorkerId], stuck: &[WorkerId], lies: bool) -> Vec<Call> {
         if !self.runs(now) || now < self.next_call {
             return Vec::new();
         }
@@ -196,18 +245,23 @@ impl FakeWorker {
                 peer_address: format!("{}:{}", self.name, self.process),
             })];
         };
-        let doing = self.assignment().map(|assignment| Doing {
-            grant: assignment.grant.clone(),
-            progress: Progress { done: self.live.as_ref().map_or(0, |l| l.2), total: STEPS, ..Default::default() },
-            lost: match (&assignment.role, self.silent_peers_since) {
-                (Role::Member { members, .. }, Some(since)) if now.since(since) > 2500 => {
-                    members.iter().map(|m| &m.worker).filter(|w| unreachable.contains(w)).cloned().collect()
-                }
-                _ => Vec::new(),
-            },
+        let doing = self.assignment().map(|assignment| {
+            let members = match &assignment.role {
+                Role::Member { members, .. } => members.as_slice(),
+                Role::Alone | Role::Shard { .. } | Role::Merge { .. } | Role::Resolve => &[],
+            };
+            let peers = members.iter().map(|member| &member.worker).filter(|worker| **worker != self.name);
+            let misses = self.silent_peers_since.is_some_and(|since| now.since(since) > 2500);
+            let lost = peers.clone().filter(|worker| lies || (misses && unreachable.contains(worker)));
+            let lost = lost.map(|worker| LostPeer { worker: worker.clone(), cause: LossCause::Unreachable });
+            let waits_for = peers.clone().find(|worker| stuck.contains(worker) && !self.is_stuck(now)).cloned();
+            let progress = Progress { done: self.live.as_ref().map_or(0, |l| l.2), total: STEPS, ..Default::default() };
+            let grant = assignment.grant.clone();
+            Doing { holds: self.live(&grant), waits_for, lost: lost.collect(), ..Doing::new(grant, progress) }
         });
-        let asked = self.desired.iter().flat_map(|desired| &desired.prepare).map(|prepare| prepare.task.clone());
-        let asked: BTreeSet<TaskId> = asked.collect();
+        let reaches = |prepare: &&Prepare| !prepare.peers.iter().any(|peer| unreachable.contains(&peer.worker));
+        let asked = self.desired.iter().flat_map(|desired| &desired.prepare).filter(reaches);
+        let asked: BTreeSet<TaskId> = asked.map(|prepare| prepare.task.clone()).collect();
         self.fetching.retain(|task, _| asked.contains(task));
         for task in asked {
             self.fetching.entry(task).or_insert(now.after(self.fetches_ms));
@@ -229,7 +283,7 @@ impl FakeWorker {
         self.saving = Saving::Report(ReportOutcome { grant, outcome });
     }
 
-    /// Finds the first of its task's inputs that `can_be` damaged to be so, and says it; gives which.
+    /// Reports the first input for which `can_be` holds as damaged, and returns it.
     pub(crate) fn finds_damage(&mut self, now: Millis, can_be: impl Fn(Digest) -> bool) -> Option<Digest> {
         if !self.runs(now) || self.saving != Saving::No {
             return None;
@@ -241,7 +295,8 @@ impl FakeWorker {
         Some(input)
     }
 
-    /// One unit of work. `peers` says for a gang how far the furthest member is, or `None` if not all are there.
+    /// Does one unit of work. For a gang, `peers` has the steps of the most advanced member, or `None` if some are
+    /// absent.
     pub(crate) fn work(
         &mut self,
         now: Millis,
@@ -255,12 +310,20 @@ impl FakeWorker {
         }
         let Some(assignment) = self.assignment().cloned() else { return };
         let grant = assignment.grant.clone();
+        if self.is_stuck(now) && matches!(assignment.role, Role::Member { .. }) {
+            return;
+        }
         if chaos && random.chance(1) {
             let class = if random.chance(50) { FailureClass::Fault } else { FailureClass::Infrastructure };
             return self.report(grant, TaskOutcome::Failed { class, message: "made up".into() });
         }
         let rank = match &assignment.role {
             Role::Member { members, .. } => members.iter().position(|member| member.worker == self.name),
+            Role::Resolve => {
+                let folders = assignment.stage.settings.folders().into_iter();
+                let digests = folders.map(|folder| (folder.field, Digest::of(folder.path.as_bytes()))).collect();
+                return self.report(grant, TaskOutcome::Resolved { digests });
+            }
             Role::Alone | Role::Shard { .. } | Role::Merge { .. } => {
                 if random.chance(40) {
                     self.report(grant.clone(), finished(&assignment));
@@ -272,7 +335,7 @@ impl FakeWorker {
             let class = FailureClass::Diverged;
             return self.report(grant, TaskOutcome::Failed { class, message: "the loss is not a number".into() });
         }
-        // A rung of a sweep ends earlier, and with a checkpoint of its last step.
+        // A rung of a sweep stops earlier, with a checkpoint of its last step.
         let stop = assignment.stage.settings.training().and_then(|training| training.stop);
         let steps = stop.map_or(STEPS, |stop| stop.0);
         let Some(furthest) = peers else {
@@ -310,16 +373,16 @@ impl FakeWorker {
     }
 }
 
-/// A stage is a function: every worker that computes it gets this.
+/// A stage is a function: all workers compute the same result.
 fn finished(assignment: &Assignment) -> TaskOutcome {
     let path = within_run(&assignment.grant.task);
-    // A trial is as good as its name says.
+    // The name of a trial determines its metric.
     let fid = if path.contains(".t") { lot(path) as f64 / 256.0 } else { 0.1 };
     let metrics = BTreeMap::from([("latent_fid".to_owned(), fid)]);
     TaskOutcome::Finished { output: Digest::of(path.as_bytes()), metrics }
 }
 
-/// Some trials of a sweep do not survive some of their rungs.
+/// Returns true for some rungs of some trials of a sweep.
 fn diverges(task: &TaskId) -> bool {
     let path = within_run(task);
     path.contains(".t") && lot(path).is_multiple_of(9)

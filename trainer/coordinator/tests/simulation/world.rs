@@ -1,4 +1,4 @@
-//! The world of a seed: the coordinator as it is, what it stores, and everything that is on its way.
+//! The world of a seed: the real coordinator, its store, and all messages in transit.
 
 mod disk;
 mod steps;
@@ -9,9 +9,9 @@ use std::sync::Arc;
 use coordinator::batch::{Ask, Batches};
 use coordinator::state::run::Run;
 use coordinator::{Control, Effect, Event, Millis, Policy, Refused, State, journal};
-use protocol::message::RunState;
+use protocol::message::{Member, RunState};
 use protocol::stage::WorkerRange;
-use protocol::{Digest, Incarnation, RunId, WorkerId};
+use protocol::{Attempt, Digest, Incarnation, RunId, TaskId, WorkerId};
 
 use self::disk::{Disk, Ticket};
 use crate::pipelines;
@@ -19,13 +19,17 @@ use crate::random::Random;
 use crate::store::FakeStore;
 use crate::worker::{Answer, Call, FakeWorker};
 
-/// Everything that goes wrong in some seed. What is never counted has silently gone missing from the simulation.
-pub(crate) const INJECTED: [&str; 25] = [
+/// All injected faults. A fault that is never counted has silently disappeared from the simulation.
+pub(crate) const INJECTED: [&str; 29] = [
     "a call that was lost",
     "a call that came twice",
     "a worker that died",
     "a worker that was stopped",
     "a cut between peers that both reach the coordinator",
+    "a cut that only one of two peers notices",
+    "a refused peer port",
+    "a false complaint",
+    "a stage that hangs while its worker polls",
     "a member whom its peers could not reach",
     "a slow joiner",
     "a late tick of a clock that overslept",
@@ -48,67 +52,81 @@ pub(crate) const INJECTED: [&str; 25] = [
     "a snapshot that was overtaken by facts",
 ];
 
-/// How long things go wrong.
+/// Duration of the period with faults.
 pub(crate) const CHAOS_MS: u64 = 180_000;
 const LIMIT_MS: u64 = 3_000_000;
+
+/// A pair of workers that cannot reach each other.
+#[derive(Debug, Clone)]
+pub(crate) struct Cut {
+    pub(crate) from: WorkerId,
+    pub(crate) to: WorkerId,
+    /// Set if only `from` notices.
+    pub(crate) one_way: bool,
+    pub(crate) until: Millis,
+}
 
 pub(crate) struct World {
     pub(crate) policy: Policy,
     pub(crate) random: Random,
     pub(crate) now: Millis,
     pub(crate) store: FakeStore,
-    /// What the coordinator's actor drives, too.
+    /// The same batches that the coordinator's actor drives.
     batches: Batches<u64>,
     disk: Disk,
-    /// Who waits for an answer.
+    /// Pending requests.
     asked: BTreeMap<u64, Ticket>,
     tickets: u64,
     /// The answer for the caller that waits in [`World::happen`].
     answered: Option<Result<Vec<Effect>, Refused>>,
-    /// Snapshots on their way, and when they get there.
+    /// Snapshots being stored, with their completion times.
     snapshots: Vec<(Millis, Arc<State>)>,
-    /// The newest poll of each process that was answered, and the same when the batch in flight was decided.
+    /// The newest answered poll of each process, now and when the batch in flight was decided.
     heard: BTreeMap<(WorkerId, Incarnation), Millis>,
     heard_then: BTreeMap<(WorkerId, Incarnation), Millis>,
-    /// The processes that had a lease after the newest batch.
+    /// Processes with a lease after the newest batch.
     present: BTreeMap<WorkerId, Incarnation>,
-    /// What went wrong, and how often.
+    /// Gangs after the newest batch, with attempts and members.
+    gangs: BTreeMap<TaskId, (Attempt, Vec<Member>)>,
+    /// Number of injected faults by kind.
     pub(crate) injected: BTreeMap<&'static str, u64>,
-    /// The coordinator runs.
+    /// Set while the coordinator runs.
     pub(crate) up: bool,
     pub(crate) back_at: Millis,
     pub(crate) effects: Vec<(Millis, Effect)>,
     pub(crate) calls: Vec<(Millis, usize, u32, Call)>,
     pub(crate) answers: Vec<(Millis, usize, u32, Answer)>,
     pub(crate) workers: Vec<FakeWorker>,
-    /// Pairs of workers that cannot reach each other, and until when; the coordinator reaches both.
-    pub(crate) cuts: Vec<(WorkerId, WorkerId, Millis)>,
+    /// Workers that cannot reach each other, although the coordinator reaches them.
+    pub(crate) cuts: Vec<Cut>,
     pub(crate) submissions: Vec<(Millis, Event)>,
     pub(crate) checkpoint_steps: BTreeMap<Digest, u64>,
     pub(crate) events: u64,
-    /// Runs that somebody asked to cancel.
+    /// Cancelled runs.
     pub(crate) cancelled: Vec<RunId>,
-    /// Try every event now and then.
+    /// Tries every kind of event at intervals.
     pub(crate) wild: bool,
-    /// Kill the coordinator after each stored batch whose number is a multiple of the first, from the second on; its answers are lost.
+    /// Kills the coordinator after stored batches, whose answers are lost: those numbered by multiples of the first
+    /// value, starting from the second.
     pub(crate) kills: Option<(u64, u64)>,
-    /// Only the first of them.
+    /// Kills only once.
     pub(crate) once: bool,
     pub(crate) stored: u64,
-    /// Starts of the coordinator.
+    /// Number of starts of the coordinator.
     pub(crate) starts: usize,
-    /// Until when nobody looks at the clock, and since when.
+    /// The period without ticks: its end and its start.
     pub(crate) asleep: Option<(Millis, Millis)>,
 }
 
 fn policy() -> Policy {
-    Policy { grace_ms: 10_000, fault_budget: 1000, infrastructure_budget: 1000, ..Policy::default() }
+    let budgets = Policy { fault_budget: 1000, infrastructure_budget: 1000, ..Policy::default() };
+    Policy { grace_ms: 10_000, stall_ms: 30_000, ..budgets }
 }
 
 impl World {
     pub(crate) fn new(seed: u64) -> Self {
         let mut random = Random::new(seed);
-        let workers = (0..1 + random.below(4)).map(|i| FakeWorker::new(&format!("w{i}"))).collect();
+        let workers = (0..1 + random.below(6)).map(|i| FakeWorker::new(&format!("w{i}"))).collect();
         let submissions = (0..1 + random.below(3))
             .map(|i| {
                 let max = random.below(4) as usize;
@@ -116,13 +134,17 @@ impl World {
                 let gates: &[&str] = if random.chance(15) { &["never <= 0"] } else { &["latent_fid <= 1"] };
                 let pipeline = match random.below(4) {
                     0 => pipelines::swept(random.below(2), 4 + random.below(8)),
-                    _ => pipelines::quickstart(random.below(2), range, gates),
+                    _ => match random.below(2) {
+                        0 => pipelines::quickstart(0, range, gates),
+                        seed => pipelines::reading_files(pipelines::quickstart(seed, range, gates)),
+                    },
                 };
                 let event = Event::Submit {
                     pipeline: Box::new(pipeline),
                     source: String::new(),
                     idempotency_key: random.chance(30).then(|| format!("key-{i}")),
                     until: random.chance(20).then(|| "mld".into()),
+                    owner: protocol::Owner::local("me"),
                 };
                 (Millis(random.below(CHAOS_MS / 2)), event)
             })
@@ -141,6 +163,7 @@ impl World {
             heard: BTreeMap::new(),
             heard_then: BTreeMap::new(),
             present: BTreeMap::new(),
+            gangs: BTreeMap::new(),
             injected: BTreeMap::new(),
             up: true,
             back_at: Millis(0),
@@ -166,18 +189,18 @@ impl World {
         self.now.0 < CHAOS_MS
     }
 
-    /// Counts something that went wrong.
+    /// Counts an injected fault.
     pub(crate) fn count(&mut self, what: &'static str) {
         debug_assert!(INJECTED.contains(&what), "`{what}` is not in the list");
         *self.injected.entry(what).or_default() += 1;
     }
 
-    /// The newest stored state that the coordinator knows of.
+    /// The newest stored state that the coordinator knows.
     pub(crate) fn state(&self) -> &State {
         self.batches.state()
     }
 
-    /// Somebody asks, and waits until it is answered, while everything else stands still.
+    /// Requests an event and waits for the answer while the rest of the world stands still.
     pub(crate) fn happen(&mut self, event: Event) -> Result<Vec<Effect>, Refused> {
         let starts = matches!(event, Event::Started { .. });
         self.ask(Ask::Event(Box::new(event)), Ticket::Caller);
@@ -191,14 +214,14 @@ impl World {
         answer
     }
 
-    /// The process is gone: what is stored is what was, and a caller that waits hears nothing.
+    /// Kills the coordinator: only stored data survives, and waiting callers get no answer.
     fn crash(&mut self) {
         self.up = false;
         self.back_at = self.now.after(self.random.below(40_000));
         self.forget();
     }
 
-    /// All that was in the memory of the coordinator is gone.
+    /// Discards the coordinator's memory.
     fn forget(&mut self) {
         self.effects.clear();
         self.snapshots.clear();
@@ -208,23 +231,24 @@ impl World {
             Disk::Written { .. } => self.count("a crash between commit and answer"),
         }
         for ticket in std::mem::take(&mut self.asked).into_values() {
-            // A client that cannot know whether it was taken sends it again, under a key; without one, it may count twice.
+            // A client without an answer repeats its submission under the same key; without a key it may count twice.
             if let Ticket::Submission(event) = ticket {
                 self.submissions.push((self.now.after(500), *event));
             }
         }
     }
 
-    /// What is stored is what was; workers that come back go on from it.
+    /// Recovers from the stored data and compares it with the state before.
     pub(crate) fn recovered(&mut self) {
         let recovered =
             journal::recover(self.policy.clone(), &self.store.recovery).expect("what is stored can be recovered");
-        // A commit that was in flight may be there, though nobody was told.
+        // A commit in flight may be stored, although it was not acknowledged.
         assert!(recovered.seq >= self.state().seq, "what was acknowledged is gone");
         if recovered.seq == self.state().seq {
             assert_eq!(durable(&recovered), durable(self.state()), "recovery gives what was");
         }
         self.batches = Batches::new(recovered);
+        self.gangs.clear();
         self.present = self.present_now();
     }
 
@@ -276,10 +300,10 @@ impl World {
         }
         self.recovered();
         let held: usize = self.state().executions.values().map(|execution| execution.tasks.held().count()).sum();
-        assert!(self.state().executions.len() <= held, "all that is left in memory is what workers are leaving");
+        assert!(self.state().executions.size() <= held, "all that is left in memory is what workers are leaving");
     }
 
-    /// All runs, whether they go on or have ended, by submission.
+    /// All runs, active and ended, by submission.
     pub(crate) fn runs(&self) -> Vec<Run> {
         let ended = self.store.ended.keys().filter(|run| self.state().run(run).is_err());
         let ended = ended.map(|run| *self.store.archived(run).expect("it ended"));
@@ -288,7 +312,7 @@ impl World {
         runs
     }
 
-    /// As clients see them.
+    /// Views of all runs.
     pub(crate) fn views(&self) -> Vec<protocol::message::RunView> {
         let view = |run: Run| match self.state().run(&run.id) {
             Ok(run) => self.state().view(run, self.now),
@@ -297,7 +321,7 @@ impl World {
         self.runs().into_iter().map(view).collect()
     }
 
-    /// As the shell does: a run that has ended is handed in.
+    /// Controls a run. Like the shell, it passes the archive of an ended run.
     pub(crate) fn control(&mut self, run: &RunId, action: Control) -> Result<Vec<Effect>, Refused> {
         let event = self.control_event(run, action);
         self.happen(event)
@@ -309,7 +333,7 @@ impl World {
     }
 }
 
-/// What must survive a restart.
+/// The data that must survive a restart.
 fn durable(state: &State) -> impl PartialEq + std::fmt::Debug + use<> {
     (
         state.workers.clone(),

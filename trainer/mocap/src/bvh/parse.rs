@@ -3,11 +3,10 @@
 use std::path::Path;
 
 use motion::quaternion::Vec3;
+use protocol::excerpt;
 
 use super::{Bvh, BvhError, Channel, MAX_DEPTH, MAX_NODES, MAX_SECONDS, MAX_VALUES, Node, nominal_rate};
 
-/// Largest number of a word's bytes shown in an error.
-const SHOWN: usize = 40;
 /// Largest length of a joint's name, in bytes.
 const NAME_BYTES: usize = 256;
 
@@ -110,10 +109,7 @@ impl<'a> Reader<'a> {
 fn shown(word: &str) -> String {
     match word {
         "" => "the file ends here".to_owned(),
-        _ if word.chars().count() > SHOWN => {
-            format!("`{}...`", word.chars().take(SHOWN).collect::<String>().escape_debug())
-        }
-        _ => format!("`{}`", word.escape_debug()),
+        _ => format!("`{}`", excerpt(word)),
     }
 }
 
@@ -147,12 +143,12 @@ fn hierarchy(reader: &mut Reader<'_>) -> Result<Vec<Node>, Fault> {
                 open.pop();
             }
             "MOTION" | "" => {
-                let name = &nodes[joint].name;
+                let name = excerpt(&nodes[joint].name);
                 return reader.fault(format!("the brace of `{name}` is never closed ({} open)", open.len()));
             }
             _ => {
                 let expected = "expected OFFSET, CHANNELS, JOINT, End Site or `}`";
-                return reader.fault(format!("{} in `{}`, {expected}", shown(word), nodes[joint].name));
+                return reader.fault(format!("{} in `{}`, {expected}", shown(word), excerpt(&nodes[joint].name)));
             }
         }
     }
@@ -177,7 +173,7 @@ fn add(
 fn open_joint(reader: &mut Reader<'_>, nodes: &mut Vec<Node>, open: &mut Vec<usize>) -> Result<(), Fault> {
     let name = reader.name()?;
     if open.iter().any(|joint| nodes[*joint].name == name) {
-        return reader.fault(format!("joint `{name}` lies inside a joint of the same name"));
+        return reader.fault(format!("joint `{}` lies inside a joint of the same name", excerpt(&name)));
     }
     if open.len() == MAX_DEPTH {
         return reader.fault(format!("joints are nested more than {MAX_DEPTH} deep; no more are read"));
@@ -203,13 +199,13 @@ fn end_site(reader: &mut Reader<'_>, nodes: &mut Vec<Node>, joint: usize) -> Res
 
 fn channels(reader: &mut Reader<'_>, joint: &Node) -> Result<Vec<Channel>, Fault> {
     if !joint.channels.is_empty() {
-        return reader.fault(format!("`{}` has a second list of channels", joint.name));
+        return reader.fault(format!("`{}` has a second list of channels", excerpt(&joint.name)));
     }
     let count = reader.count("the number of CHANNELS")?;
     if count > Channel::NAMES.len() {
         return reader.fault(format!(
             "`{}` has {count} channels, expected at most {}",
-            joint.name,
+            excerpt(&joint.name),
             Channel::NAMES.len()
         ));
     }
@@ -220,13 +216,13 @@ fn channels(reader: &mut Reader<'_>, joint: &Node) -> Result<Vec<Channel>, Fault
         let Some((_, channel)) = Channel::NAMES.iter().find(|(name, _)| name.eq_ignore_ascii_case(word)) else {
             let found = format!(
                 "CHANNELS {count} of `{}` is followed by {i} names of channels, then {}",
-                joint.name,
+                excerpt(&joint.name),
                 shown(word)
             );
             return Err((line, format!("{found}; expected {count} such as Xposition or Zrotation")));
         };
         if channels.contains(channel) {
-            return reader.fault(format!("`{}` has the channel {} twice", joint.name, channel.name()));
+            return reader.fault(format!("`{}` has the channel {} twice", excerpt(&joint.name), channel.name()));
         }
         channels.push(*channel);
     }
@@ -368,6 +364,7 @@ mod tests {
 
     #[test]
     fn a_mistake_is_told_with_its_line() {
+        protocol::show_excerpts();
         for (from, to, part) in [
             ("HIERARCHY", "", "x.bvh:2: `ROOT`, expected `HIERARCHY`"),
             ("yrotation", "yturn", "followed by 1 names of channels, then `yturn`"),

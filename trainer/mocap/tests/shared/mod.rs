@@ -2,6 +2,7 @@
 
 #![allow(dead_code, reason = "each test binary uses its own part of this module")]
 
+use motion::DataPath;
 use std::fs;
 use std::path::{Path, PathBuf};
 
@@ -11,7 +12,7 @@ use serde_json::Value;
 
 /// Reads f32 or f64.
 pub(crate) fn load(file: &Path) -> Array {
-    npy::read_any_float(file).unwrap_or_else(|e| panic!("{e}"))
+    npy::read_any_float(&DataPath::local(file)).unwrap_or_else(|e| panic!("{e}"))
 }
 
 /// Reads a JSON file.

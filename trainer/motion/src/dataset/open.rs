@@ -20,11 +20,11 @@ use std::collections::{BTreeMap, HashMap, HashSet};
 use std::fmt;
 use std::path::{Path, PathBuf};
 
-use protocol::limits;
 use protocol::stage::DataFormat;
+use protocol::{excerpt, limits};
 
 use super::{Clip, Dataset, Entry, Split};
-use crate::files;
+use crate::files::DataPath;
 use crate::npy::{self, NpyError};
 use crate::skeleton::Skeleton;
 use crate::text::{self, Oddity, Texts};
@@ -264,9 +264,27 @@ enum Loaded {
 
 impl Dataset {
     /// Opens a folder. Reads `train.txt`, `val.txt`, `test.txt`, `new_joint_vecs/`, `texts/`, `Mean.npy`, `Std.npy`.
-    pub fn open(path: &Path, format: DataFormat) -> Result<(Self, OpenReport), OpenError> {
-        let fail = |problems| OpenError { folder: path.into(), problems };
-        if !path.is_dir() {
+    ///
+    /// # Errors
+    /// [`OpenError`] with every problem found.
+    ///
+    /// # Panics
+    /// Never.
+    pub fn open(path: &DataPath, format: DataFormat) -> Result<(Self, OpenReport), OpenError> {
+        Self::open_while(path, format, &|_| true).map(|opened| opened.expect("reading is never stopped"))
+    }
+
+    /// Opens a folder while `go_on`, which is asked every few clips with how many are read, returns true; else `None`.
+    ///
+    /// # Errors
+    /// As [`open`](Self::open).
+    pub fn open_while(
+        path: &DataPath,
+        format: DataFormat,
+        go_on: &dyn Fn(usize) -> bool,
+    ) -> Result<Option<(Self, OpenReport)>, OpenError> {
+        let fail = |problems| OpenError { folder: path.shown().into(), problems };
+        if !path.is_folder() {
             let what = if path.exists() { "is not a folder" } else { "no such folder" };
             return Err(fail(vec![Problem::new(
                 ProblemKind::Missing,
@@ -286,7 +304,7 @@ impl Dataset {
             }
         }
         for folder in ["new_joint_vecs", "texts"] {
-            if !path.join(folder).is_dir() {
+            if !path.join(folder).is_folder() {
                 let file = path.join(folder);
                 problems.push(Problem::new(ProblemKind::Missing, format!("{}: no such folder", file.display())));
             }
@@ -315,7 +333,13 @@ impl Dataset {
                 ids.push(id);
             }
         }
-        let loaded: HashMap<&str, Loaded> = ids.iter().copied().zip(load_all(path, &ids, skeleton)).collect();
+        let mut loaded: HashMap<&str, Loaded> = HashMap::new();
+        for (part, ids) in ids.chunks(AT_ONCE).enumerate() {
+            if !go_on(part * AT_ONCE) {
+                return Ok(None);
+            }
+            loaded.extend(ids.iter().copied().zip(load_all(path, ids, skeleton)));
+        }
         for id in &ids {
             if let Loaded::Bad(found) = &loaded[id] {
                 problems.extend(found.iter().cloned());
@@ -330,7 +354,7 @@ impl Dataset {
             let what = format!("{}: no usable training clip\n{report}", path.join("train.txt").display());
             return Err(fail(vec![Problem::new(ProblemKind::Empty, what)]));
         }
-        Ok((dataset, report))
+        Ok(Some((dataset, report)))
     }
 
     /// Converts loaded clips to entries by the load rules, and records those left out.
@@ -440,8 +464,8 @@ impl Dataset {
 }
 
 /// Reads the ids of a list, trimmed, without blank lines.
-fn read_list(file: &Path) -> Result<Vec<String>, Vec<Problem>> {
-    let content = files::read(file, limits::CLIP_LIST_BYTES).map_err(|e| {
+fn read_list(file: &DataPath) -> Result<Vec<String>, Vec<Problem>> {
+    let content = file.read(limits::CLIP_LIST_BYTES).map_err(|e| {
         let (kind, hint) = match e.kind() {
             std::io::ErrorKind::NotFound => (ProblemKind::Missing, "; expected a list with one clip id a line"),
             _ => (ProblemKind::Io, ""),
@@ -455,11 +479,10 @@ fn read_list(file: &Path) -> Result<Vec<String>, Vec<Problem>> {
         .filter(|(_, id)| !is_clip_id(id))
         .take(MANY_PROBLEMS)
         .map(|(n, id)| {
-            let id: String = id.chars().take(80).collect();
             let what = format!(
                 "{}:{n}: `{}` is not a clip id; expected a file name without folder",
                 file.display(),
-                id.escape_debug()
+                excerpt(id)
             );
             Problem::new(ProblemKind::Text, what)
         })
@@ -482,7 +505,7 @@ fn left_out((line, oddity): (usize, Oddity)) -> SkipReason {
     }
 }
 
-fn read_statistic(file: &Path, skeleton: &Skeleton, positive: bool) -> Result<Vec<f32>, Problem> {
+fn read_statistic(file: &DataPath, skeleton: &Skeleton, positive: bool) -> Result<Vec<f32>, Problem> {
     let array = npy::read_any_float(file).map_err(|e| {
         let mut problem = Problem::from(e);
         if problem.kind == ProblemKind::Missing {
@@ -502,8 +525,11 @@ fn read_statistic(file: &Path, skeleton: &Skeleton, positive: bool) -> Result<Ve
     Ok(array.data)
 }
 
+/// Clips that are read between two looks at whether to go on.
+const AT_ONCE: usize = 256;
+
 /// Loads all clips, a contiguous part of the list on each core. The result has the order of `ids`.
-fn load_all(root: &Path, ids: &[&str], skeleton: &Skeleton) -> Vec<Loaded> {
+fn load_all(root: &DataPath, ids: &[&str], skeleton: &Skeleton) -> Vec<Loaded> {
     let threads = std::thread::available_parallelism().map_or(1, |n| n.get()).min(8);
     let part = ids.len().div_ceil(threads).max(1);
     std::thread::scope(|scope| {
@@ -515,18 +541,18 @@ fn load_all(root: &Path, ids: &[&str], skeleton: &Skeleton) -> Vec<Loaded> {
     })
 }
 
-fn load(root: &Path, id: &str, skeleton: &Skeleton) -> Loaded {
+fn load(root: &DataPath, id: &str, skeleton: &Skeleton) -> Loaded {
     let (motion_file, text_file) =
         (root.join("new_joint_vecs").join(format!("{id}.npy")), root.join("texts").join(format!("{id}.txt")));
     let motion = match npy::read(&motion_file) {
         Err(e) if e.is_missing() => return Loaded::Skip(SkipReason::NoMotion),
         motion => motion.map_err(Problem::from),
     };
-    let text = match files::read(&text_file, limits::CAPTIONS_BYTES) {
+    let text = match text_file.read(limits::CAPTIONS_BYTES) {
         Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Loaded::Skip(SkipReason::NoText),
-        text => parse_text(&text_file, text),
+        text => parse_text(text_file.shown(), text),
     };
-    let motion = motion.and_then(|array| check_motion(&motion_file, array, skeleton));
+    let motion = motion.and_then(|array| check_motion(motion_file.shown(), array, skeleton));
     let (array, texts) = match (motion, text) {
         (Ok(motion), Ok(texts)) => (motion, texts),
         (motion, text) => {

@@ -6,6 +6,7 @@
 //! datasets give equal bytes: clips keep their order, and neither file has a map with an order of its own.
 
 use std::borrow::Cow;
+use std::collections::BTreeSet;
 
 use bytes::Bytes;
 use protocol::stage::DataFormat;
@@ -55,6 +56,13 @@ struct Index {
     clips: Vec<ClipRow>,
     captions: Vec<Caption>,
     entries: Vec<Entry>,
+}
+
+impl Index {
+    fn fetched(fetch: &dyn Fn(&str) -> Result<Bytes, String>) -> Result<Self, PackError> {
+        let bytes = fetch(INDEX).map_err(|why| PackError::Fetch { file: INDEX.into(), why })?;
+        serde_json::from_slice(&bytes).map_err(|e| PackError::Content { file: INDEX.into(), what: e.to_string() })
+    }
 }
 
 #[derive(Serialize, Deserialize)]
@@ -152,10 +160,20 @@ impl Dataset {
 
     /// Reads only the captions, without fetching a clip.
     pub fn captions_from_files(fetch: &dyn Fn(&str) -> Result<Bytes, String>) -> Result<Vec<Caption>, PackError> {
-        let bytes = fetch(INDEX).map_err(|why| PackError::Fetch { file: INDEX.into(), why })?;
-        let index: Index = serde_json::from_slice(&bytes)
-            .map_err(|e| PackError::Content { file: INDEX.into(), what: e.to_string() })?;
-        Ok(index.captions)
+        Ok(Index::fetched(fetch)?.captions)
+    }
+
+    /// The captions of training entries alone, without fetching a clip.
+    ///
+    /// # Errors
+    /// If the index cannot be fetched or does not read.
+    pub fn training_captions_from_files(
+        fetch: &dyn Fn(&str) -> Result<Bytes, String>,
+    ) -> Result<Vec<Caption>, PackError> {
+        let index = Index::fetched(fetch)?;
+        let training = index.entries.iter().filter(|entry| entry.split == super::Split::Train);
+        let numbers: BTreeSet<usize> = training.flat_map(|entry| entry.captions.iter().copied()).collect();
+        Ok(numbers.into_iter().filter_map(|number| index.captions.get(number).cloned()).collect())
     }
 
     /// Reads the files of [`Dataset::write_files`]; `fetch` returns a file's content by its name. Features borrow that
@@ -163,7 +181,7 @@ impl Dataset {
     pub fn from_files(fetch: &dyn Fn(&str) -> Result<Bytes, String>) -> Result<Self, PackError> {
         let get = |file: &str| fetch(file).map_err(|why| PackError::Fetch { file: file.into(), why });
         let bad = |file: &str, what: String| PackError::Content { file: file.into(), what };
-        let index: Index = serde_json::from_slice(&get(INDEX)?).map_err(|e| bad(INDEX, e.to_string()))?;
+        let index = Index::fetched(fetch)?;
         if index.version != 1 {
             return Err(bad(INDEX, format!("version {}, expected 1; made by a newer program?", index.version)));
         }

@@ -144,7 +144,7 @@ pub(super) fn check_references(stages: &[PipelineStage], found: &mut ByStage) {
                     );
                 }
                 None => {
-                    let near = super::diagnostic::nearest(input.stage.as_str(), giving().take(10 * LISTED));
+                    let near = crate::spelling::nearest(input.stage.as_str(), giving().take(10 * LISTED));
                     let question = near.map(|near| format!("; did you mean `{near}`?")).unwrap_or_default();
                     let message =
                         format!("`{}` names the stage `{}`, which does not exist{question}", input.field, input.stage);

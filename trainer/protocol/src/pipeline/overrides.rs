@@ -2,10 +2,11 @@
 
 use serde_json::Value;
 
-use super::diagnostic::{Position, nearest};
+use super::diagnostic::Position;
 use super::schema::list_keys;
 use super::yaml::{self, Budget, Content, Entry, Node};
 use crate::limits;
+use crate::spelling::nearest;
 
 /// Top-level keys of a pipeline.
 pub(super) const TOP_KEYS: [&str; 6] = ["name", "seed", "backend", "dataset", "text", "stages"];

@@ -156,6 +156,7 @@ const RANGES: &[(&str, Range, &str)] = &[
     ("workers.max", Whole(0, 10_000), "workers"),
     ("checkpoint.every", Whole(0, 1_000_000_000), "steps"),
     ("checkpoint.keep.latest", Whole(1, 10_000), "checkpoints"),
+    ("checkpoint.keep.ended", Whole(0, 10_000), "checkpoints"),
     ("checkpoint.keep.best", Whole(0, 10_000), "checkpoints"),
 ];
 

@@ -8,7 +8,7 @@ use serde_json::Value;
 
 use super::definition::{Pipeline, PipelineStage};
 use super::described::described;
-use super::diagnostic::{Diagnostic, Diagnostics, Position, nearest, window};
+use super::diagnostic::{Diagnostic, Diagnostics, Position, window};
 use super::overrides::{self, TOP_KEYS};
 use super::reader::Reader;
 use super::rules::{self, Problem};
@@ -17,6 +17,7 @@ use super::yaml::{self, Budget, Content, Entry, Node};
 use super::{graph, sweep_rules, trial};
 use crate::id::{is_name, is_stage_name};
 use crate::limits;
+use crate::spelling::nearest;
 use crate::stage::{Backend, DataOpen, DataSynthetic, Placement, StageSettings, TextEmbed};
 use crate::sweep::Sweep;
 use crate::{Seed, StageName};
@@ -71,6 +72,24 @@ pub(super) fn described_head() -> Value {
     described(&Head::default())
 }
 
+/// Removes the keys that the file gives `dataset` and that its format does not have, after an override of the format: another
+/// format has no use for `path`.
+fn forget_keys_of_another_format(root: &mut Node) {
+    let Content::Map(entries) = &mut root.value else { return };
+    let dataset = entries.iter_mut().find(|entry| entry.key == "dataset");
+    let Some(Entry { value: Node { value: Content::Map(keys), .. }, .. }) = dataset else { return };
+    let format = keys.iter().find(|entry| entry.key == "format").and_then(|entry| entry.value.as_text());
+    let settings = match format {
+        Some("synthetic") => StageSettings::DataSynthetic(DataSynthetic::default()),
+        Some("humanml3d" | "kit") => StageSettings::DataOpen(DataOpen::default()),
+        _ => return,
+    };
+    let known = settings.example();
+    let known = |key: &str| key == "format" || known.get(key).is_some();
+    // Overrides stay: an unknown key that a user has just typed is a mistake to report.
+    keys.retain(|entry| known(&entry.key) || entry.key_at.source != 0 || entry.value.at.source != 0);
+}
+
 /// A stage as written in the file.
 struct Written {
     name: StageName,
@@ -108,6 +127,9 @@ impl Reader {
             if let Err(message) = overrides::apply(&mut root, set, i + 1, &mut budget) {
                 self.mistake(Position { source: i + 1, line: 1, column: 1 }, "", message, None);
             }
+        }
+        if sets.iter().any(|set| set.split('=').next().is_some_and(|key| key.trim() == "dataset.format")) {
+            forget_keys_of_another_format(&mut root);
         }
         let head = self.head(&root);
         let (written, stages) = self.stages(&root);

@@ -3,9 +3,10 @@
 use serde::Serialize;
 use serde_json::Value;
 
-use super::diagnostic::{Position, nearest};
+use super::diagnostic::Position;
 use super::schema::{Mistake, list_keys, overlay};
 use super::yaml::Node;
+use crate::spelling::nearest;
 use crate::stage::StageSettings;
 
 pub(super) struct Reader {

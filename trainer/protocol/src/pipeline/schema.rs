@@ -7,8 +7,8 @@
 use serde::de::DeserializeOwned;
 use serde_json::Value;
 
-use super::diagnostic::nearest;
 use super::yaml::{Content, Node};
+use crate::spelling::nearest;
 
 /// A mistake at a position of the tree.
 #[derive(Debug)]

@@ -7,6 +7,7 @@ use super::graph::{self, ByStage};
 use super::rules::{self, Problem, Problems};
 use super::schema::list_keys;
 use crate::limits;
+use crate::spelling::nearest;
 use crate::stage::{Placement, StageSettings};
 use crate::sweep::{self, Domain, MAX_TRIALS, Rungs, SearchKind, Sweep, Values, evaluated_field};
 use crate::{ArtifactKind, StageName};
@@ -39,7 +40,10 @@ pub(super) fn rules(stage: &PipelineStage) -> Vec<Problem> {
         let message =
             format!("`{}` does not give `{}`, by which trials are compared", sweep.evaluate.kind(), sweep.metric);
         let names = given.iter().filter(|name| !name.ends_with(".lower") && !name.ends_with(".upper"));
-        p.add("sweep.metric", message, &format!("name one of {}", list_keys(names.map(String::as_str))));
+        let near = nearest(&sweep.metric, names.clone().map(String::as_str));
+        let meant = near.map(|near| format!("did you mean `{near}`? ")).unwrap_or_default();
+        let help = format!("{meant}name one of {}", list_keys(names.map(String::as_str)));
+        p.add("sweep.metric", message, &help);
     }
     if !(1..=1000).contains(&sweep.parallel) {
         p.add("sweep.parallel", format!("`parallel` is {}; expected 1 to 1000", sweep.parallel), "");

@@ -543,7 +543,7 @@ fn how_checkpoints_are_kept_is_no_part_of_a_stage_s_key() {
     );
     let (plain, kept) = (read("p.yaml", GOOD, &[]).unwrap(), read("p.yaml", &kept, &[]).unwrap());
     let vae = |pipeline: &Pipeline| pipeline.stage(&"vae".into()).unwrap().clone();
-    let expected = Keep { latest: 2, best: 2, metric: "joint".into(), mode: Mode::Max };
+    let expected = Keep { latest: 2, ended: 0, best: 2, metric: "joint".into(), mode: Mode::Max };
     assert_eq!(vae(&kept).placement.checkpoint.keep, expected);
     let inputs = BTreeMap::from([("dataset".to_owned(), Digest::of(b"d"))]);
     assert_eq!(plain.identity(&vae(&plain), &inputs), kept.identity(&vae(&kept), &inputs));

@@ -9,7 +9,7 @@ use super::StageSettings;
 use crate::{Digest, Seed, StageName};
 
 /// Backend that computes. Part of a stage's key: other backends give other bits.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Backend {
     /// Burn's pure-Rust CPU backend, with our fused kernels.

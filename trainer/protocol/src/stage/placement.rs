@@ -73,12 +73,15 @@ impl Default for CheckpointPolicy {
     }
 }
 
-/// Checkpoints of a task to keep; the union of both rules.
+/// Checkpoints of a task to keep: the union of the newest and the best.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct Keep {
     /// Number of newest checkpoints to keep.
     pub latest: usize,
+    /// Number of newest checkpoints to keep once the stage has ended and its value is stored. `trainer run --verify`
+    /// begins at them; 2 lets it check the last interval.
+    pub ended: usize,
     /// Number of best checkpoints by `metric` to keep.
     pub best: usize,
     /// A value that the stage saves with its checkpoints; each is a mean of recorded values over the last hundred
@@ -90,7 +93,7 @@ pub struct Keep {
 
 impl Default for Keep {
     fn default() -> Self {
-        Self { latest: 2, best: 0, metric: "loss".into(), mode: Mode::Min }
+        Self { latest: 2, ended: 0, best: 0, metric: "loss".into(), mode: Mode::Min }
     }
 }
 
@@ -99,6 +102,15 @@ impl Keep {
     /// the newer. A value that is not finite is never best. All are kept if none has the metric, because the best is
     /// unknown.
     pub fn kept(&self, oldest_first: &[&BTreeMap<String, f64>]) -> Vec<bool> {
+        self.newest_and_best(oldest_first, self.latest.max(1))
+    }
+
+    /// Checkpoints to keep once the stage's value is stored: as [`Self::kept`], with `ended` newest ones, which may be none.
+    pub fn kept_at_end(&self, oldest_first: &[&BTreeMap<String, f64>]) -> Vec<bool> {
+        self.newest_and_best(oldest_first, self.ended)
+    }
+
+    fn newest_and_best(&self, oldest_first: &[&BTreeMap<String, f64>], newest: usize) -> Vec<bool> {
         let count = oldest_first.len();
         if self.best > 0 && count > 0 && oldest_first.iter().all(|metrics| !metrics.contains_key(&self.metric)) {
             return vec![true; count];
@@ -109,7 +121,7 @@ impl Keep {
         let mut ranked: Vec<(f64, usize)> =
             oldest_first.iter().enumerate().filter_map(|(i, metrics)| Some((value(metrics)?, i))).collect();
         ranked.sort_by(|a, b| a.0.total_cmp(&b.0).then(b.1.cmp(&a.1)));
-        let mut kept: Vec<bool> = (0..count).map(|i| i + self.latest.max(1) >= count).collect();
+        let mut kept: Vec<bool> = (0..count).map(|i| i + newest >= count).collect();
         ranked.iter().take(self.best).for_each(|(_, i)| kept[*i] = true);
         kept
     }
@@ -164,14 +176,17 @@ mod tests {
                 .collect();
             let mode = if dice(&mut state).is_multiple_of(2) { Mode::Min } else { Mode::Max };
             let (latest, best) = (dice(&mut state) as usize % 4, dice(&mut state) as usize % 4);
-            let keep = Keep { latest, best, metric: "joint".into(), mode };
-            let kept = keep.kept(&rows.iter().collect::<Vec<_>>());
+            let ended = dice(&mut state) as usize % 3;
+            let keep = Keep { latest, ended, best, metric: "joint".into(), mode };
+            let is_over = dice(&mut state).is_multiple_of(2);
+            let rows_in_order = rows.iter().collect::<Vec<_>>();
+            let kept = if is_over { keep.kept_at_end(&rows_in_order) } else { keep.kept(&rows_in_order) };
             assert_eq!(kept.len(), count);
             if best > 0 && rows.iter().all(|row| !row.contains_key("joint")) {
                 assert!(kept.iter().all(|kept| *kept), "nothing is lost by a metric that is not there");
                 continue;
             }
-            let newest = count.saturating_sub(latest.max(1));
+            let newest = count.saturating_sub(if is_over { ended } else { latest.max(1) });
             assert!(kept[newest..].iter().all(|kept| *kept), "{keep:?} {rows:?} {kept:?}");
             // A slow reference: a checkpoint is among the best if fewer than `best` are better, or equal and newer.
             let finite = |i: usize| rows[i].get("joint").copied().filter(|v| v.is_finite());

@@ -157,6 +157,16 @@ impl Family {
         matches!(self, Self::Lcm { .. } | Self::Pcm { .. })
     }
 
+    /// The range of guidance that a student was trained for, if `guidance` lies outside of it.
+    pub fn exceeded_range(&self, guidance: f64) -> Option<(f64, f64)> {
+        match self {
+            Self::Lcm { guidance: (low, high), .. } | Self::Pcm { guidance: (low, high), .. } => {
+                (!(*low..=*high).contains(&guidance)).then_some((*low, *high))
+            }
+            Self::Mld | Self::Autoregressive | Self::Masked | Self::Mmm | Self::Features { .. } => None,
+        }
+    }
+
     /// Returns true if it generates tokens.
     pub fn draws_tokens(&self) -> bool {
         matches!(self, Self::Autoregressive | Self::Masked | Self::Mmm)
@@ -343,6 +353,14 @@ mod tests {
         for family in [Family::Mld, lcm, pcm, mdm, Family::Autoregressive, Family::Masked, Family::Mmm] {
             assert_eq!(family.accepts(&family.published()), Ok(()), "{family:?}");
         }
+    }
+
+    #[test]
+    fn guidance_outside_of_a_student_s_training_is_known() {
+        let lcm = Family::Lcm { skip: 100, guidance: (0.5, 5.0) };
+        assert_eq!([0.5, 2.0, 5.0].map(|guidance| lcm.exceeded_range(guidance)), [None; 3]);
+        assert_eq!([0.0, 40.0].map(|guidance| lcm.exceeded_range(guidance)), [Some((0.5, 5.0)); 2]);
+        assert_eq!(Family::Mld.exceeded_range(40.0), None, "a teacher has no range");
     }
 
     #[test]

@@ -13,7 +13,7 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 use super::{DataFormat, Family, LatentShape, Neighbours, Problems, Sampler, Training};
-use crate::ArtifactKind;
+use crate::{ArtifactKind, Steps};
 
 /// Distribution of a stage's work over workers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -103,6 +103,30 @@ pub trait StageSpec:
     /// rank by them.
     fn recorded(&self) -> &'static [&'static str] {
         &[]
+    }
+
+    /// Steps at which the loss becomes another sum, so that its values before and after do not compare.
+    fn loss_changes(&self) -> Vec<LossChange> {
+        Vec::new()
+    }
+}
+
+/// A step at which a training's loss becomes another sum.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct LossChange {
+    /// The first step with the new loss, counted from 0.
+    pub at: u64,
+    /// A sentence on the new loss, such as `the terms on joints join the loss`.
+    pub what: &'static str,
+    /// The setting that says when.
+    pub setting: &'static str,
+}
+
+impl LossChange {
+    /// The change behind `share` of `steps`, if it lies within them.
+    pub(super) fn behind(share: f64, steps: Steps, what: &'static str, setting: &'static str) -> Option<Self> {
+        let at = (steps.0 as f64 * share).round() as u64;
+        (0 < at && at < steps.0).then_some(Self { at, what, setting })
     }
 }
 
@@ -227,6 +251,7 @@ pub(super) trait AnySpec: Any {
     fn sampler(&self) -> Option<&Sampler>;
     fn metrics(&self) -> Option<BTreeSet<String>>;
     fn recorded(&self) -> &'static [&'static str];
+    fn loss_changes(&self) -> Vec<LossChange>;
 }
 
 impl<S: StageSpec> AnySpec for S {
@@ -292,6 +317,10 @@ impl<S: StageSpec> AnySpec for S {
 
     fn recorded(&self) -> &'static [&'static str] {
         StageSpec::recorded(self)
+    }
+
+    fn loss_changes(&self) -> Vec<LossChange> {
+        StageSpec::loss_changes(self)
     }
 }
 

@@ -1,4 +1,5 @@
-//! Which sentence a stream is at, how its frames are numbered and written, and what is measured of it. Does no input or output.
+//! State of a stream: its current sentence, the numbering and encoding of its frames, and its measurements. Does no
+//! input or output.
 
 use std::fmt::Write as _;
 use std::time::{Duration, Instant};
@@ -10,7 +11,7 @@ use stages::stream::{Ask, Segment};
 use super::line::Line;
 use super::report::Meter;
 
-/// The course of one stream.
+/// State of one stream.
 #[derive(Debug)]
 pub(super) struct Course {
     skeleton: &'static Skeleton,
@@ -19,9 +20,9 @@ pub(super) struct Course {
     line: Option<Line>,
     /// The sentence as JSON.
     caption: String,
-    /// Frames that the sentence has had.
+    /// Frames given out for the sentence.
     at: usize,
-    /// Since when its first frame is waited for.
+    /// Start of the wait for its first frame.
     asked: Option<Instant>,
     segment: u64,
     last: Option<Instant>,
@@ -33,37 +34,37 @@ impl Course {
         Self { skeleton, bound, line: None, caption: String::new(), at: 0, asked: None, segment: 0, last: None, meter }
     }
 
-    /// The next sentence, for a stream whose root stands at `root`.
+    /// Starts the next sentence, for a stream whose root is at `root`.
     ///
     /// # Errors
-    /// A first waypoint too far from there; the sentence before goes on.
+    /// If the first waypoint is too far from there; the previous sentence then continues.
     pub(super) fn take(&mut self, line: Line, root: [f64; 3]) -> Result<(), String> {
         waypoints::check_start(&line.waypoints, self.skeleton, root)
             .map_err(|why| format!("line {}: {why}", line.number))?;
         self.caption = serde_json::Value::from(line.caption.as_str()).to_string();
-        // A sentence that waited for its turn is not late before that.
+        // The time in the queue does not count as delay.
         self.asked = Some(self.last.map_or(line.read, |last| last.max(line.read)));
         self.at = 0;
         self.line = Some(line);
         Ok(())
     }
 
-    /// Whether there is a sentence yet.
+    /// Returns true once there is a sentence.
     pub(super) fn has_begun(&self) -> bool {
         self.line.is_some()
     }
 
-    /// Whether the sentence said how long it goes on, and has not yet.
+    /// Returns true if the sentence has a length and has not reached it.
     pub(super) fn is_pinned(&self) -> bool {
         self.line.as_ref().and_then(|line| line.frames).is_some_and(|frames| self.at < frames)
     }
 
-    /// Whether there are as many frames as there may be.
+    /// Returns true if the stream has reached its limit of frames.
     pub(super) fn is_over(&self) -> bool {
         self.bound.is_some_and(|bound| self.meter.frames() >= bound)
     }
 
-    /// What comes next.
+    /// The request for the next segment.
     pub(super) fn ask(&self) -> Ask {
         let Some(line) = &self.line else { return Ask::default() };
         let frames = line.frames.and_then(|frames| frames.checked_sub(self.at)).filter(|frames| *frames > 0);
@@ -72,23 +73,23 @@ impl Course {
         Ask { caption: line.caption.clone(), frames, waypoints }
     }
 
-    /// The sentence, and its waypoints by the stream's frames.
-    pub(super) fn told(&self) -> impl Iterator<Item = (u64, Waypoint)> {
+    /// The waypoints of the sentence by frames of the stream.
+    pub(super) fn waypoints(&self) -> impl Iterator<Item = (u64, Waypoint)> {
         let first = self.meter.frames() - self.at as u64;
         let waypoints = self.line.iter().flat_map(|line| &line.waypoints);
         waypoints.map(move |waypoint| (first + waypoint.frame as u64, *waypoint))
     }
 
-    /// What was asked for was drawn within `took`.
+    /// Records a segment that was generated within `took`.
     pub(super) fn drawn(&mut self, segment: &Segment, took: Duration) {
         self.segment += 1;
         self.meter.segment(segment, took);
     }
 
-    /// Frame `k` of the last segment, as a line of JSON behind what `text` holds.
+    /// Appends frame `k` of the last segment to `text` as a line of JSON.
     pub(super) fn write(&self, text: &mut String, segment: &Segment, k: usize) {
         let (frame, line) = (self.meter.frames(), self.line.as_ref().map_or(0, |line| line.number));
-        // Writing to a string does not fail.
+        // Writing to a string never fails.
         let _ = write!(
             text,
             "{{\"frame\":{frame},\"time\":{:.3},\"segment\":{},\"line\":{line},\"sentence\":{},\"joints\":[",
@@ -103,7 +104,7 @@ impl Course {
         text.push_str("]}");
     }
 
-    /// Frame `k` of the last segment has been given out.
+    /// Records that frame `k` of the last segment was given out.
     pub(super) fn given(&mut self, segment: &Segment, k: usize) {
         let asked = self.asked.take();
         self.meter.frame(self.joints(segment, k), k == 0, asked);
@@ -118,7 +119,7 @@ impl Course {
     }
 }
 
-/// When frames are due.
+/// Schedule of the frames.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Pace {
     /// Frames per second.
@@ -132,7 +133,8 @@ impl Pace {
         Self { rate, begun: None, frames: 0 }
     }
 
-    /// How long to wait for the next frame. What was late is made up for, so that the stream as a whole keeps its rate.
+    /// Time to wait for the next frame. Later frames make up for a late one, so that the stream as a whole keeps its
+    /// rate.
     pub(super) fn wait(&mut self, now: Instant) -> Duration {
         let due = *self.begun.get_or_insert(now) + Duration::from_secs_f64(self.frames as f64 / self.rate);
         self.frames += 1;
@@ -178,10 +180,10 @@ mod tests {
         assert_eq!((&value["line"], &value["sentence"]), (&7.into(), &"say \"hi\"".into()));
         assert_eq!((value["joints"].as_array().unwrap().len(), &value["joints"][0][2]), (22, &8.5.into()));
         (0..3).for_each(|k| course.given(&drawn, k));
-        // The rest of it, with what lies ahead by its own frames.
+        // The rest of the sentence, with the remaining waypoints counted from its first frame.
         let ask = course.ask();
         assert!(course.is_pinned() && ask.frames == Some(2) && ask.waypoints.len() == 1 && ask.waypoints[0].frame == 1);
-        assert_eq!(course.told().map(|(frame, _)| frame).collect::<Vec<_>>(), [1, 4]);
+        assert_eq!(course.waypoints().map(|(frame, _)| frame).collect::<Vec<_>>(), [1, 4]);
         course.drawn(&drawn, Duration::from_millis(1));
         (0..2).for_each(|k| course.given(&drawn, k));
         assert!(!course.is_pinned() && course.ask().frames.is_none() && !course.is_over());

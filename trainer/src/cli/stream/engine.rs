@@ -1,5 +1,5 @@
-//! One model on one thread, which draws for all streams of a process by turns. A stream waits for its segment before it asks for another one, so there are
-//! never more jobs than streams, and they come round in order.
+//! One model on one thread, which generates segments for all streams of a process in turn. A stream waits for its
+//! segment before it requests another one. So there are never more jobs than streams, and they take turns.
 
 use std::thread;
 use std::time::{Duration, Instant};
@@ -10,24 +10,24 @@ use tokio::sync::{mpsc, oneshot};
 use super::opening::{Beginning, Opening};
 use crate::problem::{Problem, Result};
 
-/// A segment with the time that it took, or why there is none.
+/// A segment with the time that it took, or the reason of the failure.
 type Drawn = std::result::Result<(Segment, Duration), String>;
 
-/// A segment to draw.
+/// A request for a segment.
 struct Job {
     stream: MotionStream,
     ask: Ask,
     reply: oneshot::Sender<(MotionStream, Drawn)>,
 }
 
-/// Where segments are drawn.
+/// Handle of the thread that generates segments.
 #[derive(Debug, Clone)]
 pub(super) struct Engine {
     jobs: mpsc::Sender<Job>,
 }
 
 impl Engine {
-    /// Loads the model on a thread of its own, for `streams` at once.
+    /// Loads the model on its own thread, for at most `streams` streams.
     pub(super) async fn start(
         opening: Opening,
         (overlap, blend): (Option<u16>, u16),
@@ -38,7 +38,7 @@ impl Engine {
         let work = move || {
             let generator = match opening.open(overlap, blend) {
                 Ok((generator, beginning)) => {
-                    // Nobody waits for it only if the process ends.
+                    // The receiver is gone only if the process ends.
                     let _ = ready.send(Ok(beginning));
                     generator
                 }
@@ -48,7 +48,7 @@ impl Engine {
                 }
             };
             while let Some(Job { mut stream, ask, reply }) = asked.blocking_recv() {
-                // Who has left is drawn for no more.
+                // Skip clients that have left.
                 if reply.is_closed() {
                     continue;
                 }
@@ -64,7 +64,7 @@ impl Engine {
         Ok((Self { jobs }, beginning))
     }
 
-    /// The stream behind its next segment, and that; `None` if the thread is gone.
+    /// Generates the next segment of `stream` and returns both; `None` if the thread is gone.
     pub(super) async fn draw(&self, stream: MotionStream, ask: Ask) -> Option<(MotionStream, Drawn)> {
         let (reply, drawn) = oneshot::channel();
         self.jobs.send(Job { stream, ask, reply }).await.ok()?;

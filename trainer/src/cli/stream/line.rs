@@ -1,4 +1,4 @@
-//! A line of a stream's input: a sentence, with a length and waypoints if wanted.
+//! A line of a stream's input: a sentence, optionally with a length and waypoints.
 
 use std::io::{BufRead, Read as _};
 use std::time::Instant;
@@ -8,60 +8,60 @@ use motion::Skeleton;
 use motion::waypoints::{self, Waypoint};
 use serde_json::{Map, Value};
 
-/// Bytes of a line.
+/// Limit of a line in bytes.
 pub(super) const MOST_BYTES: usize = 64 << 10;
-/// Sentences that wait for their turn; more are not read.
+/// Limit of queued sentences; more are not read.
 pub(super) const QUEUE: usize = 64;
 
-/// A sentence.
+/// A sentence of a stream.
 #[derive(Debug, Clone)]
 pub(super) struct Line {
-    /// Its line of the input, or its number on a connection, from 1.
+    /// Line number in the input or message number on a connection, from 1.
     pub(super) number: u64,
     pub(super) caption: String,
-    /// How long it goes on at least.
+    /// Minimum length.
     pub(super) frames: Option<usize>,
-    /// Metres of the stream's world; its own first frame is frame 0.
+    /// In metres of the stream's world; the sentence's first frame is frame 0.
     pub(super) waypoints: Vec<Waypoint>,
-    /// When it was there.
+    /// Time at which the line was read.
     pub(super) read: Instant,
 }
 
-/// What lines are read for.
+/// Context of parsing a line.
 #[derive(Debug, Clone)]
 pub(super) struct Form {
     pub(super) skeleton: &'static Skeleton,
-    /// Joints that waypoints are of if they name none, and those that count of others; empty is the root, and all.
+    /// Default joints of waypoints, and the joints used of other motions. If empty, the root and all joints.
     pub(super) joints: Vec<String>,
-    /// Whether the model can be told where to go.
+    /// True if the model has a control part.
     pub(super) controlled: bool,
 }
 
-/// Reads a line: text as in a file of sentences (`a person walks#4.5s`), or an object with `caption`, `frames` or `seconds`, and `waypoints` as in a
-/// `.json` of waypoints.
+/// Parses a line. It is text as in a file of sentences (`a person walks#4.5s`), or an object with `caption`, `frames`
+/// or `seconds`, and `waypoints` as in a `.json` of waypoints.
 ///
 /// # Errors
-/// What is wrong with it, with its number.
+/// The mistake, with the line's number.
 pub(super) fn parse(number: u64, text: &str, form: &Form) -> Result<Line, String> {
     let name = format!("line {number}");
     let refuse = |what: String| format!("{name}: {what}");
     let text = text.trim().trim_start_matches('\u{feff}');
-    let mut told = None;
+    let mut waypoints_value = None;
     let request = if text.starts_with('{') {
         let mut fields: Map<String, Value> =
             serde_json::from_str(text).map_err(|error| refuse(format!("is no JSON object: {error}")))?;
-        told = fields.remove("waypoints");
+        waypoints_value = fields.remove("waypoints");
         requests::parse("line", &Value::Object(fields).to_string(), true)
     } else {
         requests::parse("line", text, text.starts_with('"'))
     };
-    // It is the only line of what is parsed.
+    // The parsed text has only this line.
     let mut requests = request.map_err(|error| refuse(error.to_string().replacen("line:1: ", "", 1)))?;
     let request = requests.pop().ok_or_else(|| refuse("holds no sentence".into()))?;
     let skeleton = form.skeleton;
     let mut frames = request.length.map(|length: Length| length.frames(skeleton.fps));
     let mut waypoints = Vec::new();
-    if let Some(value) = told {
+    if let Some(value) = waypoints_value {
         if !form.controlled {
             return Err(refuse(
                 "has waypoints, but the model has no control part, and so cannot be told where to go".into(),
@@ -83,10 +83,10 @@ pub(super) fn parse(number: u64, text: &str, form: &Form) -> Result<Line, String
     Ok(Line { number, caption: request.caption, frames, waypoints, read: Instant::now() })
 }
 
-/// The next line, however it ends; `None` at the end of the input.
+/// Reads the next line, with or without a line ending; `None` at the end of the input.
 ///
 /// # Errors
-/// It is too long or no text, or the input fails.
+/// If the line is too long or no text, or if reading fails.
 pub(super) fn next(input: &mut impl BufRead) -> Option<Result<String, String>> {
     let mut bytes = Vec::new();
     match input.by_ref().take(MOST_BYTES as u64 + 1).read_until(b'\n', &mut bytes) {
@@ -117,14 +117,15 @@ mod tests {
         assert_eq!(read("walks#4.5s"), ("walks".into(), Some(90), 0));
         assert_eq!(read("\"walks\""), ("walks".into(), None, 0));
         assert_eq!(read(r#"{"caption": "walks", "seconds": 2}"#), ("walks".into(), Some(40), 0));
-        let told = r#"{"caption": "walks", "waypoints": [[0, 0, 0.9, 0], [1.5, 0, 0.9, 1]]}"#;
-        assert_eq!(read(told), ("walks".into(), Some(31), 2), "as long as its path");
+        let controlled = r#"{"caption": "walks", "waypoints": [[0, 0, 0.9, 0], [1.5, 0, 0.9, 1]]}"#;
+        assert_eq!(read(controlled), ("walks".into(), Some(31), 2), "as long as its path");
         let longer = r#"{"caption": "w", "seconds": 4, "waypoints": {"left_wrist": [[1, 0, 1, 1]]}}"#;
         assert_eq!(read(longer), ("w".into(), Some(80), 1));
     }
 
     #[test]
     fn mistakes_are_named_with_the_line() {
+        protocol::show_excerpts();
         for (text, controlled, words) in [
             ("walks#soon", true, &["line 3: `soon` is no length"][..]),
             ("{\"caption\": \"a\"", true, &["line 3: is no JSON object"]),
@@ -158,7 +159,7 @@ mod tests {
     }
 
     proptest::proptest! {
-        /// A line is read or explained.
+        /// Every line is parsed or refused with a reason.
         #[test]
         fn no_text_breaks_the_reader(text in "(\\{\"caption\":\"a\",\"waypoints\":)?(?s).{0,120}") {
             let _ = parse(1, &text, &form(true)).map_err(|why| assert!(why.starts_with("line 1: "), "{why}"));

@@ -1,12 +1,21 @@
-//! Streams over WebSockets: `GET /v1/stream` with a token of scope `read`, then a message a sentence in, a message a frame out.
+//! Streams over WebSockets: `GET /v1/stream` with a token of scope `read`, then one message per sentence in, one
+//! message per frame out.
 //!
-//! Nothing is computed before the token is checked and a place is free. What a client may cost is bounded: places, the size of a message, sentences
-//! that wait (more are not read, so that TCP holds the sender back), one segment of frames (the next is drawn when it has been sent), the time that a frame may take to
-//! be sent and that the first sentence may take to come. A message that is no sentence is answered by `{"error": ...}`, and the sentence before goes on.
-//! The last message is `{"end": REPORT}`.
+//! Nothing is computed before the token is checked and a place is free. A connection takes its place with its first
+//! sentence. Silent connections hold no place and are few: the oldest of them is closed for a new one.
+//!
+//! The cost of a client is bounded in these ways:
+//! - the number of places and the size of a message;
+//! - waiting sentences: more are not read, so that TCP slows the sender down;
+//! - generated frames: the next segment is generated when the last one has been sent;
+//! - the time to send a frame, and the time until the first sentence.
+//!
+//! A message that is no sentence is answered with `{"error": ...}`, and the previous sentence continues. The last
+//! message is `{"end": REPORT}`.
 
 use std::borrow::Cow;
-use std::sync::Arc;
+use std::collections::VecDeque;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use access::{Scope, Tokens};
@@ -15,14 +24,14 @@ use axum::extract::ws::{CloseFrame, Message, WebSocket, WebSocketUpgrade, close_
 use axum::http::StatusCode;
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
-use coordinator::Door;
+use coordinator::RouteServer;
 use futures::stream::{SplitSink, SplitStream};
 use futures::{SinkExt, StreamExt};
 use protocol::message::ApiError;
 use serde_json::json;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::mpsc::error::TryRecvError;
-use tokio::sync::{Semaphore, mpsc, watch};
+use tokio::sync::{Notify, OwnedSemaphorePermit, Semaphore, mpsc, watch};
 use tokio::task::JoinHandle;
 use tokio::time::{sleep, timeout};
 
@@ -35,18 +44,20 @@ use super::report::Real;
 use crate::print;
 use crate::problem::{Problem, Result, exit};
 
-/// Sentences of a connection that wait for their turn.
+/// Limit of a connection's queued sentences.
 const WAITING: usize = 16;
-/// How long a message may take to be sent: a client that reads nothing for so long is dropped.
+/// Time limit to send a message: a client that reads nothing for this long is dropped.
 const SLOW: Duration = Duration::from_secs(10);
-/// How long the first sentence may take to come.
+/// Time limit for the first sentence.
 const SILENCE: Duration = Duration::from_secs(60);
-/// Bytes of messages that wait for the network.
+/// Limit of connections without a sentence.
+const SILENT: usize = 32;
+/// Limit of bytes that wait for the network.
 const WRITE_BYTES: usize = 256 << 10;
 
-/// What all connections share.
+/// State shared by all connections.
 #[derive(Debug)]
-struct Hall {
+struct StreamServer {
     engine: Engine,
     beginning: Beginning,
     real: Option<Real>,
@@ -54,22 +65,47 @@ struct Hall {
     rate: f64,
     places: Arc<Semaphore>,
     streams: usize,
+    silent: Silent,
 }
 
-/// Why a connection ends.
+/// Connections without a sentence, oldest first.
+#[derive(Debug, Default)]
+struct Silent(Mutex<VecDeque<Arc<Notify>>>);
+
+impl Silent {
+    /// Adds a connection and notifies the oldest one to leave if there are too many.
+    fn enter(&self) -> Arc<Notify> {
+        let leave = Arc::new(Notify::new());
+        let mut all = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        if all.len() >= SILENT
+            && let Some(oldest) = all.pop_front()
+        {
+            oldest.notify_one();
+        }
+        all.push_back(Arc::clone(&leave));
+        leave
+    }
+
+    /// Removes a connection that has sent a sentence or has ended.
+    fn leave(&self, which: &Arc<Notify>) {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).retain(|one| !Arc::ptr_eq(one, which));
+    }
+}
+
+/// Reason for the end of a connection.
 enum End {
-    /// The client has left, or reads nothing.
+    /// The client has left or reads nothing.
     Gone,
-    /// There are as many frames as there may be.
+    /// The stream has reached its limit of frames.
     Over,
-    /// Something that the client should know.
-    Told(u16, Cow<'static, str>),
+    /// A message for the client.
+    Close(u16, Cow<'static, str>),
 }
 
 type Sink = SplitSink<WebSocket, Message>;
 type Lines = mpsc::Receiver<std::result::Result<Line, String>>;
 
-/// A task that does not outlive its connection.
+/// A task that is aborted with its connection.
 struct Ends(JoinHandle<()>);
 
 impl Drop for Ends {
@@ -78,7 +114,7 @@ impl Drop for Ends {
     }
 }
 
-/// Answers until it is interrupted.
+/// Serves streams until an interrupt.
 pub(super) async fn listen(
     args: StreamArgs,
     opening: Opening,
@@ -91,33 +127,42 @@ pub(super) async fn listen(
     let (Some(address), Some(file)) = (args.listen, &args.listen_token_file) else {
         return Err(Problem::usage("`--listen` wants an address and `--listen-token-file`"));
     };
-    let config = args.door.config(address, Tokens::read(file)?, insecure)?;
-    // Said before the model is loaded.
-    let door = Door::open(&config).await?;
+    let config = args.endpoint.config(address, Tokens::read(file)?, insecure)?;
+    // Report errors before the model is loaded.
+    let listener = RouteServer::bind(&config).await?;
     let streams = usize::from(args.streams);
     let (engine, beginning) = Engine::start(opening, (args.overlap, args.blend), streams).await?;
     let skeleton = beginning.skeleton();
     let real = args.real.as_deref().map(|path| real::read(path, skeleton)).transpose()?;
     let rate = args.pace.flatten().unwrap_or(skeleton.fps);
-    let scheme = if door.is_encrypted() { "wss" } else { "ws" };
+    let scheme = if listener.is_encrypted() { "wss" } else { "ws" };
     print::note(&format!(
         "{} streams at {scheme}://{}/v1/stream, {rate} frames per second, {streams} streams at once",
         beginning.label,
-        door.address()
+        listener.address()
     ));
     let (bound, places) = (bound(skeleton.fps)?, Arc::new(Semaphore::new(streams)));
-    let hall = Arc::new(Hall { engine: engine.clone(), beginning, real, bound, rate, places, streams });
-    let handler = get(move |upgrade: WebSocketUpgrade| std::future::ready(Arc::clone(&hall).admit(upgrade)));
+    let server = Arc::new(StreamServer {
+        engine: engine.clone(),
+        beginning,
+        real,
+        bound,
+        rate,
+        places,
+        streams,
+        silent: Silent::default(),
+    });
+    let handler = get(move |upgrade: WebSocketUpgrade| std::future::ready(Arc::clone(&server).admit(upgrade)));
     let (_stop, stopped) = watch::channel(false);
     tokio::select! {
-        () = door.serve("/v1/stream", &[Scope::Read], handler, stopped) => Ok(0),
+        () = listener.serve("/v1/stream", &[Scope::Read], handler, stopped) => Ok(0),
         _ = interrupt.recv() => Ok(0),
         _ = terminate.recv() => Ok(0),
         () = engine.gone() => Err(Problem::new(exit::FAULT, anyhow::anyhow!("the model's thread has ended; this is a bug of Stride's"))),
     }
 }
 
-/// Sentences of a connection, each message one or more lines; ends with it.
+/// Reads the sentences of a connection, one or more lines per message, until the connection ends.
 async fn read(
     mut source: SplitStream<WebSocket>,
     lines: mpsc::Sender<std::result::Result<Line, String>>,
@@ -161,19 +206,25 @@ async fn tell(sink: &mut Sink, what: String) -> std::result::Result<(), End> {
     send(sink, json!({"error": what}).to_string()).await
 }
 
-impl Hall {
-    /// Takes a connection in, if there is a place.
+async fn close(sink: &mut Sink, end: End) {
+    let End::Close(code, reason) = end else { return };
+    let close = CloseFrame { code, reason: reason.as_ref().into() };
+    // A client that has left does not receive it.
+    let _ = timeout(SLOW, sink.send(Message::Close(Some(close)))).await;
+}
+
+impl StreamServer {
+    /// Accepts a connection if there is a place.
     fn admit(self: Arc<Self>, upgrade: WebSocketUpgrade) -> Response {
-        let Ok(place) = Arc::clone(&self.places).try_acquire_owned() else {
+        if self.places.available_permits() == 0 {
             let message = format!("this server draws {} streams at once, and does", self.streams);
             let hint = Some("try again when one has ended; `--streams N` takes more".to_owned());
             let error = ApiError { code: "busy".to_owned(), message, hint };
             return (StatusCode::SERVICE_UNAVAILABLE, Json(error)).into_response();
-        };
+        }
         let upgrade = upgrade.max_message_size(MOST_BYTES).max_frame_size(MOST_BYTES);
         upgrade.max_write_buffer_size(WRITE_BYTES).on_upgrade(move |socket| async move {
             self.converse(socket).await;
-            drop(place);
         })
     }
 
@@ -182,31 +233,63 @@ impl Hall {
         let (sender, mut lines) = mpsc::channel(WAITING);
         let _reading = Ends(tokio::spawn(read(source, sender, self.beginning.form.clone())));
         let mut course = self.beginning.course(self.bound, self.real.clone());
-        let end = match self.give(&mut sink, &mut lines, &mut course).await {
+        let leave = self.silent.enter();
+        let first = self.first(&mut sink, &mut lines, &leave).await;
+        self.silent.leave(&leave);
+        let (first, _place) = match first {
+            Ok(begun) => begun,
+            Err(end) => return close(&mut sink, end).await,
+        };
+        let end = match self.give(&mut sink, &mut lines, &mut course, first).await {
             Ok(()) | Err(End::Over) => {
                 let report = json!({"end": course.meter.json()}).to_string();
                 let _ = send(&mut sink, report).await;
                 (close_code::NORMAL, Cow::Borrowed("the stream has ended"))
             }
             Err(End::Gone) => return,
-            Err(End::Told(code, why)) => (code, why),
+            Err(End::Close(code, why)) => (code, why),
         };
-        let (code, reason) = end;
-        let close = CloseFrame { code, reason: reason.as_ref().into() };
-        // Whoever is gone is not told.
-        let _ = timeout(SLOW, sink.send(Message::Close(Some(close)))).await;
+        close(&mut sink, End::Close(end.0, end.1)).await;
     }
 
-    /// Gives frames until the client leaves.
+    /// Waits for the first sentence and takes a place for it.
+    async fn first(
+        &self,
+        sink: &mut Sink,
+        lines: &mut Lines,
+        leave: &Notify,
+    ) -> std::result::Result<(Line, OwnedSemaphorePermit), End> {
+        let silence = sleep(SILENCE);
+        tokio::pin!(silence);
+        let line = loop {
+            let next = tokio::select! {
+                next = lines.recv() => next,
+                () = leave.notified() => return Err(End::Close(close_code::AGAIN, "others wait to begin".into())),
+                () = &mut silence => return Err(End::Close(close_code::POLICY, "no sentence came within a minute".into())),
+            };
+            match next {
+                Some(Ok(line)) => break line,
+                Some(Err(what)) => tell(sink, what).await?,
+                None => return Err(End::Gone),
+            }
+        };
+        let Ok(place) = Arc::clone(&self.places).try_acquire_owned() else {
+            return Err(End::Close(close_code::AGAIN, "every place was taken meanwhile".into()));
+        };
+        Ok((line, place))
+    }
+
+    /// Sends frames until the client leaves.
     async fn give(
         &self,
         sink: &mut Sink,
         lines: &mut Lines,
         course: &mut super::course::Course,
+        first: Line,
     ) -> std::result::Result<(), End> {
         let mut stream = self.beginning.stream.clone();
         let mut pace = Pace::new(self.rate);
-        let mut next = None;
+        let mut next = Some(first);
         let mut text = String::new();
         loop {
             while !course.is_pinned() {
@@ -226,14 +309,14 @@ impl Hall {
                     Err(what) => tell(sink, what).await?,
                 }
             }
-            let over = End::Told(close_code::ERROR, "the server is stopping".into());
+            let over = End::Close(close_code::ERROR, "the server is stopping".into());
             let (back, drawn) = self.engine.draw(stream, course.ask()).await.ok_or(over)?;
             stream = back;
             let (segment, took) = match drawn {
                 Ok(drawn) => drawn,
                 Err(what) => {
                     tell(sink, what).await?;
-                    return Err(End::Told(close_code::ERROR, "the model cannot go on".into()));
+                    return Err(End::Close(close_code::ERROR, "the model cannot go on".into()));
                 }
             };
             course.drawn(&segment, took);
@@ -262,7 +345,7 @@ impl Hall {
         }
     }
 
-    /// A line that is there, or the first one; `None` if the sentence goes on.
+    /// Returns a line that has arrived, or waits for the first one; `None` if the sentence continues.
     async fn line(
         &self,
         lines: &mut Lines,
@@ -278,7 +361,7 @@ impl Hall {
         match timeout(SILENCE, lines.recv()).await {
             Ok(Some(line)) => Ok(Some(line)),
             Ok(None) => Err(End::Gone),
-            Err(_) => Err(End::Told(close_code::POLICY, "no sentence came within a minute".into())),
+            Err(_) => Err(End::Close(close_code::POLICY, "no sentence came within a minute".into())),
         }
     }
 }

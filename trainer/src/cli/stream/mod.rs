@@ -1,4 +1,4 @@
-//! `trainer generate --stream`: sentences in, motion out, without end. Decision 0012.
+//! `trainer generate --stream`: an endless motion from sentences that arrive over time. Decision 0012.
 
 mod course;
 mod engine;
@@ -14,8 +14,8 @@ use crate::problem::Result;
 
 pub(super) use self::opening::{Opening, StreamArgs};
 
-/// Streams until its input or its output ends. `bound` gives the frames at a rate after which it does in any case; `insecure` allows
-/// to listen beyond this machine without TLS.
+/// Streams until its input or its output ends. `bound` returns the frames, at a frame rate, after which the stream ends
+/// in any case. `insecure` allows listening beyond this machine without TLS.
 pub(super) async fn stream(
     args: StreamArgs,
     opening: Opening,

@@ -18,21 +18,21 @@ use super::opening::Beginning;
 use crate::print::{self, Output};
 use crate::problem::{Problem, Result};
 
-/// Frames that are kept for files: an hour of HumanML3D, 19 MB.
+/// Limit of frames kept for files: an hour of HumanML3D, 19 MB.
 const MOST_KEPT: usize = 72_000;
 
-/// A sentence, or why there is none.
+/// A sentence, or the reason of its refusal.
 type Read = std::result::Result<Line, String>;
 
-/// Why a stream ends.
+/// Reason for the end of a stream.
 enum End {
-    /// Its input ended, there are as many frames as there may be, or nobody reads any more.
+    /// The input has ended, the stream has reached its limit of frames, or the output is closed.
     Quiet,
-    /// A line is wrong.
+    /// A line is invalid.
     Line(String),
 }
 
-/// Reads lines beside what is drawn. The thread goes with the process: nothing ends a read.
+/// Reads lines on a separate thread. It ends with the process, because a blocked read cannot be interrupted.
 fn lines(form: Form) -> Receiver<Read> {
     let (sender, lines) = sync_channel(QUEUE);
     thread::spawn(move || {
@@ -54,7 +54,7 @@ fn lines(form: Form) -> Receiver<Read> {
     lines
 }
 
-/// What goes into files when the stream ends.
+/// Frames kept for the output files.
 #[derive(Default)]
 struct Kept {
     joints: Vec<f32>,
@@ -65,11 +65,11 @@ struct Kept {
 
 impl Kept {
     fn sentence(&mut self, course: &Course, caption: &str) {
-        let told = course.told().filter_map(|(frame, waypoint)| {
+        let waypoints = course.waypoints().filter_map(|(frame, waypoint)| {
             let frame = usize::try_from(frame).ok().filter(|frame| *frame < MOST_KEPT)?;
             Some(Waypoint { frame, ..waypoint })
         });
-        self.waypoints.extend(told);
+        self.waypoints.extend(waypoints);
         if self.captions.len() < QUEUE {
             self.captions.push(caption.to_owned());
         }
@@ -96,13 +96,13 @@ impl Kept {
     }
 }
 
-/// The two ends of the pipe.
+/// A stream with its input and output.
 struct Pipe<'g> {
     generator: &'g Generator,
     stream: MotionStream,
     course: Course,
     lines: Receiver<Read>,
-    /// A line that has been there before its turn.
+    /// A line that was read before its turn.
     next: Option<Read>,
     pace: Option<Pace>,
     kept: Option<Kept>,
@@ -110,7 +110,7 @@ struct Pipe<'g> {
 }
 
 impl Pipe<'_> {
-    /// The sentence of the next segment; `false` at the end of the input.
+    /// Starts the sentence of the next segment; returns `false` at the end of the input.
     fn turn(&mut self) -> std::result::Result<bool, End> {
         if self.course.is_pinned() {
             return Ok(true);
@@ -136,7 +136,7 @@ impl Pipe<'_> {
         Ok(true)
     }
 
-    /// Gives a segment out, or as much of it as is wanted; `false` if nobody reads any more.
+    /// Writes a segment up to the limit of frames; returns `false` if the stream has ended.
     fn give(&mut self, segment: &Segment, output: &mut impl Write) -> bool {
         for k in 0..segment.frames {
             if self.course.is_over() {
@@ -149,7 +149,7 @@ impl Pipe<'_> {
             self.course.write(&mut self.text, segment, k);
             self.text.push('\n');
             let written = output.write_all(self.text.as_bytes());
-            // A frame in time is seen in time; others, and the first of a sentence, at the latest with the segment.
+            // With a pace, every frame is flushed. Otherwise the first frame of a segment and its end are.
             let flush = self.pace.is_some() || k == 0 || k + 1 == segment.frames;
             if written.and_then(|()| if flush { output.flush() } else { Ok(()) }).is_err() {
                 return false;
@@ -186,7 +186,7 @@ impl Pipe<'_> {
     }
 }
 
-/// Streams until the input ends, or nobody reads the output any more.
+/// Streams until the input ends or the output is closed.
 pub(super) fn run(
     generator: &Generator,
     beginning: Beginning,
@@ -202,7 +202,7 @@ pub(super) fn run(
     let mut pipe = Pipe { generator, stream, course, lines, next: None, pace, kept, text: String::new() };
     let mut output = io::BufWriter::with_capacity(64 << 10, io::stdout().lock());
     let end = pipe.run(&mut output);
-    // Whoever has left misses nothing more.
+    // A closed output needs no more frames.
     let _ = output.flush();
     drop(output);
     let meter = &pipe.course.meter;

@@ -1,33 +1,34 @@
-//! By how much real motion changes its course, for junctions to be held against.
+//! Changes of course in real motion, for comparison with junctions.
 
 use std::path::Path;
 
-use motion::{Skeleton, files, npy};
+use motion::{DataPath, Skeleton, npy};
 use stages::evaluation::junction::{Jump, jumps, usual};
 
 use super::report::Real;
 use crate::problem::{Problem, Result};
 
-/// Clips that are read of a folder, the first ones of its list.
+/// Limit of clips read from a folder, in the order of its list.
 const CLIPS: usize = 256;
-/// Bytes of a list of clips.
+/// Limit of a list of clips in bytes.
 const LIST_BYTES: u64 = 8 << 20;
-/// Boundaries without which a percentile says little.
+/// Least number of boundaries for a meaningful percentile.
 const LEAST: usize = 100;
 
-/// Of a motion, `.npy` as `trainer export` takes it, or of a dataset folder's training clips.
+/// Measures a motion, `.npy` as `trainer export` accepts it, or the training clips of a dataset folder.
 pub(super) fn read(path: &Path, skeleton: &'static Skeleton) -> Result<Real> {
     let mut all: Vec<Jump> = Vec::new();
     let name = if path.is_dir() {
         let list = path.join("train.txt");
-        let bytes = files::read(&list, LIST_BYTES)
+        let bytes = DataPath::local(&list)
+            .read(LIST_BYTES)
             .map_err(|error| Problem::usage(format!("`{}`: {error}; expected a dataset folder", list.display())))?;
         let text = String::from_utf8_lossy(&bytes).into_owned();
         let ids = text.lines().map(str::trim).filter(|id| motion::dataset::is_clip_id(id)).take(CLIPS);
         let mut clips = 0;
         for id in ids {
             let file = path.join("new_joint_vecs").join(format!("{id}.npy"));
-            // Lists name clips that are not there, in the published sets too.
+            // Lists name missing clips, in the published datasets too.
             if file.exists() {
                 all.extend(of_file(&file, skeleton)?);
                 clips += 1;
@@ -50,7 +51,7 @@ pub(super) fn read(path: &Path, skeleton: &'static Skeleton) -> Result<Real> {
 
 fn of_file(file: &Path, skeleton: &'static Skeleton) -> Result<Vec<Jump>> {
     let refuse = |what: String| Problem::usage(format!("`{}`: {what}", file.display()));
-    let array = npy::read_any_float(file).map_err(|error| Problem::usage(error.to_string()))?;
+    let array = npy::read_any_float(&DataPath::local(file)).map_err(|error| Problem::usage(error.to_string()))?;
     let joints = match array.shape[..] {
         [_, count, 3] if count == skeleton.joints => array.data.iter().map(|v| f64::from(*v)).collect(),
         [_, width] if width == skeleton.features => motion::features::recover_joints_wide(&array.data, skeleton),

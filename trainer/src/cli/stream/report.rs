@@ -1,4 +1,4 @@
-//! What is said of a stream when it ends.
+//! The report at the end of a stream.
 
 use std::time::{Duration, Instant};
 
@@ -6,7 +6,7 @@ use serde_json::{Value, json};
 use stages::evaluation::junction::{Jump, JunctionMeter, usual};
 use stages::stream::{Joining, Segment};
 
-/// Many values, of which mean and largest are kept.
+/// Running mean and maximum of many values.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Many {
     count: u64,
@@ -30,16 +30,16 @@ impl Many {
     }
 }
 
-/// What junctions are held against.
+/// Reference for junctions.
 #[derive(Debug, Clone)]
 pub(super) struct Real {
-    /// Where it is from, for people.
+    /// Source of the reference, for display.
     pub(super) name: String,
     /// The 99th percentile.
     pub(super) usual: Jump,
 }
 
-/// Takes the measure of a stream.
+/// Measurements of a stream.
 #[derive(Debug, Clone)]
 pub(super) struct Meter {
     fps: f64,
@@ -50,17 +50,17 @@ pub(super) struct Meter {
     ended: Option<Instant>,
     frames: u64,
     segments: u64,
-    /// Time that segments were drawn in.
+    /// Time spent on generating segments.
     drawing: Duration,
-    /// Frames that were drawn, also if not given out.
+    /// Frames generated, including those not given out.
     drawn: u64,
-    /// From a sentence to its first frame, seconds.
+    /// Seconds from a sentence to its first frame.
     latency: Many,
-    /// Frames that segments were told of those before.
+    /// Frames of earlier segments that conditioned a segment.
     overlap: Many,
-    /// Metres by which joints were off at junctions before that faded.
+    /// Offsets of joints at junctions in metres, before they were faded.
     offset: Many,
-    /// Metres from waypoints.
+    /// Distances from waypoints in metres.
     missed: Many,
 }
 
@@ -84,7 +84,7 @@ impl Meter {
         }
     }
 
-    /// A segment was drawn within `took`.
+    /// Records a segment that was generated within `took`.
     pub(super) fn segment(&mut self, segment: &Segment, took: Duration) {
         self.segments += 1;
         self.drawing += took;
@@ -96,7 +96,8 @@ impl Meter {
         segment.missed.iter().for_each(|metres| self.missed.add(*metres));
     }
 
-    /// A frame `[joints, 3]` is given out, the first of a segment or not; of a new sentence, since `asked`.
+    /// Records a frame `[joints, 3]`. `first` marks the first of a segment; `asked` is the time of the sentence that
+    /// the frame starts.
     pub(super) fn frame(&mut self, frame: &[f64], first: bool, asked: Option<Instant>) {
         self.junctions.push(frame, first && self.frames > 0);
         self.frames += 1;
@@ -113,18 +114,18 @@ impl Meter {
         self.frames
     }
 
-    /// Frames that are drawn in a second of drawing.
+    /// Frames generated per second of generation.
     fn rate(&self) -> f64 {
         self.drawn as f64 / self.drawing.as_secs_f64().max(1e-9)
     }
 
-    /// Frames that are given out in a second, from the first sentence to the last frame.
+    /// Frames given out per second, from the first sentence to the last frame.
     fn sustained(&self) -> f64 {
         let time = self.begun.zip(self.ended).map_or(0.0, |(begun, ended)| (ended - begun).as_secs_f64());
         self.frames as f64 / time.max(1e-9)
     }
 
-    /// What junctions are held against, and where that is from.
+    /// Reference for junctions with its source.
     fn against(&self) -> Option<Real> {
         let own = || {
             let usual = usual(self.junctions.interior())?;
@@ -140,7 +141,7 @@ impl Meter {
         })
     }
 
-    /// Junctions that jump by no more than the others, in both.
+    /// Number of junctions that stay below the reference in velocity and acceleration.
     fn smooth(&self, against: &Real) -> usize {
         let below =
             |jump: &&Jump| jump.velocity <= against.usual.velocity && jump.acceleration <= against.usual.acceleration;
@@ -172,7 +173,7 @@ impl Meter {
         })
     }
 
-    /// For people.
+    /// The report as text.
     pub(super) fn text(&self) -> String {
         let Self { frames, segments, latency, .. } = self;
         let (sustained, rate) = (self.sustained(), self.rate());

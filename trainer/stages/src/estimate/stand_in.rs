@@ -49,7 +49,7 @@ pub(super) fn dataset(cx: &mut dyn AttemptContext, format: DataFormat) -> Result
 /// An untrained evaluator of the published size.
 pub(super) fn evaluator(cx: &mut dyn AttemptContext, format: DataFormat) -> Result<Digest, StageError> {
     let skeleton = Skeleton::of(format);
-    let words = Words::open("")?;
+    let words = Words::Hashed;
     let meta = EvaluatorMeta {
         format,
         config: evaluator::config(&EvaluatorNetwork::default(), skeleton),

@@ -7,7 +7,7 @@ use protocol::Digest;
 use protocol::stage::{DataFormat, Family, LatentShape, Sampler};
 
 use crate::context::StageError;
-use crate::control::{ControlMeta, Heed};
+use crate::control::{ControlMeta, ControlOptions};
 use crate::hint::Hint;
 use crate::text::TextEncoder;
 
@@ -39,7 +39,7 @@ pub struct ControlRequest<'a> {
     /// A hint for each motion, of the motion's length.
     pub hints: &'a [Hint],
     /// Strength of the steering.
-    pub heed: Heed,
+    pub options: ControlOptions,
 }
 
 impl std::fmt::Debug for Batch<'_> {

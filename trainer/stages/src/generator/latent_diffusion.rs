@@ -118,18 +118,18 @@ impl MotionGenerator for LatentDiffusion {
 
     fn draw(&self, batch: Batch<'_>, sampler: &Sampler, lap: &mut dyn FnMut(Lap)) -> Result<Vec<Vec<f32>>, StageError> {
         let mut z = self.steered(batch.texts, batch.seeds, sampler, batch.control, &mut |_, _| {})?;
-        if let (Some(ControlRequest { hints, heed }), Some(control)) = (batch.control, &self.control) {
-            z = control.correct(&self.vae, z, batch.lengths, (hints, heed));
+        if let (Some(ControlRequest { hints, options }), Some(control)) = (batch.control, &self.control) {
+            z = control.correct(&self.vae, z, batch.lengths, (hints, options));
         }
-        if let Some(ControlRequest { hints, heed }) = batch.control
-            && heed.refine > 0
+        if let Some(ControlRequest { hints, options }) = batch.control
+            && options.refine > 0
         {
             if self.decoder.is_some() {
                 return Err(StageError::Input(
                     "the model's motions are decoded by a flow, through which latents cannot be refined".into(),
                 ));
             }
-            refine(&self.vae, &mut z, batch.lengths, hints, heed.refine);
+            refine(&self.vae, &mut z, batch.lengths, hints, options.refine);
         }
         lap(Lap::Sampled);
         let mut motions = match &self.decoder {
@@ -184,7 +184,7 @@ impl LatentDiffusion {
         let text = texts.iter().flat_map(|text| text.values.iter().copied()).collect();
         let conditions = Conditions { text, null: self.null.clone(), noise: fill(0) };
         let steering = match (control, &self.control) {
-            (Some(request), Some(control)) => Some(control.steer(request.hints, request.heed.scale)),
+            (Some(request), Some(control)) => Some(control.steer(request.hints, request.options.scale)),
             _ => None,
         };
         self.denoiser.sample_seen(&conditions, sampler, steering.as_ref(), &mut |step| fill(1 + step), see)

@@ -21,7 +21,7 @@ use super::entry_draws::{Draw, EntryDraws, finite, skates};
 use super::{Map, REPORT_FILE, drawn};
 use crate::artifacts::{self, Tensors};
 use crate::context::{AttemptContext, Outcome, StageError};
-use crate::control::Heed;
+use crate::control::ControlOptions;
 use crate::evaluation::frechet::to_f64;
 use crate::evaluation::interval::Interval;
 use crate::generator::{self, Batch, ControlRequest, MotionGenerator, Texts};
@@ -118,8 +118,8 @@ impl Maker<'_> {
         let texts = self.texts.get(&captions, |caption| plan.of.dataset.captions[caption].text.as_str())?;
         let lengths: Vec<usize> = draws.iter().map(|d| d.len).collect();
         let EvaluateControl { scale, feedback, refine, .. } = *plan.settings;
-        let heed = Heed { scale, feedback, refine };
-        let control = hints.map(|hints| ControlRequest { hints, heed });
+        let options = ControlOptions { scale, feedback, refine };
+        let control = hints.map(|hints| ControlRequest { hints, options });
         let batch = Batch { texts: &texts, lengths: &lengths, seeds, control };
         generator::motions(self.generator, batch, &plan.settings.sampler, &mut |_| {})
     }

@@ -3,8 +3,8 @@
 //! Files: those of [`Dataset::write_files`], and `report.txt`, which lists every clip and caption left out with its
 //! reason.
 
+use std::cell::RefCell;
 use std::collections::BTreeMap;
-use std::path::Path;
 
 use motion::Dataset;
 use motion::dataset::{OpenReport, PackError, Split};
@@ -14,14 +14,18 @@ use protocol::stage::{DataFormat, DataOpen, DataSynthetic};
 use super::Plain;
 use crate::artifacts::{DatasetMeta, Draft, to_meta};
 use crate::context::{AttemptContext, Outcome, StageError};
+use crate::external;
 
 /// The file that lists the clips and captions left out.
 const REPORT_FILE: &str = "report.txt";
 
 impl Plain for DataOpen {
     fn run(&self, cx: &mut dyn AttemptContext) -> Result<Outcome, StageError> {
-        let (dataset, report) =
-            Dataset::open(Path::new(&self.path), self.format).map_err(|e| StageError::Input(e.to_string()))?;
+        let opened = external::read(cx, |cx, given| {
+            let opened = Dataset::open_while(given.path("path")?, self.format, &|_| !cx.interrupted());
+            opened.map_err(|e| StageError::Input(e.to_string()))
+        })?;
+        let Some((dataset, report)) = opened else { return Ok(Outcome::Yielded { at: 0 }) };
         log_report(cx, &report);
         pack(cx, &dataset, report.skips.len(), report.to_string(), vec![])
     }
@@ -42,7 +46,15 @@ impl Plain for DataSynthetic {
         if self.clips == 0 {
             return Err(StageError::Input("`clips` is 0, expected at least 1".into()));
         }
-        let dataset = motion::synthetic::generate(self, cx.task().seed);
+        let (seed, clips) = (cx.task().seed, self.clips as u64);
+        let world = RefCell::new(&mut *cx);
+        let go_on = |made: usize| {
+            let mut cx = world.borrow_mut();
+            cx.progress(made as u64, clips, "clips", &[]);
+            !cx.interrupted()
+        };
+        let made = motion::synthetic::generate_while(self, seed, &go_on);
+        let Some(dataset) = made else { return Ok(Outcome::Yielded { at: 0 }) };
         let text = format!("made by the program: {} clips, {} captions\n", dataset.clips.len(), dataset.captions.len());
         pack(cx, &dataset, 0, text, vec![])
     }
@@ -78,17 +90,24 @@ pub(super) fn pack(
     for (name, bytes) in extras {
         draft.add(name, bytes)?;
     }
-    dataset.write_files::<Failure>(|name, bytes| draft.add(&name, bytes).map_err(Failure::Store)).map_err(
-        |e| match e {
-            Failure::Store(e) => e,
-            Failure::Pack(e) => StageError::Fault(e.to_string()),
-        },
-    )?;
+    let written = dataset.write_files::<Failure>(|name, bytes| {
+        if cx.interrupted() {
+            return Err(Failure::Interrupted);
+        }
+        draft.add(&name, bytes).map_err(Failure::Store)
+    });
+    match written {
+        Ok(()) => {}
+        Err(Failure::Interrupted) => return Ok(Outcome::Yielded { at: 0 }),
+        Err(Failure::Store(error)) => return Err(error),
+        Err(Failure::Pack(error)) => return Err(StageError::Fault(error.to_string())),
+    }
     Ok(Outcome::Finished { output: draft.finish(cx)?, metrics })
 }
 
 /// An error that prevented a file from being stored.
 enum Failure {
+    Interrupted,
     Store(StageError),
     Pack(PackError),
 }

@@ -23,6 +23,7 @@ use super::{Gang, dropout_seed, group, no_clips};
 use crate::artifacts::{self, to_meta};
 use crate::context::{GangContext, Outcome, StageError};
 use crate::evaluator::{self, EvaluatorMeta, UNIT, normalise};
+use crate::external;
 use crate::train::{GroupPlan, Objective, Order, Pick, SliceResult, TrainState, Trained, Turns, train};
 use crate::warm_start::WarmStart;
 use crate::words::{CLASSES, CaptionBatch, WORD_WIDTH, WORDS, Words};
@@ -278,7 +279,7 @@ impl Gang for TrainEvaluator {
                 "`movement.until` gives {turn} of {steps} steps to the movements; both phases need some"
             )));
         }
-        let words = Words::open(&self.words)?;
+        let words = external::read(cx, |_, given| Words::open(given.get("words")))?;
         let meta = EvaluatorMeta {
             format: dataset.format,
             config: evaluator::config(&self.network, dataset.skeleton()),

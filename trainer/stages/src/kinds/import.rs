@@ -10,14 +10,13 @@
 //! shapes describe has no more parameters than the file.
 
 use std::collections::{BTreeMap, HashMap};
-use std::path::{Path, PathBuf};
 
 use models::flat::layout;
 use models::names::from_bytes;
 use models::networks::{Evaluator, EvaluatorConfig, Init};
-use motion::{Skeleton, files, npy};
+use motion::{DataPath, Skeleton, npy};
 use protocol::stage::{ImportEvaluator, Positions};
-use protocol::{Seed, limits};
+use protocol::{Seed, excerpt, limits};
 use pytorch_reader::{DType, PytorchReader};
 use safetensors::SafeTensors;
 
@@ -25,6 +24,7 @@ use super::Plain;
 use crate::artifacts::Tensors;
 use crate::context::{AttemptContext, Outcome, StageError};
 use crate::evaluator::{self, EvaluatorMeta};
+use crate::external::{self, Given};
 use crate::words::{CLASSES, WORD_WIDTH, Words};
 
 /// The state dicts of the pickle.
@@ -37,65 +37,68 @@ const MAX_HEADER: u64 = 1 << 20;
 
 impl Plain for ImportEvaluator {
     fn run(&self, cx: &mut dyn AttemptContext) -> Result<Outcome, StageError> {
-        let folder = Path::new(&self.path);
-        let skeleton = Skeleton::of(self.format);
-        let (file, bytes) = weights(folder)?;
-        let refuse = |text: String| StageError::Input(format!("{}: {text}", file.display()));
-        let config = sizes(&bytes).map_err(refuse)?;
-        let expected = skeleton.layout().contacts.start;
-        if config.features != expected {
-            return Err(refuse(format!(
-                "its movements are made of {} features, those of {:?} of {expected}; set `format` to what it was trained on",
-                config.features, self.format
-            )));
-        }
-        if (config.word, config.classes) != (WORD_WIDTH, CLASSES) {
-            let (word, classes) = (config.word, config.classes);
-            return Err(refuse(format!(
-                "it reads words of width {word} in {classes} classes, expected {WORD_WIDTH} in {CLASSES}"
-            )));
-        }
-        check_parameters(&config, &bytes).map_err(refuse)?;
-        let (mean, std) = (statistic(folder, "mean.npy", skeleton)?, statistic(folder, "std.npy", skeleton)?);
-        if let Some(i) = std.iter().position(|s| !(*s > 0.0 && s.is_finite())) {
-            return Err(StageError::Input(format!(
-                "{}: std.npy: value {i} is {}, expected above 0",
-                folder.display(),
-                std[i]
-            )));
-        }
-        let device = cx.device().inner();
-        let blank = Evaluator::new(&config, &mut Init::new(Seed(0), "blank", Positions::Uniform, &device));
-        let entries = layout(&blank);
-        let flat = from_bytes(&entries, &bytes, "").map_err(|e| refuse(e.to_string()))?;
-        if let Some(bad) = flat.iter().position(|v| !v.is_finite()) {
-            return Err(refuse(format!("parameter {bad} of {} is not finite", flat.len())));
-        }
-        let words = Words::open(&self.words)?;
-        if words == Words::Hashed {
-            cx.log("no `words` folder: captions are read through the built-in word vectors; the published evaluators need the published ones");
-        }
-        let meta =
-            EvaluatorMeta { format: self.format, config, mean, std, words: words.meta(), origin: "imported".into() };
-        let output = evaluator::publish(cx, &meta, (&entries, &flat), &words)?;
-        let metrics = BTreeMap::from([("parameters".to_owned(), flat.len() as f64)]);
-        Ok(Outcome::Finished { output, metrics })
+        external::read(cx, |cx, given| import(self, cx, given))
     }
 }
 
+fn import(settings: &ImportEvaluator, cx: &mut dyn AttemptContext, given: &Given) -> Result<Outcome, StageError> {
+    let folder = given.path("path")?;
+    let skeleton = Skeleton::of(settings.format);
+    let (file, bytes) = weights(folder)?;
+    let refuse = |text: String| StageError::Input(format!("{}: {text}", file.display()));
+    let config = sizes(&bytes).map_err(refuse)?;
+    let expected = skeleton.layout().contacts.start;
+    if config.features != expected {
+        return Err(refuse(format!(
+            "its movements are made of {} features, those of {:?} of {expected}; set `format` to what it was trained on",
+            config.features, settings.format
+        )));
+    }
+    if (config.word, config.classes) != (WORD_WIDTH, CLASSES) {
+        let (word, classes) = (config.word, config.classes);
+        return Err(refuse(format!(
+            "it reads words of width {word} in {classes} classes, expected {WORD_WIDTH} in {CLASSES}"
+        )));
+    }
+    check_parameters(&config, &bytes).map_err(refuse)?;
+    let (mean, std) = (statistic(folder, "mean.npy", skeleton)?, statistic(folder, "std.npy", skeleton)?);
+    if let Some(i) = std.iter().position(|s| !(*s > 0.0 && s.is_finite())) {
+        return Err(StageError::Input(format!(
+            "{}: std.npy: value {i} is {}, expected above 0",
+            folder.display(),
+            std[i]
+        )));
+    }
+    let device = cx.device().inner();
+    let blank = Evaluator::new(&config, &mut Init::new(Seed(0), "blank", Positions::Uniform, &device));
+    let entries = layout(&blank);
+    let flat = from_bytes(&entries, &bytes, "").map_err(|e| refuse(e.to_string()))?;
+    if let Some(bad) = flat.iter().position(|v| !v.is_finite()) {
+        return Err(refuse(format!("parameter {bad} of {} is not finite", flat.len())));
+    }
+    let words = Words::open(given.get("words"))?;
+    if words == Words::Hashed {
+        cx.log("no `words` folder: captions are read through the built-in word vectors; the published evaluators need the published ones");
+    }
+    let meta =
+        EvaluatorMeta { format: settings.format, config, mean, std, words: words.meta(), origin: "imported".into() };
+    let output = evaluator::publish(cx, &meta, (&entries, &flat), &words)?;
+    let metrics = BTreeMap::from([("parameters".to_owned(), flat.len() as f64)]);
+    Ok(Outcome::Finished { output, metrics })
+}
+
 /// Reads the file of the weights, and returns its path and its tensors as safetensors.
-fn weights(folder: &Path) -> Result<(PathBuf, Vec<u8>), StageError> {
+fn weights(folder: &DataPath) -> Result<(DataPath, Vec<u8>), StageError> {
     let below = folder.join("text_mot_match/model");
     for base in [&below, folder] {
-        let is_there = |path: &Path| path.symlink_metadata().is_ok();
         let safe = base.join("finest.safetensors");
-        if is_there(&safe) {
-            let bytes = files::read(&safe, limits::WEIGHTS_BYTES);
+        if safe.has_entry() {
+            let bytes = safe.read(limits::WEIGHTS_BYTES);
             let bytes = bytes.map_err(|e| StageError::Input(format!("{}: {e}", safe.display())))?;
             return Ok((safe, bytes));
         }
         let pickle = base.join("finest.tar");
-        if is_there(&pickle) {
+        if pickle.has_entry() {
             let bytes = unpickle(&pickle).map_err(|e| StageError::Input(format!("{}: {e}", pickle.display())))?;
             return Ok((pickle, bytes));
         }
@@ -108,12 +111,15 @@ fn weights(folder: &Path) -> Result<(PathBuf, Vec<u8>), StageError> {
 }
 
 /// Reads the three state dicts of a torch file.
-fn unpickle(file: &Path) -> Result<Vec<u8>, String> {
+fn unpickle(file: &DataPath) -> Result<Vec<u8>, String> {
     let length = text_models::archive_length(file)?;
+    let held = file.hold().map_err(|e| e.to_string())?;
     let mut tensors = Vec::new();
     for part in PARTS {
-        let reader = PytorchReader::with_top_level_key(file, part)
-            .map_err(|e| format!("no state dict `{part}`: {e}; expected {}", PARTS.join(", ")))?;
+        let reader = PytorchReader::with_top_level_key(held.path(), part).map_err(|e| {
+            let said = text_models::no_torch(&e);
+            format!("no state dict `{part}`: {said}; expected {}", PARTS.join(", "))
+        })?;
         tensors.extend(reader.into_tensors().into_iter().map(|(name, tensor)| (format!("{part}.{name}"), tensor)));
     }
     if tensors.len() > MAX_TENSORS {
@@ -126,11 +132,11 @@ fn unpickle(file: &Path) -> Result<Vec<u8>, String> {
     }
     let mut all = Tensors::default();
     for (name, tensor) in tensors {
-        let bytes = tensor.read().map_err(|e| format!("`{name}`: {e}"))?;
+        let bytes = tensor.read().map_err(|e| format!("`{}`: {}", excerpt(&name), text_models::no_torch(&e)))?;
         let values: Vec<f32> = match tensor.dtype() {
             DType::F32 => bytes.as_chunks::<4>().0.iter().map(|b| f32::from_le_bytes(*b)).collect(),
             DType::F64 => bytes.as_chunks::<8>().0.iter().map(|b| f64::from_le_bytes(*b) as f32).collect(),
-            other => return Err(format!("`{name}` is {other:?}, expected F32")),
+            other => return Err(format!("`{}` is {other:?}, expected F32", excerpt(&name))),
         };
         all = all.with(&name, tensor.shape().to_vec(), values);
     }
@@ -143,14 +149,14 @@ fn sizes(bytes: &[u8]) -> Result<EvaluatorConfig, String> {
     if header > MAX_HEADER {
         return Err(format!("a header of {header} bytes; expected at most {MAX_HEADER}"));
     }
-    let file = SafeTensors::deserialize(bytes).map_err(|e| e.to_string())?;
+    let file = SafeTensors::deserialize(bytes).map_err(|e| format!("no safetensors: {}", excerpt(&e.to_string())))?;
     if file.len() > MAX_TENSORS {
         return Err(format!("{} tensors; expected at most {MAX_TENSORS}", file.len()));
     }
     let shapes: HashMap<String, Vec<usize>> =
         file.iter().map(|(name, view)| (name.to_owned(), view.shape().to_vec())).collect();
     if let Some((name, shape)) = shapes.iter().find(|(_, shape)| shape.contains(&0)) {
-        return Err(format!("`{}` has shape {shape:?}, which holds nothing", name.escape_debug()));
+        return Err(format!("`{}` has shape {shape:?}, which holds nothing", excerpt(name)));
     }
     let dim = |name: &str, axis: usize| {
         let found = shapes.get(name).and_then(|shape| shape.get(axis)).copied();
@@ -192,17 +198,17 @@ fn check_parameters(config: &EvaluatorConfig, bytes: &[u8]) -> Result<(), String
 }
 
 /// Reads a statistic from `meta`, or from the `meta` of the only `Comp_*` folder.
-fn statistic(folder: &Path, name: &str, skeleton: &Skeleton) -> Result<Vec<f32>, StageError> {
+fn statistic(folder: &DataPath, name: &str, skeleton: &Skeleton) -> Result<Vec<f32>, StageError> {
     let missing = |what: String| StageError::Input(format!("{}: {what}", folder.display()));
-    let entries = std::fs::read_dir(folder).map_err(|e| missing(e.to_string()))?;
-    let mut found: Vec<PathBuf> = entries
-        .filter_map(|entry| Some(entry.ok()?.path()))
-        .filter(|path| path.file_name().is_some_and(|n| n.to_string_lossy().starts_with("Comp_")))
-        .chain([folder.to_owned()])
+    let names = folder.names().map_err(|e| missing(e.to_string()))?;
+    let found: Vec<DataPath> = names
+        .into_iter()
+        .filter(|entry| entry.to_string_lossy().starts_with("Comp_"))
+        .map(|entry| folder.join(entry))
+        .chain([folder.clone()])
         .map(|path| path.join("meta").join(name))
-        .filter(|path| path.symlink_metadata().is_ok())
+        .filter(DataPath::has_entry)
         .collect();
-    found.sort();
     let [file] = &found[..] else {
         return Err(missing(format!(
             "{} files `Comp_*/meta/{name}`, expected one: the statistics that the evaluator normalises motions with",
@@ -311,12 +317,12 @@ mod tests {
             archive.write_all(&vec![0; 8 << 20]).unwrap();
         }
         archive.finish().unwrap();
-        let said = unpickle(&path).unwrap_err();
+        let said = unpickle(&DataPath::local(&path)).unwrap_err();
         assert!(said.contains("unpacks to 16777216 bytes"), "{said}");
         std::fs::remove_file(&path).unwrap();
         assert!(std::process::Command::new("mkfifo").arg(&path).status().unwrap().success());
-        assert!(unpickle(&path).unwrap_err().contains("is a named pipe"));
-        let said = weights(folder.path()).unwrap_err().to_string();
+        assert!(unpickle(&DataPath::local(&path)).unwrap_err().contains("is a named pipe"));
+        let said = weights(&DataPath::local(folder.path())).unwrap_err().to_string();
         assert!(said.contains("finest.tar: is a named pipe; expected a file"), "{said}");
     }
 
@@ -360,7 +366,7 @@ mod tests {
             }
             if round % 2 == 0 {
                 std::fs::write(&path, &bytes).unwrap();
-                let _ = unpickle(&path);
+                let _ = unpickle(&DataPath::local(&path));
             } else if let Ok(config) = sizes(&bytes) {
                 let _ = check_parameters(&config, &bytes);
             }

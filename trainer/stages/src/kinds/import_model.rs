@@ -6,7 +6,6 @@
 //! constants of a published file are kept beside the weights, for a later export.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::Path;
 
 use burn::module::Module;
 use burn::tensor::Device;
@@ -16,7 +15,7 @@ use models::names::{Weights, from_bytes};
 use models::networks::{
     Denoiser, Gpt, Init, MaskedTransformer, Mmm, MomaskConfig, Projection, ResidualTransformer, Tokenizer, Vae,
 };
-use motion::{Skeleton, npy};
+use motion::{DataPath, Skeleton, npy};
 use protocol::artifact::Role;
 use protocol::stage::{
     DataFormat, Diffusion, Family, FlowBackbone, FlowNetwork, FlowPrediction, FlowProjection, ImportModel,
@@ -29,6 +28,7 @@ use super::{Plain, latent_data, word};
 use crate::artifacts::{self, DenoiserMeta, Draft, EmbeddingsMeta, MODEL_FILE, VaeMeta, to_meta};
 use crate::context::{AttemptContext, ContextError, Outcome, StageError};
 use crate::control::{CONTROLNET_PREFIX, ControlMeta, TRAJECTORY_PREFIX};
+use crate::external::{self, Given};
 use crate::flow_decoder::{Backbone, FlowMeta, HEAD};
 use crate::generator::{FEATURE_DIFFUSION, GeneratorMeta, LATENT_DIFFUSION, MASKED_PREFIX, RESIDUAL_PREFIX, TOKENS};
 use crate::motion_networks::{Architecture, MotionDenoiserMeta};
@@ -45,31 +45,36 @@ const REACH: usize = 10_000;
 
 impl Plain for ImportModel {
     fn run(&self, cx: &mut dyn AttemptContext) -> Result<Outcome, StageError> {
-        let file = Checkpoint::open(Path::new(&self.path))?;
-        let heads = if self.heads == 0 { self.part.heads() } else { self.heads };
-        let device = cx.device().inner();
-        let mut import = Import { settings: self, file: &file, heads, device, read: BTreeSet::new(), parameters: 0 };
-        let output = match self.part {
-            ImportedPart::Vae => import.vae(cx)?,
-            ImportedPart::Mld | ImportedPart::Lcm => import.denoiser(cx)?,
-            ImportedPart::Control => import.control(cx)?,
-            ImportedPart::Tokenizer => import.tokenizer(cx)?,
-            ImportedPart::T2mgpt => import.gpt(cx)?,
-            ImportedPart::Momask => import.momask(cx)?,
-            ImportedPart::Mmm => import.mmm(cx)?,
-            ImportedPart::Mdm => import.mdm(cx)?,
-            ImportedPart::Discord => import.discord(cx)?,
-        };
-        if let Some(left_out) = file.left_out(&import.read) {
-            cx.log(&format!("{}: not read, by the beginning of the names: {left_out}", self.path));
-        }
-        let metrics = BTreeMap::from([("parameters".to_owned(), import.parameters as f64)]);
-        Ok(Outcome::Finished { output, metrics })
+        external::read(cx, |cx, given| import(self, cx, given))
     }
+}
+
+fn import(settings: &ImportModel, cx: &mut dyn AttemptContext, given: &Given) -> Result<Outcome, StageError> {
+    let file = Checkpoint::open(given.path("path")?)?;
+    let heads = if settings.heads == 0 { settings.part.heads() } else { settings.heads };
+    let device = cx.device().inner();
+    let mut import = Import { settings, given, file: &file, heads, device, read: BTreeSet::new(), parameters: 0 };
+    let output = match settings.part {
+        ImportedPart::Vae => import.vae(cx)?,
+        ImportedPart::Mld | ImportedPart::Lcm => import.denoiser(cx)?,
+        ImportedPart::Control => import.control(cx)?,
+        ImportedPart::Tokenizer => import.tokenizer(cx)?,
+        ImportedPart::T2mgpt => import.gpt(cx)?,
+        ImportedPart::Momask => import.momask(cx)?,
+        ImportedPart::Mmm => import.mmm(cx)?,
+        ImportedPart::Mdm => import.mdm(cx)?,
+        ImportedPart::Discord => import.discord(cx)?,
+    };
+    if let Some(left_out) = file.left_out(&import.read) {
+        cx.log(&format!("{}: not read, by the beginning of the names: {left_out}", settings.path));
+    }
+    let metrics = BTreeMap::from([("parameters".to_owned(), import.parameters as f64)]);
+    Ok(Outcome::Finished { output, metrics })
 }
 
 struct Import<'a> {
     settings: &'a ImportModel,
+    given: &'a Given,
     file: &'a Checkpoint,
     heads: usize,
     device: Device,
@@ -115,9 +120,9 @@ fn departing(found: bool, rule: bool) -> Option<bool> {
 }
 
 /// Reads a statistic of a folder: the first existing file of `names`, with `len` finite numbers.
-fn statistic(folder: &str, names: [&str; 2], len: usize) -> Result<Vec<f32>, StageError> {
-    let refuse = |what: String| StageError::Input(format!("{folder}: {what}"));
-    let file = names.iter().map(|name| Path::new(folder).join(name)).find(|file| file.symlink_metadata().is_ok());
+fn statistic(folder: &DataPath, names: [&str; 2], len: usize) -> Result<Vec<f32>, StageError> {
+    let refuse = |what: String| StageError::Input(format!("{}: {what}", folder.display()));
+    let file = names.iter().map(|name| folder.join(name)).find(DataPath::has_entry);
     let file = file.ok_or_else(|| refuse(format!("no `{}` in it", names.join("` or `"))))?;
     let array = npy::read_any_float(&file).map_err(|e| StageError::Input(e.to_string()))?;
     let refuse = |what: String| StageError::Input(format!("{}: {what}", file.display()));
@@ -131,10 +136,15 @@ fn statistic(folder: &str, names: [&str; 2], len: usize) -> Result<Vec<f32>, Sta
 }
 
 /// Reads mean and deviation from a folder.
-fn statistics(folder: &str, names: [[&str; 2]; 2], len: usize) -> Result<(Vec<f32>, Vec<f32>), StageError> {
+fn statistics(folder: &DataPath, names: [[&str; 2]; 2], len: usize) -> Result<(Vec<f32>, Vec<f32>), StageError> {
     let (mean, std) = (statistic(folder, names[0], len)?, statistic(folder, names[1], len)?);
     if let Some(i) = std.iter().position(|s| *s <= 0.0) {
-        return Err(StageError::Input(format!("{folder}: {}: value {i} is {}, expected above 0", names[1][0], std[i])));
+        return Err(StageError::Input(format!(
+            "{}: {}: value {i} is {}, expected above 0",
+            folder.display(),
+            names[1][0],
+            std[i]
+        )));
     }
     Ok((mean, std))
 }
@@ -187,7 +197,7 @@ impl Import<'_> {
         if let Some(dataset) = dataset {
             return Ok((format, dataset.mean, dataset.std));
         }
-        let (mean, std) = statistics(&self.settings.statistics, FEATURES, features)?;
+        let (mean, std) = statistics(self.given.path("statistics")?, FEATURES, features)?;
         Ok((format, mean, std))
     }
 
@@ -334,7 +344,7 @@ impl Import<'_> {
                 config.tokens, config.dim, base.latent.tokens, base.latent.dim
             )));
         }
-        let (mean, std) = statistics(&self.settings.hint_statistics, JOINTS, 3 * joints)?;
+        let (mean, std) = statistics(self.given.path("hint_statistics")?, JOINTS, 3 * joints)?;
         let meta = ControlMeta {
             format: model.format,
             hints: self.settings.hints.clone(),
@@ -487,7 +497,7 @@ impl Import<'_> {
                     "`tokenizer` has {many} codebooks, and this network draws the first; set `residual` to the file of the other"
                 )));
             }
-            (path, _) => networks.push(self.above(cx, Path::new(path), &config)?.under(RESIDUAL_PREFIX)),
+            _ => networks.push(self.above(cx, &config)?.under(RESIDUAL_PREFIX)),
         }
         let MomaskConfig { dim, width, layers, heads, feed_forward, text_dim, .. } = config;
         let size = TokenNetwork { width, layers, heads, feed_forward, embedding: dim, ..TokenNetwork::default() };
@@ -496,7 +506,8 @@ impl Import<'_> {
     }
 
     /// Reads MoMask's network of the layers above the first.
-    fn above(&mut self, cx: &mut dyn AttemptContext, path: &Path, first: &MomaskConfig) -> Result<Network, StageError> {
+    fn above(&mut self, cx: &mut dyn AttemptContext, first: &MomaskConfig) -> Result<Network, StageError> {
+        let path = self.given.path("residual")?;
         let file = Checkpoint::open(path)?;
         let found = sizes::residual(&file)?;
         let config = sizes::of_residual(&found, self.heads)?;

@@ -9,11 +9,10 @@
 //! evaluators.
 
 use std::collections::BTreeMap;
-use std::path::Path;
 
 use mocap::corpus::{self, Division, FromFile, Made, Recipe, Report};
 use mocap::detect::Up;
-use mocap::joint_map::JointMap;
+use mocap::joint_map::{JointMap, MapError};
 use mocap::listing::{Listing, list};
 use mocap::take::Reading;
 use motion::features::recover_joints;
@@ -27,6 +26,7 @@ use super::data::{Extra, pack};
 use super::encode::shard_range;
 use crate::artifacts::{self, Draft, Tensors, to_meta};
 use crate::context::{AttemptContext, Outcome, StageError};
+use crate::external::{self, Given};
 
 /// File of a shard's features, all clips one after the other.
 const FEATURES_FILE: &str = "features.safetensors";
@@ -57,34 +57,12 @@ struct File {
 
 impl Map for DataFeatures {
     fn shard(&self, cx: &mut dyn AttemptContext, index: usize, of: usize) -> Result<Outcome, StageError> {
-        let recipe = recipe(self)?;
-        let listing = listing(self)?;
-        let range = shard_range(listing.clips.len(), index, of);
-        let (mut files, mut features) = (Vec::new(), Vec::new());
-        for (done, clip) in listing.clips[range.clone()].iter().enumerate() {
-            if cx.interrupted() {
-                return Ok(Outcome::Yielded { at: 0 });
-            }
-            let mut read = corpus::clips_of(clip, &recipe);
-            if let Ok(read) = &mut read {
-                read.clips.iter_mut().for_each(|clip| features.append(&mut clip.features));
-            }
-            files.push(File { id: clip.id.clone(), read });
-            cx.progress(done as u64 + 1, range.len() as u64, "recordings", &[]);
-        }
-        let width = Skeleton::of(self.format).features;
-        let metrics = BTreeMap::from([("frames".to_owned(), (features.len() / width) as f64)]);
-        let meta = ShardMeta { first: range.start, files: files.len() };
-        let mut draft = Draft::new(cx, ArtifactKind::Shard, to_meta(&meta));
-        let clips = serde_json::to_vec(&files).map_err(|e| StageError::Fault(e.to_string()))?;
-        draft.add(CLIPS_FILE, clips)?;
-        let shape = [features.len() / width, width];
-        draft.add(FEATURES_FILE, Tensors::default().with("features", shape, features).to_bytes()?)?;
-        Ok(Outcome::Finished { output: draft.finish(cx)?, metrics })
+        external::read(cx, |cx, given| read_shard(self, cx, given, (index, of)))
     }
 
     fn merge(&self, cx: &mut dyn AttemptContext, shards: &[Digest]) -> Result<Outcome, StageError> {
-        let mut report = Report { notes: listing(self)?.notes, ..Report::default() };
+        let notes = external::read(cx, |_, given| Ok(listing(given)?.notes))?;
+        let mut report = Report { notes, ..Report::default() };
         let (mut made, mut broken, mut have) = (Vec::new(), Vec::new(), 0);
         for digest in shards {
             let manifest = cx.manifest(*digest)?;
@@ -115,6 +93,39 @@ impl Map for DataFeatures {
         let skipped = report.left_out.len();
         pack(cx, &dataset, skipped, report.to_string(), extras)
     }
+}
+
+/// The clips of a shard's files.
+fn read_shard(
+    settings: &DataFeatures,
+    cx: &mut dyn AttemptContext,
+    given: &Given,
+    (index, of): (usize, usize),
+) -> Result<Outcome, StageError> {
+    let recipe = recipe(settings, given)?;
+    let listing = listing(given)?;
+    let range = shard_range(listing.clips.len(), index, of);
+    let (mut files, mut features) = (Vec::new(), Vec::new());
+    for (done, clip) in listing.clips[range.clone()].iter().enumerate() {
+        if cx.interrupted() {
+            return Ok(Outcome::Yielded { at: 0 });
+        }
+        let mut read = corpus::clips_of(clip, &recipe);
+        if let Ok(read) = &mut read {
+            read.clips.iter_mut().for_each(|clip| features.append(&mut clip.features));
+        }
+        files.push(File { id: clip.id.clone(), read });
+        cx.progress(done as u64 + 1, range.len() as u64, "recordings", &[]);
+    }
+    let width = Skeleton::of(settings.format).features;
+    let metrics = BTreeMap::from([("frames".to_owned(), (features.len() / width) as f64)]);
+    let meta = ShardMeta { first: range.start, files: files.len() };
+    let mut draft = Draft::new(cx, ArtifactKind::Shard, to_meta(&meta));
+    let clips = serde_json::to_vec(&files).map_err(|e| StageError::Fault(e.to_string()))?;
+    draft.add(CLIPS_FILE, clips)?;
+    let shape = [features.len() / width, width];
+    draft.add(FEATURES_FILE, Tensors::default().with("features", shape, features).to_bytes()?)?;
+    Ok(Outcome::Finished { output: draft.finish(cx)?, metrics })
 }
 
 /// Adds a shard's clips with their features, and its broken files.
@@ -173,15 +184,19 @@ impl std::fmt::Display for Broken<'_> {
     }
 }
 
-fn listing(settings: &DataFeatures) -> Result<Listing, StageError> {
-    let table = (!settings.captions.is_empty()).then(|| Path::new(&settings.captions));
-    list(Path::new(&settings.path), table).map_err(|e| StageError::Input(e.to_string()))
+fn listing(given: &Given) -> Result<Listing, StageError> {
+    list(given.path("path")?, given.get("captions")).map_err(|e| StageError::Input(e.to_string()))
 }
 
-fn recipe(settings: &DataFeatures) -> Result<Recipe, StageError> {
+fn recipe(settings: &DataFeatures, given: &Given) -> Result<Recipe, StageError> {
     let skeleton = Skeleton::of(settings.format);
-    let map = (!settings.map.is_empty()).then(|| JointMap::load(&settings.map)).transpose();
-    let target = (!settings.target.is_empty()).then(|| corpus::read_target(Path::new(&settings.target), skeleton));
+    let map = match (given.get("map"), settings.map.as_str()) {
+        (Some(file), _) => Some(JointMap::read(file)),
+        (None, "") => None,
+        (None, name) => Some(JointMap::shipped(name).ok_or_else(|| MapError::Unknown { name: name.to_owned() })),
+    };
+    let map = map.transpose();
+    let target = given.get("target").map(|file| corpus::read_target(file, skeleton));
     let up = match settings.up {
         UpAxis::Auto => None,
         UpAxis::X => Some(Up::X),

@@ -15,6 +15,7 @@ use super::Map;
 use super::encode::shard_range;
 use crate::artifacts::{self, Draft, EMBEDDINGS_FILE, EmbeddingsMeta, Tensors, to_meta};
 use crate::context::{AttemptContext, Outcome, StageError};
+use crate::external;
 use crate::text::{Named, TextEncoderMeta};
 
 /// Number of texts between progress reports.
@@ -23,10 +24,16 @@ const BLOCK: usize = 16;
 /// Meta of one shard.
 #[derive(Debug, Serialize, Deserialize)]
 struct ShardMeta {
-    /// Digest of the encoder in the folder.
+    /// Fingerprint of the encoder in the folder, see [`fingerprint`].
     encoder: Digest,
     /// Index of the shard's first text.
     first: usize,
+}
+
+/// Digest of an encoder's digest. A shard does not upload the encoder, so its manifest must not name the encoder's artifact, which another
+/// run may have stored: a manifest names only blobs that its worker has uploaded or reads.
+fn fingerprint(encoder: Digest) -> Digest {
+    Digest::of(encoder.to_string().as_bytes())
 }
 
 /// All different texts, the empty one first, and the index of each caption's text.
@@ -49,8 +56,8 @@ impl Map for TextEmbed {
     fn shard(&self, cx: &mut dyn AttemptContext, index: usize, of: usize) -> Result<Outcome, StageError> {
         let (texts, _) = texts(cx)?;
         let range = shard_range(texts.len(), index, of);
-        let named = Named::open(self)?;
-        let encoder_digest = named.digest();
+        let named = external::read(cx, |_, given| Named::open(self, given))?;
+        let fingerprint = fingerprint(named.digest());
         let encoder = named.ready(self, &cx.device())?;
         let dim = encoder.dim();
         let mut rows = Vec::with_capacity(range.len() * dim);
@@ -62,7 +69,7 @@ impl Map for TextEmbed {
             rows.extend(encoder.pooled(&block)?);
             cx.progress((rows.len() / dim) as u64, range.len() as u64, "captions", &[]);
         }
-        let meta = ShardMeta { encoder: encoder_digest, first: range.start };
+        let meta = ShardMeta { encoder: fingerprint, first: range.start };
         let bytes = Tensors::default().with("rows", [range.len(), dim], rows).to_bytes()?;
         let output = artifacts::publish(cx, ArtifactKind::Shard, to_meta(&meta), EMBEDDINGS_FILE, bytes)?;
         let metrics = BTreeMap::from([("captions".to_owned(), range.len() as f64)]);
@@ -71,8 +78,8 @@ impl Map for TextEmbed {
 
     fn merge(&self, cx: &mut dyn AttemptContext, shards: &[Digest]) -> Result<Outcome, StageError> {
         let (texts, of) = texts(cx)?;
-        let named = Named::open(self)?;
-        let encoder = named.digest();
+        let named = external::read(cx, |_, given| Named::open(self, given))?;
+        let encoder = fingerprint(named.digest());
         let mut rows: Vec<f32> = Vec::new();
         let mut dim = 0;
         for digest in shards {
@@ -97,8 +104,7 @@ impl Map for TextEmbed {
             return Err(StageError::Fault(format!("{} numbers for {} texts of {dim}", rows.len(), texts.len())));
         }
         if let Some(bad) = rows.iter().position(|v| !v.is_finite()) {
-            let text = texts[bad / dim].chars().take(40).collect::<String>();
-            let text = text.escape_debug();
+            let text = protocol::excerpt(&texts[bad / dim]);
             return Err(StageError::Input(format!(
                 "the encoder makes no finite numbers of `{text}`; its weights are damaged"
             )));

@@ -11,10 +11,11 @@
 
 pub mod sizes;
 
+use motion::DataPath;
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::{Path, PathBuf};
 
 use models::flat::Entry;
+use protocol::{excerpt, excerpts};
 use text_models::{StoredTensor, Weights};
 
 use crate::context::StageError;
@@ -40,7 +41,7 @@ const FOREIGN: [&str; 2] = ["trans_base.vqvae.", ".num_batches_tracked"];
 /// A file of weights, with only names and shapes read so far.
 #[derive(Debug)]
 pub struct Checkpoint {
-    file: PathBuf,
+    file: DataPath,
     weights: Weights,
 }
 
@@ -68,9 +69,9 @@ impl Checkpoint {
     ///
     /// # Errors
     /// If the file is neither torch's nor safetensors, or declares more data than it holds.
-    pub fn open(file: &Path) -> Result<Self, StageError> {
+    pub fn open(file: &DataPath) -> Result<Self, StageError> {
         let weights = Weights::open_file(file).map_err(|e| StageError::Input(e.to_string()))?;
-        let found = Self { file: file.to_owned(), weights };
+        let found = Self { file: file.clone(), weights };
         let count = found.weights.tensors().len() + found.weights.others().len();
         if count > TENSORS {
             return Err(found.refuse(format!("{count} tensors; expected at most {TENSORS}")));
@@ -84,9 +85,11 @@ impl Checkpoint {
     /// If there is none; the message lists the networks in the file.
     pub fn network(&self, what: &str, places: &[&str], marker: &str) -> Result<Found<'_>, StageError> {
         self.find(places, marker).ok_or_else(|| {
-            let groups: Vec<String> = self.groups(|_| true).into_keys().take(SHOWN).collect();
-            let has =
-                if groups.is_empty() { "no weights at all".to_owned() } else { format!("`{}`", groups.join("`, `")) };
+            let groups = self.groups(|_| true);
+            let has = match groups.is_empty() {
+                true => "no weights at all".to_owned(),
+                false => format!("`{}`", excerpts(groups.keys().map(String::as_str), SHOWN)),
+            };
             self.refuse(format!("it holds no {what}, which has a tensor `{marker}`; it holds {has}"))
         })
     }
@@ -101,10 +104,9 @@ impl Checkpoint {
     /// Summarises the names that are not in `read`, such as `t2m_textencoder (19)`; `None` if all were read.
     pub fn left_out(&self, read: &BTreeSet<String>) -> Option<String> {
         let groups = self.groups(|name| !read.contains(name));
+        let count: usize = groups.values().sum();
         let words: Vec<String> = groups.iter().map(|(group, count)| format!("`{group}` ({count})")).collect();
-        let shown = words.len().min(SHOWN);
-        let more = if shown < words.len() { format!(" and {} more", words.len() - shown) } else { String::new() };
-        (shown > 0).then(|| format!("{}{more}", words[..shown].join(", ")))
+        (count > 0).then(|| format!("{count} tensors: {}", excerpts(words.iter().map(String::as_str), SHOWN)))
     }
 
     /// Makes an error that names the file.
@@ -119,7 +121,7 @@ impl Checkpoint {
         for name in names.filter(|name| counts(name)) {
             let words = if name.starts_with("state_dict.") { 2 } else { 1 };
             let group: Vec<&str> = name.split('.').take(words).collect();
-            *groups.entry(group.join(".").escape_debug().to_string()).or_default() += 1;
+            *groups.entry(group.join(".")).or_default() += 1;
         }
         groups
     }
@@ -207,7 +209,7 @@ impl Found<'_> {
             if CONSTANTS.iter().any(|end| name.ends_with(end)) {
                 constants.push((Entry { name: name.to_owned(), shape: tensor.shape.clone() }, tensor));
             } else if heads.contains(head) {
-                wrong.push(format!("`{begin}{}` {:?} is not of this network", name.escape_debug(), tensor.shape));
+                wrong.push(format!("`{begin}{}` {:?} is not of this network", excerpt(name), tensor.shape));
             }
         }
         if !wrong.is_empty() {

@@ -8,7 +8,7 @@ use motion::features::recover_joints;
 use protocol::stage::{ControlHints, DataFormat, Family, Network};
 
 use super::*;
-use crate::control::{ControlMeta, Heed};
+use crate::control::{ControlMeta, ControlOptions};
 use crate::generator::{Batch, Edit, Infilling, Lap, MotionGenerator, Seeds, Text};
 use crate::text::TextEncoder;
 
@@ -142,7 +142,8 @@ fn scripted(joining: Joining) -> (Vec<f32>, Generator, MotionStream, Rc<RefCell<
     let infills = joining == Joining::Infilling;
     let model = Scripted { rows: rows.clone(), control, infills, said: Rc::clone(&said), text: NoText };
     let generator = Generator::of(Box::new(model));
-    let settings = Settings { sampler: None, seed: Seed(2), heed: Heed::default(), overlap: None, blend: BLEND };
+    let settings =
+        Settings { sampler: None, seed: Seed(2), control: ControlOptions::default(), overlap: None, blend: BLEND };
     let stream = MotionStream::new(&generator, settings).unwrap();
     assert_eq!(stream.joining(), joining);
     (rows, generator, stream, said)

@@ -10,6 +10,7 @@ use protocol::message::StageTask;
 use protocol::{Digest, Manifest};
 
 use crate::context::{AttemptContext, ContextError, Outcome};
+use crate::external::DataAccess;
 
 /// Locks even if another thread panicked with the lock held: the panic is reported where it happened.
 pub(super) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
@@ -59,6 +60,8 @@ pub struct MemoryAttempt {
     device: Device,
     blobs: Arc<MemoryBlobs>,
     stop: Arc<AtomicBool>,
+    /// Access to files outside the store: unrestricted, without expected digests.
+    pub data: Arc<DataAccess>,
     /// Reports of the attempt so far.
     pub told: Told,
 }
@@ -66,7 +69,8 @@ pub struct MemoryAttempt {
 impl MemoryAttempt {
     /// Creates an attempt at `task` that computes on `device`.
     pub fn new(task: StageTask, device: Device, blobs: Arc<MemoryBlobs>) -> Self {
-        Self { task, device, blobs, stop: Arc::default(), told: Told::default() }
+        let data = Arc::new(DataAccess::unverified());
+        Self { task, device, blobs, stop: Arc::default(), data, told: Told::default() }
     }
 
     /// A flag that makes [`AttemptContext::interrupted`] true once set.
@@ -82,6 +86,10 @@ impl AttemptContext for MemoryAttempt {
 
     fn device(&self) -> Device {
         self.device.clone()
+    }
+
+    fn data(&self) -> Arc<DataAccess> {
+        Arc::clone(&self.data)
     }
 
     fn blobs(&self) -> Arc<dyn Blobs> {

@@ -14,6 +14,7 @@ use protocol::{Digest, Manifest};
 
 use super::attempt::{MemoryAttempt, Ran, Told, lock};
 use crate::context::{Adopted, AttemptContext, ContextError, Exchange, GangContext, Outcome, Rendezvous, StageError};
+use crate::external::DataAccess;
 use crate::train::tree_sum;
 
 /// Losses and joins of a gang's members. Members are numbered from 0; the lowest alive member leads.
@@ -200,6 +201,9 @@ impl AttemptContext for Member {
     }
     fn device(&self) -> Device {
         self.attempt.device()
+    }
+    fn data(&self) -> Arc<DataAccess> {
+        self.attempt.data()
     }
     fn blobs(&self) -> Arc<dyn Blobs> {
         self.attempt.blobs()

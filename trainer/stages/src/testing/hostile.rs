@@ -4,7 +4,7 @@ use std::fs;
 use std::path::PathBuf;
 
 use burn::tensor::Device;
-use motion::npy;
+use motion::{DataPath, npy};
 use protocol::stage::{DataFormat, ImportEvaluator, StageSettings};
 
 use super::Bench;
@@ -23,6 +23,9 @@ pub fn run(name: &str, bytes: &[u8]) -> bool {
     }
 }
 
+/// A word that no error may repeat.
+pub const CANARY: &str = "qzcanaryzq";
+
 /// A folder of this process.
 pub(super) fn folder(name: &str) -> PathBuf {
     let folder = std::env::temp_dir().join(format!("stride-hostile-{}", std::process::id())).join(name);
@@ -34,6 +37,9 @@ pub(super) fn folder(name: &str) -> PathBuf {
 pub(super) fn accepted<T>(result: Result<T, StageError>) -> bool {
     if let Err(error @ StageError::Fault(_)) = &result {
         panic!("{error}");
+    }
+    if let Err(error) = &result {
+        assert!(!error.to_string().contains(CANARY), "an error quotes the file: {error}");
     }
     result.is_ok()
 }
@@ -75,7 +81,7 @@ pub fn vocabulary(bytes: &[u8]) -> bool {
         npy::write(&vectors, &[4, WORD_WIDTH], &vec![0.5; 4 * WORD_WIDTH]).expect("a file of ours");
     }
     fs::write(root.join("our_vab_idx.pkl"), bytes).expect("a file of ours");
-    let words = Words::open(&root.display().to_string());
+    let words = Words::open(Some(&DataPath::local(root)));
     if let Ok(Words::Vocabulary { index, .. }) = &words {
         assert!(index.values().all(|row| *row < 4));
     }

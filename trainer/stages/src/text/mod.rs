@@ -20,6 +20,7 @@ use serde_json::json;
 
 use crate::artifacts;
 use crate::context::{AttemptContext, StageError};
+use crate::external::Given;
 
 pub use encoder::{TextEncoder, TextEncoderMeta};
 use hashed::Hashed;
@@ -88,8 +89,8 @@ impl Named {
     ///
     /// # Errors
     /// If a file is missing or invalid.
-    pub fn open(settings: &TextEmbed) -> Result<Self, StageError> {
-        Ok(Self(Source::open(settings)?))
+    pub fn open(settings: &TextEmbed, given: &Given) -> Result<Self, StageError> {
+        Ok(Self(Source::open(settings, given)?))
     }
 
     /// Digest of everything that captions' vectors depend on.

@@ -5,7 +5,6 @@
 //! in f32.
 
 use std::cell::RefCell;
-use std::path::Path;
 use std::rc::Rc;
 use std::sync::Arc;
 
@@ -24,6 +23,7 @@ use text_models::{
 use super::remembered::Remembered;
 use crate::artifacts::{self, Draft, MODEL_FILE, to_meta};
 use crate::context::{AttemptContext, ContextError, StageError};
+use crate::external::Given;
 
 /// File of the tokenizer.
 const TOKENIZER_FILE: &str = "tokenizer.json";
@@ -201,7 +201,7 @@ impl Source {
     ///
     /// # Errors
     /// If a file is missing or invalid.
-    pub(super) fn open(settings: &TextEmbed) -> Result<Option<Self>, StageError> {
+    pub(super) fn open(settings: &TextEmbed, given: &Given) -> Result<Option<Self>, StageError> {
         let kind = match settings.encoder {
             Choice::Hashed => return Ok(None),
             Choice::Clip => Kind::Clip,
@@ -213,7 +213,7 @@ impl Source {
             ClipIds::OpenAi => TokenIds::OpenAi,
         };
         let request = Request { kind, ids, most: settings.max_tokens };
-        let folder = EncoderFolder::open(Path::new(&settings.path), &request).map_err(unfit)?;
+        let folder = EncoderFolder::open(given.path("path")?, &request).map_err(unfit)?;
         let Description { network, head, .. } = &folder.description;
         let dim = match (network, head, settings.output) {
             (_, Some(head), _) => head.width,

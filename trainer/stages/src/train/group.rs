@@ -205,8 +205,8 @@ impl Group {
             *newer = Newer::There;
             return;
         }
-        let scaled: Vec<f32> = gradient.iter().map(|g| g * factor).collect();
-        self.optimizer.step(turn + 1, self.lr.at(turn), &mut self.params, &scaled, &mut self.m, &mut self.v);
+        let lr = self.lr.at(turn);
+        self.optimizer.step_by(factor, turn + 1, lr, &mut self.params, gradient, &mut self.m, &mut self.v);
         if let (Some(averaging), Some(average)) = (self.averaging, &mut self.average) {
             match averaging.at(turn) {
                 Follow::Copy => average.copy_from_slice(&self.params),

@@ -140,7 +140,9 @@ pub fn train(
     // The digest excludes names of other stages, which do not affect a state; the key of the next rung depends on it.
     let config = cx.task().settings.digest();
     let accelerator = Some(cx.device()).filter(models::device::is_accelerator);
-    let mut state = TrainState::new(objective.groups(), objective.buffers());
+    let (groups, buffers) = (objective.groups(), objective.buffers());
+    check_size(TrainState::bytes_of(&groups, &buffers), cx.most_blob_bytes())?;
+    let mut state = TrainState::new(groups, buffers);
     let mut saved_at = begin(objective, &mut state, cx)?;
     let mut save_is_due = false;
     let mut stop = false;
@@ -214,10 +216,32 @@ pub fn train(
         save_is_due |= every > 0 && state.step.is_multiple_of(every);
         stop = drain;
         if cx.leads() && state.step < steps && save_is_due && !stop && cx.can_save() {
-            save(&mut state, config, &recent, cx)?;
-            (saved_at, save_is_due) = (Some(state.step), false);
+            cx.may_postpone(true);
+            let saved = save(&mut state, config, &recent, cx);
+            cx.may_postpone(false);
+            match saved {
+                Ok(()) => (saved_at, save_is_due) = (Some(state.step), false),
+                Err(StageError::Context(ContextError::Unavailable(why))) if !cx.can_save() => {
+                    cx.log(&format!("the checkpoint after step {} is put off: {why}", state.step));
+                }
+                Err(error) => return Err(error),
+            }
         }
     }
+}
+
+/// Refuses a state that the store would not take at the first checkpoint.
+fn check_size(bytes: u64, most: u64) -> Result<(), StageError> {
+    let file = bytes + state::HEADER_BYTES;
+    if file <= most {
+        return Ok(());
+    }
+    let gib = |bytes: u64| bytes as f64 / f64::from(1 << 30);
+    Err(StageError::Input(format!(
+        "the state of this training is one file of {:.1} GiB, expected at most {:.1} GiB; use a smaller `network`, or no `ema`",
+        gib(file),
+        gib(most)
+    )))
 }
 
 /// Brings `state` to the gang's position or the task's last one. Only rank 0 reads the checkpoint, or the state of the
@@ -402,6 +426,17 @@ fn keep(state: &mut TrainState, accelerator: Option<&Device>) {
     }
 }
 
+/// What a checkpoint's manifest says. Workers of two builds may save one step, so it names none of them.
+fn meta(state: &TrainState, config: protocol::Digest, seed: protocol::Seed) -> serde_json::Value {
+    json!({
+        "step": state.step,
+        "settings": config,
+        "seed": seed,
+        "groups": state.groups.iter().map(|g| json!({"name": g.name, "parameters": g.params.len()})).collect::<Vec<_>>(),
+        "buffers": state.buffers.iter().map(|(name, v)| json!({"name": name, "values": v.len()})).collect::<Vec<_>>(),
+    })
+}
+
 fn save(
     state: &mut TrainState,
     config: protocol::Digest,
@@ -409,14 +444,7 @@ fn save(
     cx: &mut dyn GangContext,
 ) -> Result<(), StageError> {
     state.fetch();
-    let meta = json!({
-        "step": state.step,
-        "settings": config,
-        "seed": cx.task().seed,
-        "groups": state.groups.iter().map(|g| json!({"name": g.name, "parameters": g.params.len()})).collect::<Vec<_>>(),
-        "buffers": state.buffers.iter().map(|(name, v)| json!({"name": name, "values": v.len()})).collect::<Vec<_>>(),
-        "build": env!("CARGO_PKG_VERSION"),
-    });
+    let meta = meta(state, config, cx.task().seed);
     let mut draft = Draft::new(cx, ArtifactKind::Checkpoint, meta);
     state.saved(|pieces| draft.add_pieces(STATE_FILE, pieces))?;
     let digest = draft.finish(cx)?;
@@ -449,5 +477,29 @@ impl Recent {
         }
         let count = self.rows.len().max(1) as f64;
         sums.into_iter().map(|(key, sum)| (key, sum / count)).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_state_larger_than_a_file_may_be_is_refused_in_words() {
+        let refused = check_size(9 << 30, 8 << 30).map_err(|error| (error.class(), error.to_string()));
+        let Err((class, message)) = refused else { panic!("9 GiB are taken") };
+        assert_eq!(class, protocol::message::FailureClass::Input);
+        assert!(message.contains("9.0 GiB") && message.contains("at most 8.0 GiB"), "{message}");
+        assert!(check_size(7 << 30, 8 << 30).is_ok());
+    }
+
+    /// In a rolling upgrade a member of one build may save a step again that one of another build has saved: those are not two states.
+    #[test]
+    fn a_checkpoint_says_nothing_of_the_build_that_saved_it() {
+        let state = TrainState::new(Vec::new(), Vec::new());
+        let meta = meta(&state, protocol::Digest::of(b"settings"), protocol::Seed(1));
+        let keys: Vec<&str> = meta.as_object().expect("an object").keys().map(String::as_str).collect();
+        assert_eq!(keys, ["buffers", "groups", "seed", "settings", "step"]);
+        assert!(!meta.to_string().contains(env!("CARGO_PKG_VERSION")), "{meta}");
     }
 }

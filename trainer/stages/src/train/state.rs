@@ -12,7 +12,7 @@ use super::buffers::{BufferPlan, Buffers};
 use super::group::{Group, GroupPlan};
 
 /// The largest header of a saved state that is read; ours have some hundred bytes.
-const HEADER_BYTES: u64 = 1 << 20;
+pub(super) const HEADER_BYTES: u64 = 1 << 20;
 
 /// A saved state was not loaded.
 #[derive(Debug, thiserror::Error)]
@@ -48,6 +48,14 @@ impl TrainState {
         let names: usize = state.groups.iter().map(|group| 3 + usize::from(group.average.is_some())).sum();
         assert_eq!(state.values().len(), names + state.buffers.iter().count(), "every name stands for one buffer");
         state
+    }
+
+    /// Bytes of the values that a state of these plans saves, before any of it is in memory.
+    pub fn bytes_of(groups: &[GroupPlan], buffers: &[BufferPlan]) -> u64 {
+        let copies = |group: &GroupPlan| 3 + usize::from(group.average.is_some());
+        let values = groups.iter().map(|group| copies(group) * group.params.len()).sum::<usize>()
+            + buffers.iter().map(|buffer| buffer.values.len()).sum::<usize>();
+        (size_of::<f32>() * values) as u64
     }
 
     /// Copies the groups to `device` and trains there from now on.
@@ -266,6 +274,8 @@ mod tests {
         assert!(there.is_fetched() && near(&host, &there), "{host:#?}\n{there:#?}");
         // Training continues from the saved state, on the host and on the device.
         let bytes: Arc<[u8]> = there.saved(|pieces| pieces.concat()).into();
+        let header = bytes.len() as u64 - TrainState::bytes_of(&plans, &[]);
+        assert!((8..1000).contains(&header), "{header}: the step, names and lengths");
         let mut other = TrainState::new(plans.to_vec(), Vec::new());
         other.restore(&bytes).unwrap();
         other.keep_on(&device);

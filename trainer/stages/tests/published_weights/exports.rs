@@ -1,5 +1,6 @@
 //! Exports of imported weights, compared with the original files.
 
+use motion::DataPath;
 use std::collections::BTreeMap;
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
@@ -53,7 +54,7 @@ fn keep(ours: &Path, theirs: &Path, without: &[&str]) {
 /// `without`.
 pub(crate) fn expect_file(ours: &Path, theirs: &Path, without: &[&str]) {
     keep(ours, theirs, without);
-    let open = |path: &Path| Weights::open_file(path).unwrap_or_else(|e| panic!("{e}"));
+    let open = |path: &Path| Weights::open_file(&DataPath::local(path)).unwrap_or_else(|e| panic!("{e}"));
     let (ours_open, theirs_open) = (open(ours), open(theirs));
     let kept = |name: &&String| !without.iter().any(|begin| name.starts_with(begin));
     let names: Vec<&String> = theirs_open.tensors().keys().filter(kept).collect();

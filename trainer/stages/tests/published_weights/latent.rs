@@ -22,6 +22,7 @@ use crate::world::{FORWARD, World, blank, part, size, text_of, vae, with_file};
 
 #[test]
 fn vaes_give_what_they_were_published_with() {
+    protocol::show_excerpts();
     for folder in with_file("01_", "weights.ckpt") {
         let (mut world, mut gates) = (World::new(), Gates::default());
         let config = json(&folder.join("config.json"));
@@ -83,6 +84,7 @@ pub(crate) fn motion_lcm(world: &mut World, folder: &Path, file: &Path) -> (Dige
 
 #[test]
 fn motion_lcm_and_its_control_part_give_what_they_were_published_with() {
+    protocol::show_excerpts();
     for folder in with_file("02_control", "weights.ckpt") {
         let (mut world, mut gates) = (World::new(), Gates::default());
         let file = folder.join("weights.ckpt");

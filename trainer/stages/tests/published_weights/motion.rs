@@ -3,6 +3,7 @@
 use checkpoint::published::Layout;
 use models::kernels::Dropout;
 use models::networks::Mdm;
+use motion::DataPath;
 use protocol::artifact::Role;
 use protocol::stage::{DataFormat, ImportModel, ImportedPart};
 use stages::published::{Checkpoint, sizes};
@@ -20,7 +21,7 @@ fn mdm_gives_what_it_was_published_with() {
         let constructor = &config["constructor"];
         let (file, heads) = (folder.join("weights.ckpt"), size(constructor, "num_heads"));
         let features = size(constructor, "njoints");
-        let opened = Checkpoint::open(&file).expect("a checkpoint");
+        let opened = Checkpoint::open(&DataPath::local(&file)).expect("a checkpoint");
         let found = sizes::mdm(&opened).expect("an MDM");
         let sizes = sizes::of_mdm(&found, heads).expect("its sizes");
         let text = world.text(size(constructor, "clip_dim"));

@@ -29,6 +29,7 @@ fn changed(from: &Path, to: &Path, change: &dyn Fn(&mut Named)) {
 
 #[test]
 fn what_makes_no_whole_network_is_refused_with_all_that_is_wrong() {
+    protocol::show_excerpts();
     let Some(folder) = with_file("01_vae_v2", "weights.ckpt").into_iter().next() else { return };
     let mut world = World::new();
     let (from, to) = (folder.join("weights.safetensors"), world.folder.path().join("changed.safetensors"));
@@ -87,6 +88,7 @@ fn what_makes_no_whole_network_is_refused_with_all_that_is_wrong() {
 
 #[test]
 fn nothing_of_a_file_is_run_and_none_but_weights_are_read() {
+    protocol::show_excerpts();
     let mut world = World::new();
     let owned = world.folder.path().join("owned");
     let command = format!("touch {}", owned.display());
@@ -110,6 +112,7 @@ fn nothing_of_a_file_is_run_and_none_but_weights_are_read() {
 
 #[test]
 fn what_is_of_another_kind_or_of_another_vae_is_refused() {
+    protocol::show_excerpts();
     let Some(folder) = with_file("02_control", "weights.ckpt").into_iter().next() else { return };
     let mut world = World::new();
     let (file, config) = (folder.join("weights.ckpt"), json(&folder.join("config.json")));

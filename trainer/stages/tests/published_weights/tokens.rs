@@ -1,5 +1,6 @@
 //! Tokenizers, their generators and the flow decoder (`05_*`, `06_*`).
 
+use motion::DataPath;
 use std::path::Path;
 
 use checkpoint::published::Layout;
@@ -95,7 +96,7 @@ fn token_generators_give_what_they_were_published_with() {
         let generator = world.part(model, &Role::GENERATOR);
         assert_eq!(generator.meta["longest"], size(&config, "block_size") - 2);
         world.expect_bits(&generator, &folder.join("weights.safetensors"), &str::to_owned);
-        let opened = Checkpoint::open(&file).expect("a checkpoint");
+        let opened = Checkpoint::open(&DataPath::local(&file)).expect("a checkpoint");
         let sizes = sizes::of_gpt(&sizes::gpt(&opened).expect("it"), 1, heads).expect("its sizes");
         let network = world.load(Gpt::new(&sizes, &mut blank(&device)), &generator, "");
         for case in ["full", "short"] {
@@ -130,7 +131,7 @@ fn token_generators_give_what_they_were_published_with() {
         let alone = world.import(&ImportModel { residual: String::new(), ..settings }, &inputs).unwrap_err();
         assert!(alone.contains("set `residual`"), "{alone}");
 
-        let opened = Checkpoint::open(&residual).expect("a checkpoint");
+        let opened = Checkpoint::open(&DataPath::local(&residual)).expect("a checkpoint");
         let sizes = sizes::of_residual(&sizes::residual(&opened).expect("it"), heads).expect("its sizes");
         let first = world.load(MaskedTransformer::new(&sizes, &mut blank(&device)), &generator, "mask.");
         let above = world.load(ResidualTransformer::new(&sizes, true, &mut blank(&device)), &generator, "res.");
@@ -150,7 +151,7 @@ fn mmm_is_read_without_the_tokenizer_in_its_file() {
     for folder in with_file("05_mmm", "weights.safetensors") {
         let mut world = World::new();
         let file = folder.join("weights.safetensors");
-        let opened = Checkpoint::open(&file).expect("a checkpoint");
+        let opened = Checkpoint::open(&DataPath::local(&file)).expect("a checkpoint");
         let found = sizes::mmm(&opened).expect("it");
         let sizes = sizes::of_mmm(&found, 1, 1).expect("its sizes");
         let inputs = [("tokenizer", stand_in(&world, sizes.codes, 1, sizes.dim)), ("text", world.text(sizes.text_dim))];
@@ -181,7 +182,7 @@ fn discord_gives_what_it_was_published_with() {
         }
         let decoder = world.manifest(decoder);
         world.expect_bits(&decoder, &folder.join("weights.safetensors"), &str::to_owned);
-        let opened = Checkpoint::open(&file).expect("a checkpoint");
+        let opened = Checkpoint::open(&DataPath::local(&file)).expect("a checkpoint");
         let sizes = sizes::of_unet(&sizes::unet(&opened).expect("it"), (heads, 32)).expect("its sizes");
         let network = world.load(FlowUnet::new(&sizes, &mut blank(&device)), &decoder, "");
         for case in io.cases() {

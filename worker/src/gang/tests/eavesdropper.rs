@@ -1,11 +1,12 @@
-//! Somebody on the way between two members, who records what passes.
+//! An eavesdropper between two members, who records the traffic.
 
 use std::io::{Read as _, Write as _};
 use std::net::{Shutdown, SocketAddr, TcpListener, TcpStream};
 
 use super::*;
 
-/// Passes everything on to `server` and keeps it. On an address of its own, so that those who dial it see their connection leave.
+/// Forwards everything to `server` and records it. It has its own address, so that dialers see their connection leave
+/// the machine.
 fn recorder(server: SocketAddr, seen: &Arc<Mutex<Vec<u8>>>) -> SocketAddr {
     let listener = TcpListener::bind("127.0.0.2:0").expect("loopback");
     let address = listener.local_addr().expect("bound");
@@ -54,7 +55,7 @@ fn what_leaves_the_machine_is_encrypted_and_changes_no_bits() {
     }
     let seen = lock(&seen);
     assert!(seen.len() > plan.length * 4, "the exchange passed by: {} bytes", seen.len());
-    // Sums of the first step, as they lie in memory: 16 bytes of them anywhere give the traffic away.
+    // Sums of the first step in memory layout. A match of 16 bytes anywhere means that the traffic is readable.
     let sum = reference(1, plan.slices, plan.length);
     let bytes: &[u8] = bytemuck::cast_slice(&sum);
     for at in (0..bytes.len() - 16).step_by(bytes.len() / 50) {

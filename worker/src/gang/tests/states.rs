@@ -1,10 +1,11 @@
-//! States on their way from one member to another.
+//! Transfers of states between members.
 
 use std::thread;
 
 use super::{Gang, Halt, Head, Kind, QUICK, exchange, mesh, wait_until};
 use crate::gang::exchange::Met;
 use crate::gang::frame::MAX_PAYLOAD;
+use crate::gang::mesh::STATE_FRAMES;
 
 const BARRIER: &str = "barrier `rendezvous` of generation 7";
 
@@ -23,7 +24,7 @@ fn a_state_arrives_where_it_belongs_however_it_is_cut() {
                 let pieces = [&state[..8], &state[8..], b"rows behind it"];
                 assert_eq!(exchange::rendezvous(&ahead, Some(5), &pieces, &|| None), Ok(Met::Keep));
             });
-            assert_eq!(exchange::rendezvous(&behind, applied, &[], &|| None), Ok(Met::Behind(0)));
+            assert_eq!(exchange::rendezvous(&behind, applied, &[], &|| None), Ok(Met::Behind(0, 5)));
             let mut room = vec![0; state.len()];
             let mut rest = room.as_mut_slice();
             let mut pieces = Vec::new();
@@ -38,17 +39,17 @@ fn a_state_arrives_where_it_belongs_however_it_is_cut() {
             assert!(room == state);
         });
     }
-    // Of another build, say.
+    // A state of another length, as another build may send.
     thread::scope(|scope| {
         scope.spawn(|| exchange::rendezvous(&ahead, Some(5), &[&state[..100]], &|| None).expect("sent"));
-        assert_eq!(exchange::rendezvous(&behind, None, &[], &|| None), Ok(Met::Behind(0)));
+        assert_eq!(exchange::rendezvous(&behind, None, &[], &|| None), Ok(Met::Behind(0, 5)));
         let refused = exchange::adopt(&behind, 0, &mut [&mut [0; 101]], true, &|| None);
         assert!(matches!(&refused, Err(Halt::Disagree(why)) if why.contains("100 bytes, expected 101")), "{refused:?}");
     });
     [ahead, behind].into_iter().for_each(|mesh| mesh.close(None));
 }
 
-/// A member that came with a state of its own has it yet when the one that is ahead is lost.
+/// A member that came with a state of its own still has it after the sender is lost.
 #[test]
 fn a_state_that_is_cut_short_takes_the_place_of_none() {
     let gang = Gang::new(2, QUICK);
@@ -64,18 +65,18 @@ fn a_state_that_is_cut_short_takes_the_place_of_none() {
     behind.close(None);
 }
 
-/// What is not taken waits with its sender, and not in memory here.
+/// Unread frames of a state wait with their sender and not in memory here.
 #[test]
 fn a_state_is_queued_within_bounds() {
     let gang = Gang::new(2, QUICK);
     let [ahead, behind] = [0, 1].map(|own| mesh(&gang, &[0, 1], own, "s").0);
-    let state = bytes(96 * MAX_PAYLOAD);
+    let state = bytes(96 << 20);
     thread::scope(|scope| {
         let sending = scope.spawn(|| exchange::rendezvous(&ahead, Some(5), &[&state], &|| None));
-        assert_eq!(exchange::rendezvous(&behind, None, &[], &|| None), Ok(Met::Behind(0)));
-        wait_until("as much as may be is queued", || behind.queued(0) == 16);
+        assert_eq!(exchange::rendezvous(&behind, None, &[], &|| None), Ok(Met::Behind(0, 5)));
+        wait_until("as much as may be is queued", || behind.queued(0) == STATE_FRAMES);
         thread::sleep(QUICK.patience / 4);
-        assert!(behind.queued(0) <= 17 && !sending.is_finished(), "{} frames are here", behind.queued(0));
+        assert!(behind.queued(0) <= STATE_FRAMES + 1 && !sending.is_finished(), "{} frames are here", behind.queued(0));
         let mut room = vec![0; state.len()];
         assert_eq!(exchange::adopt(&behind, 0, &mut [&mut room], true, &|| None), Ok(Vec::new()));
         assert!(room == state);

@@ -1,4 +1,4 @@
-//! Peers that do not belong, or do not behave.
+//! Peers that do not belong to the gang, or misbehave.
 
 use std::io::Write as _;
 use std::net::{SocketAddr, TcpStream};
@@ -19,7 +19,7 @@ fn a_peer_with_another_secret_never_gets_in() {
     second.close(None);
 }
 
-/// Connects as rank 1 with the right secret, then sends what `bytes` makes of the session.
+/// Connects as rank 1 with the right secret, then sends the result of `bytes`.
 fn misbehave(bytes: impl FnOnce(&mut Seal) -> Vec<u8>) -> Arc<Mesh> {
     let gang = Gang::new(2, QUICK);
     let (mesh, _) = mesh(&gang, &[0, 1], 0, "s");
@@ -47,7 +47,7 @@ fn a_changed_frame_ends_the_connection() {
     mesh.close(None);
 }
 
-/// What somebody on the way could do without the key: send a frame of its own, or a recorded one again.
+/// Attacks on the path without the key: a forged frame, and a replayed one.
 #[test]
 fn a_frame_that_the_peer_did_not_send_there_ends_the_connection() {
     let forged = misbehave(|_| frame_under(&mut Seal::tagged([0; 32])));
@@ -69,8 +69,8 @@ fn an_oversized_frame_ends_the_connection_without_being_read() {
     .close(None);
 }
 
-/// Sampled: as many as there is room for and half as many again, who send a byte now and then, and come again when they are
-/// turned away.
+/// Sampled: half as many strangers again as there is room for. They send a byte now and then and reconnect when they
+/// are dropped.
 #[test]
 fn slow_strangers_keep_no_peer_out() {
     let gang = Gang::new(2, QUICK);
@@ -119,7 +119,7 @@ fn dial(gang: &Gang, of: &TaskId, generation: u64, from: usize, to: usize) -> Re
     handshake::dial(&stream, of, Generation(generation), from, to, "s").map(drop)
 }
 
-/// With the right secret, so that nothing but the check in question stands between it and the gang.
+/// Uses the right secret, so that only the tested check can refuse it.
 #[test]
 fn a_peer_of_another_generation_task_or_rank_never_gets_in() {
     let gang = Gang::new(2, QUICK);
@@ -150,7 +150,15 @@ fn members_at_different_steps_or_with_other_slices_add_nothing_up() {
                         let numbers = [1.0f32; 10];
                         let own = tree::share(slices, mesh.config.rank, 2);
                         let parts = own.map(|slice| (slice..slice + 1, &numbers[..])).collect();
-                        let contribution = exchange::Contribution { step, slices, parts, drain: false, durable: 0 };
+                        let contribution = exchange::Contribution {
+                            step,
+                            slices,
+                            parts,
+                            drain: false,
+                            saved: false,
+                            computed: Duration::ZERO,
+                            durable: 0,
+                        };
                         exchange::exchange(mesh, &contribution, &|| None)
                     })
                 })
@@ -158,7 +166,7 @@ fn members_at_different_steps_or_with_other_slices_add_nothing_up() {
             threads.into_iter().map(|thread| thread.join().expect("no panic")).collect()
         });
         for sum in sums {
-            // At the greeting, before anything is added.
+            // At the first frame, before anything is added.
             assert!(matches!(&sum, Err(Halt::Disagree(why)) if why.contains("is at step")), "{sum:?}");
         }
         for mesh in meshes {

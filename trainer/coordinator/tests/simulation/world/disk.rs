@@ -1,13 +1,14 @@
-//! The coordinator's batches on a disk that takes its time: what is asked waits in the queue while a transaction is in flight, and
-//! an answer says only what is stored.
+//! The coordinator's batches on a slow disk. Requests wait in the queue while a transaction is in flight, and an answer
+//! reveals only stored data.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use coordinator::batch::{Ask, Done, Turn};
+use coordinator::state::task::Part;
 use coordinator::state::worker::Presence;
 use coordinator::{Effect, Event, Millis, Moment, Refused};
-use protocol::message::TaskOutcome;
+use protocol::message::{Member, TaskOutcome};
 use protocol::{Digest, Incarnation, WorkerId};
 use registry::{Write, WriteError};
 
@@ -16,7 +17,7 @@ use crate::random::Random;
 use crate::store::{FakeStore, Refusal};
 use crate::worker::{Answer, Call, Saving};
 
-/// How long a transaction may take, at its worst.
+/// Longest duration of a transaction.
 const SLOW_MS: u64 = 4_000;
 
 /// The transaction in flight.
@@ -24,14 +25,14 @@ const SLOW_MS: u64 = 4_000;
 pub(super) enum Disk {
     #[default]
     Idle,
-    /// Decided; nothing of it is on the disk.
+    /// Decided; nothing is on the disk.
     Writing { until: Millis, writes: Vec<Write> },
-    /// Another process would read it, but power that fails takes it back to `before`.
+    /// Visible to other processes, but a loss of power would restore `before`.
     Written { until: Millis, before: Box<FakeStore> },
 }
 
 impl Disk {
-    /// What is in flight arrives now.
+    /// Completes the current phase at once.
     pub(super) fn hurry(&mut self) {
         match self {
             Self::Idle => {}
@@ -39,26 +40,26 @@ impl Disk {
         }
     }
 
-    /// What was in flight.
+    /// Removes and returns the transaction in flight.
     pub(super) fn lose(&mut self) -> Self {
         std::mem::take(self)
     }
 }
 
-/// Who asked.
+/// The source of a request.
 #[derive(Debug)]
 pub(super) enum Ticket {
-    /// A worker; whether its report was stale when it came.
+    /// A worker; `stale` is set if its report was outdated on arrival.
     Call { i: usize, process: u32, call: Box<Call>, at: Millis, stale: bool },
-    /// A client, who asks again until it is answered.
+    /// A client, which repeats its request until it is answered.
     Submission(Box<Event>),
-    /// The coordinator itself, about something that it wants done.
+    /// The coordinator itself, for an effect.
     Effect(Box<Effect>),
-    /// Its clock.
+    /// The coordinator's timer.
     Tick { at: Millis },
     /// The caller that waits in [`World::happen`].
     Caller,
-    /// Somebody who has gone away.
+    /// A caller that does not wait for the answer.
     Nobody,
 }
 
@@ -66,7 +67,7 @@ fn moment(now: Millis, random: &mut Random) -> impl FnMut() -> Moment {
     move || Moment { now, entropy: random.digest() }
 }
 
-/// What was uploaded for what is to be stored.
+/// Uploaded blobs that the writes name.
 fn named(writes: &[Write]) -> Vec<Digest> {
     let named = writes.iter().flat_map(|write| match write {
         Write::Checkpoint { manifest, .. } => vec![*manifest],
@@ -87,7 +88,7 @@ impl World {
         self.batches.ask(ask, self.tickets);
     }
 
-    /// Whatever the coordinator and its disk can do by now.
+    /// Completes all work of the coordinator and its disk that is due.
     pub(super) fn advance(&mut self) {
         while self.up && self.turn() {}
         let now = self.now;
@@ -95,7 +96,7 @@ impl World {
             std::mem::take(&mut self.snapshots).into_iter().partition(|(at, _)| *at <= now);
         self.snapshots = later;
         for (_, state) in due {
-            // Of those that overtake one another the newest stays, as in the store.
+            // If snapshots overtake each other, the newest one stays, as in the real store.
             let newest = self.store.recovery.snapshot.as_ref().map_or(0, |(seq, _)| *seq);
             if self.up && state.seq > newest {
                 if state.seq < self.store.seq() {
@@ -106,7 +107,7 @@ impl World {
         }
     }
 
-    /// One thing that the coordinator or its disk does; `false` if there is nothing to do now.
+    /// Performs one action of the coordinator or its disk; returns `false` if none is due.
     pub(super) fn turn(&mut self) -> bool {
         let now = self.now;
         match std::mem::take(&mut self.disk) {
@@ -148,7 +149,7 @@ impl World {
             return self.conclude(Err(WriteError::Storage("full".into())));
         }
         if self.chaos() && self.random.chance(1) {
-            // It was being written: the database rolls it back, whatever part of it lay on the disk.
+            // The database rolls back an interrupted write, even if a part of it is on the disk.
             self.disk = Disk::Writing { until: self.now, writes };
             self.crash();
             return false;
@@ -195,7 +196,7 @@ impl World {
         self.take(turn)
     }
 
-    /// What survives a loss of power now.
+    /// The data that would survive a loss of power now.
     pub(super) fn synced(&self) -> &FakeStore {
         match &self.disk {
             Disk::Written { before, .. } => before,
@@ -203,7 +204,7 @@ impl World {
         }
     }
 
-    /// The power fails: every process on the machine ends, and what was not synced has never been.
+    /// Simulates a loss of power: all processes on the machine end, and unsynced writes are undone.
     pub(super) fn lose_power(&mut self) {
         if let Disk::Written { before, .. } = self.disk.lose() {
             self.store = *before;
@@ -228,6 +229,7 @@ impl World {
         self.events += answers.len() as u64;
         self.check_leases(&answers);
         self.present = self.present_now();
+        self.check_steps();
         let state = self.state();
         let suspected = |presence| matches!(presence, Presence::Suspect { since } if since == state.now);
         if done.durable && state.workers.values().any(|worker| suspected(worker.presence)) {
@@ -254,9 +256,51 @@ impl World {
         }
     }
 
-    /// Kills the coordinator if a test wants that after this batch.
+    /// Checks that a polling member that must leave its gang costs the gang at most the step in progress.
+    fn check_steps(&mut self) {
+        let state = Arc::clone(self.batches.state());
+        let mut gangs = BTreeMap::new();
+        for task in state.executions.values().flat_map(|execution| &execution.tasks) {
+            if task.part == Part::Gang && task.is_held() {
+                gangs.insert(task.id.clone(), (task.attempt, task.holders().to_vec()));
+            }
+        }
+        for (task, (attempt, before)) in std::mem::replace(&mut self.gangs, gangs) {
+            let Some((now, after)) = self.gangs.get(&task).filter(|(now, _)| *now == attempt) else { continue };
+            let process = |member: &Member| self.workers.iter().find(|worker| worker.is(member));
+            // A member may have died since its last poll.
+            if !after.iter().all(|member| process(member).is_some()) {
+                continue;
+            }
+            let live = |member: &Member| process(member).and_then(|worker| worker.live_of(&task, *now));
+            // A member's report is believed. The coordinator cannot know that a late answer made it discard the state.
+            let kept =
+                |member: &Member| process(member).and_then(|worker| worker.has_or_was_misled_out_of(&task, *now));
+            let reported =
+                state.task(&task).ok().and_then(|(_, task)| Some(task.reported.as_ref()?.grant.worker.clone()));
+            let had_to_leave = |member: &&Member| {
+                if reported.as_ref() == Some(&member.worker) {
+                    return false;
+                }
+                let process = state.workers.get(&member.worker).filter(|w| w.incarnation == member.incarnation);
+                let is_out =
+                    matches!(process.map(|w| w.presence), Some(Presence::Suspect { since }) if since == state.now);
+                let heard = state.heard.workers.get(&member.worker);
+                is_out && heard.is_some_and(|heard| state.now.since(*heard) < state.policy.hearing_ms)
+            };
+            let left =
+                before.iter().filter(|member| !after.contains(member)).filter(had_to_leave).filter_map(live).max();
+            let kept = after.iter().filter_map(kept).max();
+            assert!(
+                left.is_none_or(|left| kept.is_some_and(|kept| kept + 1 >= left)),
+                "`{task}` went from step {left:?} to {kept:?}: {before:?} to {after:?}"
+            );
+        }
+    }
+
+    /// Kills the coordinator if the test requests this after the current batch.
     fn is_killed_now(&mut self, answers: &[(Ticket, Result<Vec<Effect>, Refused>)]) -> bool {
-        // A worker that never hears that it has joined joins for ever.
+        // Joins are spared: a worker that never gets the answer would join forever.
         let joins = |ticket: &Ticket| matches!(ticket, Ticket::Call { call, .. } if matches!(**call, Call::Join(_)));
         let spared = answers.iter().any(|(ticket, _)| matches!(ticket, Ticket::Caller) || joins(ticket) && !self.once);
         let Some((every, from)) = self.kills else { return false };
@@ -273,7 +317,7 @@ impl World {
         }
         self.forget();
         self.recovered();
-        // Mostly facts are replayed, but not all of them each time.
+        // Recovery usually replays facts, but not always all of them.
         if self.stored.is_multiple_of(40) {
             let state = Arc::clone(self.batches.state());
             self.store.snapshot(&state);
@@ -306,12 +350,12 @@ impl World {
         }
     }
 
-    /// Nobody is told what a loss of power would take back.
+    /// Checks that an answer reveals nothing that a loss of power would undo.
     pub(super) fn acknowledge(&self, answer: &Answer) {
         let (synced, told) = (self.synced(), self.batches.front().state());
         assert!(told.seq <= synced.seq(), "decision {} is told and not stored", told.seq);
         match answer {
-            Answer::DesiredAssignments(desired) => {
+            Answer::DesiredAssignments(desired, _) => {
                 for assignment in &desired.assignments {
                     let (task, fence) = (&assignment.grant.task, assignment.grant.fence);
                     let stored = synced.fences.get(task);
@@ -331,7 +375,7 @@ impl World {
         }
     }
 
-    /// A worker whose polls were answered keeps its lease, by whichever way they were.
+    /// Checks that a worker with answered polls keeps its lease, with or without the queue.
     fn check_leases(&mut self, answers: &[(Ticket, Result<Vec<Effect>, Refused>)]) {
         let ticks = answers.iter().filter_map(|(ticket, _)| match ticket {
             Ticket::Tick { at } => Some(*at),
@@ -350,7 +394,7 @@ impl World {
         }
     }
 
-    /// The processes that have a lease.
+    /// Processes with a lease.
     pub(super) fn present_now(&self) -> BTreeMap<WorkerId, Incarnation> {
         let here = self.state().workers.iter().filter(|(_, worker)| !worker.is_away());
         here.map(|(name, worker)| (name.clone(), worker.incarnation)).collect()

@@ -1,17 +1,18 @@
-//! What happens in a quarter of a second: mischief, what the coordinator hears and does, what the workers say and compute.
+//! A step of 250 ms: faults, calls and actions of the coordinator, then calls and work of the workers.
 
 use std::sync::Arc;
 
 use coordinator::batch::Ask;
 use coordinator::state::execution::StageExecution;
 use coordinator::state::run::Status;
+use coordinator::state::worker::Identity;
 use coordinator::{Control, Effect, Event, Millis, Moment, Observation, Refused, Rejected, State, decide, invariants};
 use protocol::message::{Poll, RunState};
 use protocol::{Digest, Incarnation, WorkerId};
 use registry::WriteError;
 
 use super::disk::{Disk, Ticket};
-use super::{World, durable};
+use super::{Cut, World, durable};
 use crate::wild;
 use crate::worker::{Answer, Call, FakeWorker, Saving};
 
@@ -19,7 +20,11 @@ impl World {
     fn deliver(&mut self, i: usize, process: u32, call: Call) {
         let name = self.workers[i].name.clone();
         let ask = match &call {
-            Call::Join(join) => Ask::Event(Box::new(Event::Join { join: join.clone() })),
+            Call::Join(join) => {
+                let secret = Digest::of(format!("{name} {process}").as_bytes());
+                let by = Identity { caller: "t".into(), secret };
+                Ask::Event(Box::new(Event::Join { join: join.clone(), by }))
+            }
             Call::Poll(poll) => match self.poll(&name, poll) {
                 Ok(Some(ask)) => ask,
                 Ok(None) => return self.send_desired(i, process, poll.incarnation),
@@ -41,7 +46,7 @@ impl World {
         self.ask(ask, ticket);
     }
 
-    /// Polls from which nothing follows are answered beside the queue.
+    /// Passes a poll to the front, which answers it without the queue if it has no consequences.
     fn poll(&mut self, name: &WorkerId, poll: &Poll) -> Result<Option<Ask>, Rejected> {
         let asked = self.batches.front().poll(self.now, name.clone(), poll.clone())?;
         if asked.is_none() {
@@ -53,7 +58,7 @@ impl World {
         Ok(asked)
     }
 
-    /// The sender of the call is told what came of it.
+    /// Answers the sender of a call.
     pub(super) fn answer_call(
         &mut self,
         (i, process): (usize, u32),
@@ -85,16 +90,16 @@ impl World {
                 assert!(!stale || effects.is_empty(), "a stale report counted");
                 if stale { Answer::Refused(saving) } else { Answer::Done(saving) }
             }
-            // The process is not known any more.
+            // The process is no longer known.
             (Call::Join(_) | Call::Poll(_), Err(Refused::Rejected(_))) => return self.send_away(i, process),
             (Call::Commit(_) | Call::Report(_), Err(Refused::Rejected(_))) => Answer::Refused(saving),
-            // What it named is gone; the try has failed.
+            // A named blob is missing, so the attempt has failed.
             (call, Err(Refused::Write(WriteError::NotFound(_)))) => {
                 self.count(match call {
                     Call::Commit(_) => "a checkpoint refused for a missing blob",
                     _ => "an outcome refused for a missing blob",
                 });
-                // The next try uploads it again.
+                // The next attempt uploads it again.
                 self.store.collected.clear();
                 Answer::Refused(saving)
             }
@@ -109,7 +114,7 @@ impl World {
         let desired = self.batches.front().state().desired(&name, incarnation);
         match desired {
             Ok(desired) => {
-                let answer = Answer::DesiredAssignments(desired);
+                let answer = Answer::DesiredAssignments(desired, self.batches.front().state().seq);
                 self.acknowledge(&answer);
                 self.send_answer(i, process, answer);
             }
@@ -117,7 +122,7 @@ impl World {
         }
     }
 
-    /// The worker is to join again.
+    /// Makes the worker join again.
     fn send_away(&mut self, i: usize, process: u32) {
         if self.workers[i].process == process {
             self.workers[i].forget();
@@ -151,17 +156,30 @@ impl World {
                 }
                 if was_alive && self.up && self.random.chance(50) {
                     let worker = self.workers[i].name.clone();
-                    // The launcher tells what it saw; if that is lost, the lease does.
-                    self.ask(Ask::Event(Box::new(Event::WorkerGone { worker })), Ticket::Nobody);
+                    // If the launcher's report is lost, the lease expires instead.
+                    self.ask(Ask::Event(Box::new(Event::WorkerGone { worker, incarnation: None })), Ticket::Nobody);
                 }
             }
             40..48 => {
                 let other = self.random.below(self.workers.len() as u64) as usize;
                 if other != i {
                     let until = self.now.after(self.random.below(20_000));
-                    self.cuts.push((self.workers[i].name.clone(), self.workers[other].name.clone(), until));
-                    self.count("a cut between peers that both reach the coordinator");
+                    let (from, to) = (self.workers[i].name.clone(), self.workers[other].name.clone());
+                    let one_way = self.random.chance(50);
+                    self.cuts.push(Cut { from, to, one_way, until });
+                    self.count(match one_way {
+                        true => "a cut that only one of two peers notices",
+                        false => "a cut between peers that both reach the coordinator",
+                    });
                 }
+            }
+            60..66 => {
+                self.workers[i].refuses_until = self.now.after(self.random.below(40_000));
+                self.count("a refused peer port");
+            }
+            66..70 => {
+                self.workers[i].stuck_until = self.now.after(self.random.below(80_000));
+                self.count("a stage that hangs while its worker polls");
             }
             12..20 => {
                 self.workers[i].hung_until = self.now.after(self.random.below(40_000));
@@ -199,7 +217,7 @@ impl World {
         }
     }
 
-    /// The collector runs: whatever is on its way here and named by nothing that is stored goes.
+    /// Runs the garbage collector, which deletes uploads in transit that no stored row names.
     fn collect(&mut self) {
         let named: Vec<Digest> = self.calls.iter().filter_map(|(.., call)| call.uploaded()).collect();
         let loose: Vec<Digest> = named.into_iter().filter(|digest| !self.store.is_rooted(*digest)).collect();
@@ -222,7 +240,7 @@ impl World {
             if self.up {
                 let paused = self.state().runs.values().filter(|run| run.state == RunState::Paused);
                 for run in paused.map(|run| run.id.clone()).collect::<Vec<_>>() {
-                    // It may end meanwhile.
+                    // The run may end meanwhile.
                     drop(self.control(&run, Control::Resume));
                 }
             }
@@ -265,7 +283,7 @@ impl World {
             std::mem::take(&mut self.effects).into_iter().partition(|(at, _)| *at <= now);
         self.effects = later;
         for (_, effect) in due {
-            // A killed coordinator's effects died with it; the next one asks for them again.
+            // The effects of a killed coordinator are lost; the next one requests them again.
             if self.up {
                 self.perform(effect);
             }
@@ -273,7 +291,7 @@ impl World {
         for (_, i, process, call) in extract(&mut self.calls, now) {
             if self.up {
                 self.deliver(i, process, call);
-                // What comes close together is decided together, or not.
+                // Calls that arrive together are sometimes decided together.
                 if self.random.chance(30) {
                     self.advance();
                 }
@@ -283,7 +301,7 @@ impl World {
         self.advance();
     }
 
-    /// The clock is looked at every second, but for when it oversleeps or its look waits for the disk.
+    /// Ticks once a second, unless the process oversleeps or the tick waits for the disk.
     fn clock(&mut self) {
         let now = self.now;
         if self.chaos() && self.asleep.is_none() && self.random.chance(1) {
@@ -293,7 +311,7 @@ impl World {
             Some((until, _)) if now < until => return,
             Some((_, since)) => {
                 self.asleep = None;
-                // A process that was stopped, or a slow disk: the clock knows which.
+                // The delay is a stopped process or a slow disk; the timer can tell which.
                 let is_stopped = self.random.chance(50);
                 self.count(match is_stopped {
                     true => "a late tick of a clock that overslept",
@@ -312,7 +330,7 @@ impl World {
     fn perform(&mut self, effect: Effect) {
         let event = match &effect {
             Effect::Lookup { key } => self.store.look_up(*key),
-            Effect::Register { key, candidates } => Event::Bundled {
+            Effect::Register { key, candidates, .. } => Event::Bundled {
                 key: *key,
                 bundles: candidates.iter().map(|c| Digest::of(c.stage.as_str().as_bytes())).collect(),
             },
@@ -321,7 +339,7 @@ impl World {
         self.ask(Ask::Event(Box::new(event)), Ticket::Effect(Box::new(effect)));
     }
 
-    /// Whatever could happen now, on copies: nothing panics, and the invariants hold.
+    /// Tries every event on copies of the state: none panics, and the invariants hold.
     fn try_everything(&mut self) {
         for event in wild::events(self.state(), &self.runs()) {
             let moment = Moment { now: self.now, entropy: Digest::of(b"wild") };
@@ -337,18 +355,30 @@ impl World {
 
     fn workers_step(&mut self) {
         let now = self.now;
-        self.cuts.retain(|(_, _, until)| *until > now);
+        self.cuts.retain(|cut| cut.until > now);
         let cuts = self.cuts.clone();
-        let is_cut = |a: &WorkerId, b: &WorkerId| cuts.iter().any(|(x, y, _)| (x, y) == (a, b) || (x, y) == (b, a));
+        let refusing: Vec<WorkerId> =
+            self.workers.iter().filter(|worker| worker.refuses_until > now).map(|worker| worker.name.clone()).collect();
+        let notices = |a: &WorkerId, b: &WorkerId| {
+            let cut = |cut: &Cut| (&cut.from, &cut.to) == (a, b) || (!cut.one_way && (&cut.to, &cut.from) == (a, b));
+            a != b && (refusing.contains(b) || cuts.iter().any(cut))
+        };
+        let is_cut = |a: &WorkerId, b: &WorkerId| notices(a, b) || notices(b, a);
+        let is_stuck = |worker: &&FakeWorker| worker.is_stuck(now);
+        let stuck: Vec<WorkerId> = self.workers.iter().filter(is_stuck).map(|worker| worker.name.clone()).collect();
         for i in 0..self.workers.len() {
             let (process, own) = (self.workers[i].process, self.workers[i].name.clone());
             let unreachable: Vec<WorkerId> = self
                 .workers
                 .iter()
-                .filter(|other| !other.runs(now) || is_cut(&own, &other.name))
+                .filter(|other| !other.runs(now) || notices(&own, &other.name))
                 .map(|other| other.name.clone())
                 .collect();
-            for call in self.workers[i].speak(now, &unreachable) {
+            let lies = self.chaos() && self.workers[i].lies;
+            for call in self.workers[i].speak(now, &unreachable, &stuck, lies) {
+                if lies && matches!(&call, Call::Poll(poll) if poll.doing.iter().any(|doing| !doing.lost.is_empty())) {
+                    self.count("a false complaint");
+                }
                 let twice = self.chaos() && self.random.chance(8);
                 if twice {
                     self.count("a call that came twice");
@@ -368,13 +398,13 @@ impl World {
             let peers: Vec<&FakeWorker> =
                 self.workers.iter().filter(|w| members.iter().any(|member| member.worker == w.name)).collect();
             let apart = |peer: &&FakeWorker| peers.iter().any(|other| is_cut(&peer.name, &other.name));
-            let together = !peers.is_empty()
-                && !peers.iter().any(apart)
-                && peers.iter().all(|peer| peer.runs(now) && peer.grant().is_some_and(|g| g.fence == grant.fence));
+            let hangs = peers.len() > 1 && peers.iter().any(|peer| peer.is_stuck(now));
+            let in_step = |peer: &&FakeWorker| peer.runs(now) && peer.grant().is_some_and(|g| g.fence == grant.fence);
+            let together = !hangs && !peers.is_empty() && !peers.iter().any(apart) && peers.iter().all(in_step);
             let furthest = together.then(|| peers.iter().filter_map(|peer| peer.live(&grant)).max());
             let saved = task.and_then(|task| task.newest()).map_or(0, |saved| saved.step);
             let chaos = self.chaos();
-            // What the run of a task has from before it ended and was taken up again is not made again within it.
+            // Values from before the end and resumption of a run are not recomputed within it.
             let state = Arc::clone(self.batches.state());
             let reader = state.task(&grant.task).ok().map(|(execution, _)| execution);
             let can_be = |input| reader.is_some_and(|reader| is_given_here(&state, reader, input));
@@ -391,9 +421,9 @@ impl World {
     }
 }
 
-/// Whether what gave an input is in memory, in a run of its reader.
+/// Returns true if the producer of an input is in memory, in a run of its reader.
 fn is_given_here(state: &State, reader: &StageExecution, input: Digest) -> bool {
-    let runs = reader.users.keys().filter_map(|number| state.runs.get(number));
+    let runs = reader.users.iter().filter_map(|(number, _)| state.runs.get(number));
     let gave = |status: &Status| status.known().is_some_and(|known| known.outputs.values().any(|it| *it == input));
     let mut givers = runs.flat_map(|run| &run.stages).filter(|status| gave(status)).filter_map(Status::key);
     givers.any(|giver| state.executions.contains_key(&giver))

@@ -71,6 +71,7 @@ impl Default for DistillDiscord {
 
 impl StageSpec for DistillDiscord {
     const KIND: &'static str = "distill.discord";
+    const VERSION: u32 = 2;
     const SHAPE: Shape = Shape::Gang;
     const OUTPUT: Output = Output { name: "decoder", kind: ArtifactKind::FlowDecoder };
 

@@ -77,6 +77,7 @@ impl Default for EvaluateRecognition {
 
 impl StageSpec for EvaluateRecognition {
     const KIND: &'static str = "evaluate.recognition";
+    const VERSION: u32 = 2;
     const SHAPE: Shape = Shape::Plain;
     const OUTPUT: Output = Output { name: "report", kind: ArtifactKind::Report };
 

@@ -51,7 +51,7 @@ impl Default for EvaluateReconstruction {
 impl StageSpec for EvaluateReconstruction {
     const KIND: &'static str = "evaluate.reconstruction";
     // Version 2 adds PA-MPJPE, accelerations, sJPE, skating. Version 3 adds the length of a unit.
-    const VERSION: u32 = 3;
+    const VERSION: u32 = 4;
     const SHAPE: Shape = Shape::Map;
     const OUTPUT: Output = Output { name: "report", kind: ArtifactKind::Report };
 

@@ -9,6 +9,7 @@ use serde::{Deserialize, Serialize};
 use crate::ArtifactKind;
 use crate::artifact::Role;
 use crate::id::is_name;
+use crate::spelling::nearest;
 use crate::stage::{Mode, Neighbours, Output, Problems, Ref, Sampler, Shape, StageSpec, measured_with};
 
 /// `register`: registers model versions and promotes the best of them.
@@ -134,7 +135,10 @@ fn one_of(wanted: &str, given: &BTreeSet<String>) -> String {
     names.sort_by_key(|name| (name.contains('.') != wanted.contains('.'), std::cmp::Reverse(alike(wanted, name))));
     let more = names.len().saturating_sub(LISTED);
     let listed = names.iter().take(LISTED).map(|name| format!("`{name}`")).collect::<Vec<_>>().join(", ");
-    if more > 0 { format!("name one of {listed} and {more} more") } else { format!("name one of {listed}") }
+    let near = nearest(wanted, names.iter().map(|name| name.as_str()));
+    let meant = near.map(|near| format!("did you mean `{near}`? ")).unwrap_or_default();
+    let listed = format!("{meant}name one of {listed}");
+    if more > 0 { format!("{listed} and {more} more") } else { listed }
 }
 
 /// Number of equal letters at equal places.

@@ -132,8 +132,8 @@ impl TextEncoder {
 
 impl StageSpec for TextEmbed {
     const KIND: &'static str = "text.embed";
-    // Version 2 stores the encoder, version 3 adds published encoders and shards.
-    const VERSION: u32 = 3;
+    // Version 2 stores the encoder, version 3 adds published encoders and shards, version 4 rounds GELU differently.
+    const VERSION: u32 = 4;
     const SHAPE: Shape = Shape::Map;
     const OUTPUT: Output = Output { name: "embeddings", kind: ArtifactKind::Embeddings };
 

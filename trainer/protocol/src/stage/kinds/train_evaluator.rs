@@ -5,7 +5,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::import_evaluator::{VOCABULARY, WORDS_ORIGIN};
-use crate::stage::{Batch, Decay, Optimizer, Output, Problems, Ref, Shape, StageSpec, Training};
+use crate::stage::{Batch, Decay, LossChange, Optimizer, Output, Problems, Ref, Shape, StageSpec, Training};
 use crate::{ArtifactKind, Steps};
 
 /// Size of an evaluator. The published one: 512, 1024, 512, 512, dropout 0.2.
@@ -146,6 +146,11 @@ impl StageSpec for TrainEvaluator {
 
     fn recorded(&self) -> &'static [&'static str] {
         &["loss", "reconstruction", "positive", "negative"]
+    }
+
+    fn loss_changes(&self) -> Vec<LossChange> {
+        let what = "movements are trained; from here the loss is that of matching captions and motions";
+        LossChange::behind(self.movement.until, self.training.steps, what, "movement.until").into_iter().collect()
     }
 }
 

@@ -124,6 +124,7 @@ impl Default for TrainMdm {
 
 impl StageSpec for TrainMdm {
     const KIND: &'static str = "train.mdm";
+    const VERSION: u32 = 2;
     const SHAPE: Shape = Shape::Gang;
     const OUTPUT: Output = Output { name: "model", kind: ArtifactKind::Model };
 

@@ -4,7 +4,9 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::ArtifactKind;
-use crate::stage::{Augment, Batch, LatentShape, Network, Output, Problems, Ref, Shape, StageSpec, Training};
+use crate::stage::{
+    Augment, Batch, LatentShape, LossChange, Network, Output, Problems, Ref, Shape, StageSpec, Training,
+};
 
 /// Weights of the VAE loss. Source: MotionLCM v2 (feature 1, joint 1, velocity 0, KL 1e-4).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -99,6 +101,7 @@ impl Default for TrainVae {
 
 impl StageSpec for TrainVae {
     const KIND: &'static str = "train.vae";
+    const VERSION: u32 = 2;
     const SHAPE: Shape = Shape::Gang;
     const OUTPUT: Output = Output { name: "vae", kind: ArtifactKind::Vae };
 
@@ -129,6 +132,15 @@ impl StageSpec for TrainVae {
         } else {
             &["loss", "feature", "joint", "kl", "feet"]
         }
+    }
+
+    fn loss_changes(&self) -> Vec<LossChange> {
+        let steps = self.training.steps;
+        let weighted = self.loss.joint > 0.0 || self.loss.feet > 0.0;
+        let terms = "the terms on joints and feet join the loss";
+        let terms = LossChange::behind(self.loss.joint_from, steps, terms, "loss.joint_from").filter(|_| weighted);
+        let clips = "training goes from short crops to whole clips, which are harder";
+        terms.into_iter().chain(LossChange::behind(self.windows.until, steps, clips, "windows.until")).collect()
     }
 
     fn latent(&self) -> Option<LatentShape> {

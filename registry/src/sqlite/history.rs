@@ -1,0 +1,135 @@
+//! History: what happened, when, to whom and why. Rows are added and, once they are old, removed; none is changed.
+
+use std::collections::BTreeMap;
+
+use protocol::message::Times;
+use protocol::{Group, ModelName, RunId, StageName, TaskId, WorkerId};
+use sqlx::query_builder::Separated;
+use sqlx::sqlite::SqliteRow;
+use sqlx::{QueryBuilder, Row, Sqlite, SqliteConnection};
+
+use super::statement::{insert, int, json, run};
+use crate::catalog::{HistoryQuery, HistoryRow};
+use crate::history::{HistoryEntry, HistoryKind};
+use crate::{QueryError, WriteError, clock};
+
+/// Adds what happened now.
+pub(super) async fn add(conn: &mut SqliteConnection, entries: &[HistoryEntry]) -> Result<(), WriteError> {
+    let now = clock::now_ms();
+    let values = |row: &mut Separated<'_, Sqlite, &'static str>, entry: &HistoryEntry| {
+        row.push_bind(now).push_bind(entry.kind.name());
+        row.push_bind(entry.run.as_ref().map(|run| run.as_str().to_owned()));
+        row.push_bind(entry.stage.as_ref().map(|stage| stage.as_str().to_owned()));
+        row.push_bind(entry.task.as_ref().map(|task| task.as_str().to_owned()));
+        row.push_bind(entry.attempt.map(int)).push_bind(entry.step.map(int));
+        row.push_bind(entry.worker.as_ref().map(|worker| worker.as_str().to_owned()));
+        row.push_bind(entry.model.as_ref().map(|model| model.as_str().to_owned()));
+        row.push_bind(entry.actor.clone()).push_bind(entry.why.clone());
+    };
+    let begin = "INSERT INTO history (at_ms, kind, run, stage, task, attempt, step, worker, model, actor, why) ";
+    insert(conn, begin, entries, values, "").await?;
+    for entry in entries {
+        let (Some(of_run), Some(stage)) = (&entry.run, &entry.stage) else { continue };
+        let set = match entry.kind {
+            HistoryKind::Granted => {
+                "INSERT INTO stage_times (run, stage, started_ms) VALUES (?, ?, ?) ON CONFLICT DO UPDATE SET ended_ms = NULL"
+            }
+            HistoryKind::Finished | HistoryKind::Failed => {
+                "INSERT INTO stage_times (run, stage, started_ms, ended_ms) VALUES (?1, ?2, ?3, ?3) \
+                 ON CONFLICT DO UPDATE SET ended_ms = excluded.ended_ms"
+            }
+            _ => continue,
+        };
+        run(conn, sqlx::query(set).bind(of_run.as_str()).bind(stage.as_str()).bind(now)).await?;
+    }
+    Ok(())
+}
+
+/// Removes rows from before a time; returns how many.
+pub(super) async fn prune(conn: &mut SqliteConnection, before_ms: i64) -> Result<u64, WriteError> {
+    run(conn, sqlx::query("DELETE FROM history WHERE at_ms < ?").bind(before_ms)).await
+}
+
+/// Rows in the order in which they happened. Those of runs of others than `group` are left out, if there is one.
+pub(super) async fn read(
+    conn: &mut SqliteConnection,
+    asked: &HistoryQuery,
+    group: Option<&Group>,
+) -> Result<Vec<HistoryRow>, QueryError> {
+    let mut find = QueryBuilder::<Sqlite>::new("SELECT * FROM history WHERE id > ");
+    find.push_bind(asked.after);
+    if let Some(of_run) = &asked.run {
+        find.push(" AND run = ").push_bind(of_run.as_str());
+    }
+    if let Some(worker) = &asked.worker {
+        find.push(" AND worker = ").push_bind(worker.as_str());
+    }
+    if let Some(since_ms) = asked.since_ms {
+        find.push(" AND at_ms >= ").push_bind(since_ms);
+    }
+    if let Some(group) = group {
+        find.push(" AND (run IS NULL OR run IN (SELECT run FROM run_owners WHERE owner = ").push_bind(group.as_str());
+        find.push(")) AND (model IS NULL OR model IN (SELECT model FROM model_owners WHERE owner = ")
+            .push_bind(group.as_str());
+        find.push("))");
+    }
+    find.push(" ORDER BY id LIMIT ").push_bind(asked.limit);
+    let rows = find.build().persistent(false).fetch_all(conn).await?;
+    let mut rows = rows.iter().map(history_row).collect::<Result<Vec<_>, _>>()?;
+    if group.is_some() {
+        // Workers are everyone's to see, the tokens that they came with are not.
+        rows.iter_mut().filter(|row| row.entry.run.is_none()).for_each(|row| row.entry.actor = None);
+    }
+    Ok(rows)
+}
+
+fn history_row(row: &SqliteRow) -> Result<HistoryRow, QueryError> {
+    let text = |column: &str| row.try_get::<Option<String>, _>(column);
+    let number = |column: &str| row.try_get::<Option<i64>, _>(column).map(|number| number.map(i64::unsigned_abs));
+    let name = row.try_get::<&str, _>("kind")?;
+    let kind = HistoryKind::ALL.into_iter().find(|kind| kind.name() == name);
+    let kind =
+        kind.ok_or_else(|| QueryError::Database(format!("`{name}` is no kind of history that this build knows")))?;
+    let entry = HistoryEntry {
+        kind,
+        run: text("run")?.map(RunId::new),
+        stage: text("stage")?.map(StageName::new),
+        task: text("task")?.map(TaskId::new),
+        attempt: number("attempt")?,
+        step: number("step")?,
+        worker: text("worker")?.map(WorkerId::new),
+        model: text("model")?.map(ModelName::new),
+        actor: text("actor")?,
+        why: text("why")?,
+    };
+    Ok(HistoryRow { id: row.try_get("id")?, at_ms: row.try_get("at_ms")?, entry })
+}
+
+/// Times of a run's stages by name, of those that were begun in its name.
+pub(super) async fn stage_times(
+    conn: &mut SqliteConnection,
+    of_run: &RunId,
+) -> Result<BTreeMap<StageName, Times>, QueryError> {
+    let find = sqlx::query("SELECT stage, started_ms, ended_ms FROM stage_times WHERE run = ?").bind(of_run.as_str());
+    let times = |row: &SqliteRow| -> Result<(StageName, Times), QueryError> {
+        let (started_ms, ended_ms) = (row.try_get("started_ms")?, row.try_get("ended_ms")?);
+        Ok((StageName::new(row.try_get::<String, _>("stage")?), Times { created_ms: None, started_ms, ended_ms }))
+    };
+    find.fetch_all(conn).await?.iter().map(times).collect()
+}
+
+/// Times of runs by name.
+pub(super) async fn run_times(
+    conn: &mut SqliteConnection,
+    runs: &[RunId],
+) -> Result<BTreeMap<RunId, Times>, QueryError> {
+    let find = "SELECT run, created_ms, (SELECT min(started_ms) FROM stage_times WHERE stage_times.run = runs.run) AS started_ms, \
+                CASE WHEN state IN ('finished', 'failed', 'cancelled') THEN updated_ms END AS ended_ms \
+                FROM runs WHERE run IN (SELECT value FROM json_each(?))";
+    let times = |row: &SqliteRow| -> Result<(RunId, Times), QueryError> {
+        let (created_ms, started_ms) = (row.try_get("created_ms")?, row.try_get("started_ms")?);
+        let times = Times { created_ms, started_ms, ended_ms: row.try_get("ended_ms")? };
+        Ok((RunId::new(row.try_get::<String, _>("run")?), times))
+    };
+    sqlx::query(find).bind(json(&runs)).fetch_all(conn).await?.iter().map(times).collect()
+}

@@ -1,0 +1,165 @@
+//! An index of the executions that running runs wait for, in the order of service and by their needs, and of the
+//! deadlines of tasks.
+//!
+//! The index is derived from the facts: [`State::apply`](super::State::apply) updates the entry of each affected
+//! execution. A decision finds grantable work here without inspecting the executions that wait. Invariant C14 checks
+//! the index.
+
+use protocol::Digest;
+use protocol::stage::Backend;
+
+use super::execution::StageExecution;
+use super::gang;
+use super::shared::{Map, Set};
+use super::task::{Lease, Part, Task};
+use super::worker::Worker;
+use crate::time::Millis;
+
+/// A position in the order of service.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub struct Rank {
+    /// The run's number, in order of submission.
+    pub run: u64,
+    /// The stage's index in the pipeline.
+    pub stage: usize,
+    /// The index in [`State::mended_for`] of a recomputed input, which precedes its reader; `usize::MAX` for the stage
+    /// itself.
+    pub mended: usize,
+}
+
+/// The kind of workers that an execution needs.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+pub struct Need {
+    /// Set for members of a gang; otherwise one worker for a ready task is needed.
+    pub gang: bool,
+    /// The backend that computes the execution.
+    pub backend: Backend,
+    /// The instruction set that the execution requires.
+    pub instruction_set: Option<String>,
+}
+
+impl Need {
+    /// Returns true if a worker fits.
+    pub fn takes(&self, worker: &Worker) -> bool {
+        let set = self.instruction_set.as_ref();
+        worker.backend == self.backend && set.is_none_or(|set| worker.instruction_set == *set)
+    }
+}
+
+/// The indexed properties of one execution.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct Entry {
+    /// `None` if no running run waits for it.
+    pub(super) rank: Option<Rank>,
+    pub(super) need: Option<Need>,
+    /// The backend, if shards are held.
+    pub(super) sharding: Option<Backend>,
+    /// The earliest deadline of a task.
+    pub(super) due: Option<Millis>,
+}
+
+/// Entries by key, with indexes by need, backend and deadline.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Queue {
+    entries: Map<Digest, Entry>,
+    by_need: Map<Need, Set<(Rank, Digest)>>,
+    /// The number of wanted executions with held shards.
+    sharding: Map<Backend, usize>,
+    due: Set<(Millis, Digest)>,
+}
+
+impl Queue {
+    /// The needs of at least one execution.
+    pub fn needs(&self) -> impl Iterator<Item = &Need> {
+        self.by_need.keys()
+    }
+
+    /// Executions with a need, in the order of service.
+    pub fn with(&self, need: &Need) -> impl Iterator<Item = (Rank, Digest)> + '_ {
+        self.by_need.get(need).into_iter().flat_map(|set| set.iter().copied())
+    }
+
+    /// The position of an execution that a running run waits for.
+    pub fn rank(&self, key: &Digest) -> Option<Rank> {
+        self.entries.get(key)?.rank
+    }
+
+    /// The position of an execution that needs gang members.
+    pub fn rank_of_gang(&self, key: &Digest) -> Option<Rank> {
+        let entry = self.entries.get(key)?;
+        entry.need.as_ref().filter(|need| need.gang).and(entry.rank)
+    }
+
+    /// Returns true if a worker holds a shard of an execution on `backend`.
+    pub fn is_sharding(&self, backend: Backend) -> bool {
+        self.sharding.contains_key(&backend)
+    }
+
+    /// Executions with a task deadline at `now` or before.
+    pub fn due(&self, now: Millis) -> impl Iterator<Item = Digest> + '_ {
+        self.due.iter().take_while(move |(time, _)| *time <= now).map(|(_, key)| *key)
+    }
+
+    /// Replaces the entry of an execution; `None` removes it.
+    pub(super) fn set(&mut self, key: Digest, entry: Option<Entry>) {
+        if self.entries.get(&key) == entry.as_ref() {
+            return;
+        }
+        if let Some(old) = self.entries.get(&key).cloned() {
+            self.take_out(key, &old);
+        }
+        if let Some(new) = entry {
+            self.put_in(key, &new);
+            self.entries.insert_mut(key, new);
+        } else {
+            self.entries.remove_mut(&key);
+        }
+    }
+
+    fn put_in(&mut self, key: Digest, entry: &Entry) {
+        if let (Some(rank), Some(need)) = (entry.rank, &entry.need) {
+            let mut set = self.by_need.get(need).cloned().unwrap_or_default();
+            set.insert_mut((rank, key));
+            self.by_need.insert_mut(need.clone(), set);
+        }
+        if let Some(backend) = entry.sharding {
+            let count = self.sharding.get(&backend).copied().unwrap_or_default();
+            self.sharding.insert_mut(backend, count + 1);
+        }
+        if let Some(due) = entry.due {
+            self.due.insert_mut((due, key));
+        }
+    }
+
+    fn take_out(&mut self, key: Digest, entry: &Entry) {
+        if let (Some(rank), Some(need)) = (entry.rank, &entry.need)
+            && let Some(set) = self.by_need.get_mut(need)
+        {
+            set.remove_mut(&(rank, key));
+            if set.is_empty() {
+                self.by_need.remove_mut(need);
+            }
+        }
+        if let Some(backend) = entry.sharding
+            && let Some(count) = self.sharding.get_mut(&backend)
+        {
+            *count -= 1;
+            if *count == 0 {
+                self.sharding.remove_mut(&backend);
+            }
+        }
+        if let Some(due) = entry.due {
+            self.due.remove_mut(&(due, key));
+        }
+    }
+}
+
+/// The first gang task of an execution that could admit a worker.
+pub(crate) fn open_member(execution: &StageExecution) -> Option<usize> {
+    let has_room = |task: &Task| match &task.lease {
+        Lease::Waiting { .. } => true,
+        Lease::Held { holders, drain_by: None, .. } => gang::has_room(holders.len(), execution.range()),
+        Lease::Held { drain_by: Some(_), .. } | Lease::Done { .. } => false,
+    };
+    execution.tasks.iter().position(|task| task.part == Part::Gang && has_room(task))
+}

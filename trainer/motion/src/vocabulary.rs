@@ -1,0 +1,126 @@
+//! The words of the captions that a model learned from: which words of a prompt it never saw, and what it could be told instead.
+//!
+//! Not its job: what an encoder makes of a word. A hashed encoder gives every word a vector, so that only the captions tell a word
+//! that means something to the model from one that does not.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use protocol::spelling;
+
+/// Words and sentences of training captions.
+#[derive(Debug, Clone, Default)]
+pub struct Vocabulary {
+    /// The number of sentences that have a word.
+    words: BTreeMap<String, usize>,
+    /// The number of captions that are a sentence.
+    sentences: BTreeMap<String, usize>,
+}
+
+impl Vocabulary {
+    /// The vocabulary of these captions.
+    pub fn of<'a>(captions: impl IntoIterator<Item = &'a str>) -> Self {
+        let mut vocabulary = Self::default();
+        for caption in captions {
+            let sentence = caption.trim().trim_end_matches('.').to_lowercase();
+            let count = vocabulary.sentences.entry(sentence).or_default();
+            *count += 1;
+            if *count == 1 {
+                for word in words(caption).collect::<BTreeSet<_>>() {
+                    *vocabulary.words.entry(word).or_default() += 1;
+                }
+            }
+        }
+        vocabulary
+    }
+
+    /// The words of `prompt` that no caption has, in their order.
+    pub fn unknown(&self, prompt: &str) -> Vec<String> {
+        let mut unknown = Vec::new();
+        for word in words(prompt) {
+            if !self.words.contains_key(&word) && !unknown.contains(&word) {
+                unknown.push(word);
+            }
+        }
+        unknown
+    }
+
+    /// Returns true if a caption has one of the words of `prompt`.
+    pub fn has_any(&self, prompt: &str) -> bool {
+        words(prompt).any(|word| self.words.contains_key(&word))
+    }
+
+    /// The sentences that share most with `prompt`, at most `count`: rare words count more than frequent ones, and a word that is
+    /// nearly one of the prompt's counts half. Without anything shared, the most frequent sentences.
+    pub fn nearest(&self, prompt: &str, count: usize) -> Vec<&str> {
+        let mut wanted: BTreeMap<&str, f64> = BTreeMap::new();
+        for word in words(prompt) {
+            let (known, share) = match self.words.get_key_value(&word) {
+                Some((known, _)) => (Some(known.as_str()), 1.0),
+                None => (self.similar(&word), 0.5),
+            };
+            if let Some(known) = known {
+                let rarity = (1.0 + self.sentences.len() as f64 / self.words[known] as f64).ln();
+                wanted.insert(known, share * rarity);
+            }
+        }
+        let score = |sentence: &str| {
+            let own: BTreeSet<String> = words(sentence).collect();
+            let shared: f64 = own.iter().filter_map(|word| wanted.get(word.as_str())).sum();
+            // Of sentences that share as much, the one that says least besides.
+            shared / (1.0 + 0.05 * own.len() as f64)
+        };
+        let mut scored: Vec<(f64, usize, &str)> =
+            self.sentences.iter().map(|(sentence, count)| (score(sentence), *count, sentence.as_str())).collect();
+        scored.sort_by(|a, b| b.0.total_cmp(&a.0).then(b.1.cmp(&a.1)).then(a.2.cmp(b.2)));
+        scored.into_iter().take(count).map(|(_, _, sentence)| sentence).collect()
+    }
+
+    /// The known word that `word` is nearly: another form of it, or a slip.
+    fn similar(&self, word: &str) -> Option<&str> {
+        let letters: Vec<char> = word.chars().collect();
+        let stem: String = letters[..letters.len().min(4)].iter().collect();
+        let forms = self.words.keys().filter(|known| letters.len() >= 4 && known.starts_with(&stem));
+        let form = forms.min_by_key(|known| spelling::distance(word, known));
+        form.map(String::as_str).or_else(|| spelling::nearest(word, self.words.keys().map(String::as_str)))
+    }
+}
+
+/// Words in small letters, without marks.
+fn words(text: &str) -> impl Iterator<Item = String> + '_ {
+    text.split(|c: char| !c.is_alphanumeric()).filter(|word| !word.is_empty()).map(str::to_lowercase)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn vocabulary() -> Vocabulary {
+        Vocabulary::of([
+            "a person walks forward.",
+            "a person walks forward",
+            "a person walks in a circle",
+            "a person jumps up",
+            "someone kicks with the right leg",
+        ])
+    }
+
+    #[test]
+    fn words_that_training_never_saw_are_named() {
+        let vocabulary = vocabulary();
+        assert_eq!(vocabulary.unknown("quantum Flapdoodle, quantum"), ["quantum", "flapdoodle"]);
+        assert!(!vocabulary.has_any("quantum flapdoodle"));
+        assert_eq!(vocabulary.unknown("A person WALKS, up."), [""; 0]);
+        assert_eq!(vocabulary.unknown("a person moonwalks"), ["moonwalks"]);
+        assert!(vocabulary.has_any("a person moonwalks"));
+        assert_eq!(vocabulary.unknown(""), [""; 0]);
+    }
+
+    #[test]
+    fn the_nearest_sentences_share_rare_words_or_nearly_do() {
+        let vocabulary = vocabulary();
+        assert_eq!(vocabulary.nearest("somebody kicked high", 1), ["someone kicks with the right leg"]);
+        assert_eq!(vocabulary.nearest("walk around a circel", 1), ["a person walks in a circle"]);
+        assert_eq!(vocabulary.nearest("quantum flapdoodle", 2)[0], "a person walks forward", "the most frequent one");
+        assert_eq!(Vocabulary::of([]).nearest("a jump", 3), [""; 0]);
+    }
+}

@@ -1,0 +1,128 @@
+//! The page that a server shows to browsers, as files of this binary.
+//!
+//! The files are ES modules written by hand, with two libraries beside them (`static/vendor`, unchanged, with their licences). They load
+//! under a folder that is named after all of them, so that a browser may keep them for ever: another build has another folder. The page
+//! knows the HTTP API alone, and this crate has no server.
+
+use std::io::Write as _;
+use std::sync::LazyLock;
+
+use flate2::Compression;
+use flate2::write::GzEncoder;
+use protocol::Digest;
+
+/// Content policy of the page: a browser loads and runs only its own files. Markup is made by one policy alone, that of the
+/// vendored template library, whose templates are constants.
+pub const CONTENT_POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self' blob:; \
+     base-uri 'none'; form-action 'none'; frame-ancestors 'none'; require-trusted-types-for 'script'; trusted-types lit-html";
+
+/// A file of the page.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct File {
+    /// Its path below the folder.
+    pub name: &'static str,
+    /// Its MIME type.
+    pub kind: &'static str,
+    pub bytes: Vec<u8>,
+    /// The same bytes, compressed.
+    pub gzip: Vec<u8>,
+    /// Its entity tag, with quotes.
+    pub tag: String,
+}
+
+/// Written by the server in the place of the folder's name.
+const FOLDER: &str = "FOLDER";
+
+/// The addresses at which the page itself is shown: each is a view. What stands behind the last slash is the page's to read.
+pub const VIEWS: [&str; 7] = ["/", "/runs", "/runs/{*rest}", "/models", "/models/{*rest}", "/workers", "/store"];
+
+macro_rules! files {
+    ($($name:literal),* $(,)?) => {
+        [$(($name, include_bytes!(concat!("../static/", $name)).as_slice())),*]
+    };
+}
+
+/// Everything that lies in `static` but licences.
+static FILES: [(&str, &[u8]); 25] = files![
+    "index.html",
+    "icon.svg",
+    "style.css",
+    "main.js",
+    "api.js",
+    "session.js",
+    "router.js",
+    "format.js",
+    "parts.js",
+    "advice.js",
+    "chart.js",
+    "graph.js",
+    "log.js",
+    "rates.js",
+    "views/now.js",
+    "views/runs.js",
+    "views/run.js",
+    "views/stage.js",
+    "views/models.js",
+    "views/workers.js",
+    "views/store.js",
+    "views/login.js",
+    "vendor/lit-html.js",
+    "vendor/uPlot.esm.js",
+    "vendor/uPlot.min.css",
+];
+
+struct Page {
+    index: File,
+    folder: String,
+    files: Vec<File>,
+}
+
+static PAGE: LazyLock<Page> = LazyLock::new(|| {
+    let all: String = FILES.iter().map(|(name, bytes)| format!("{name} {}\n", Digest::of(bytes))).collect();
+    let folder = Digest::of(all.as_bytes()).hex()[..16].to_owned();
+    let mut files: Vec<File> = FILES.iter().map(|(name, bytes)| file(name, bytes.to_vec())).collect();
+    let index = files.remove(0);
+    let index = file(index.name, String::from_utf8_lossy(&index.bytes).replace(FOLDER, &folder).into_bytes());
+    Page { index, folder, files }
+});
+
+fn file(name: &'static str, bytes: Vec<u8>) -> File {
+    let mut encoder = GzEncoder::new(Vec::new(), Compression::best());
+    // Memory takes whatever is written to it.
+    let gzip = encoder.write_all(&bytes).and_then(|()| encoder.finish()).unwrap_or_default();
+    let tag = format!("\"{}\"", &Digest::of(&bytes).hex()[..32]);
+    File { name, kind: kind(name), bytes, gzip, tag }
+}
+
+fn kind(name: &str) -> &'static str {
+    match name.rsplit_once('.').map(|(_, ending)| ending) {
+        Some("html") => "text/html; charset=utf-8",
+        Some("js") => "text/javascript; charset=utf-8",
+        Some("css") => "text/css; charset=utf-8",
+        Some("svg") => "image/svg+xml",
+        Some(_) | None => "application/octet-stream",
+    }
+}
+
+/// The document that is shown at each of [`VIEWS`].
+#[must_use]
+pub fn index() -> &'static File {
+    &PAGE.index
+}
+
+/// The name of the folder that the files lie in.
+#[must_use]
+pub fn folder() -> &'static str {
+    &PAGE.folder
+}
+
+/// A file of this build by its folder and its path.
+#[must_use]
+pub fn find(folder: &str, name: &str) -> Option<&'static File> {
+    PAGE.files.iter().find(|file| folder == PAGE.folder && file.name == name)
+}
+
+/// All files but the document.
+pub fn files() -> impl Iterator<Item = &'static File> {
+    PAGE.files.iter()
+}

@@ -1,0 +1,250 @@
+//! One run: if it failed why, then its stages, curves, log and products.
+
+import { blob, CallError, get, post, runPath } from "../api.js";
+import { OTHERWISE, whatToDo } from "../advice.js";
+import { Chart, curves, inOrder, inWords, mainKey } from "../chart.js";
+import { count, duration, grouped, number, plain, short } from "../format.js";
+import { graph, MOST } from "../graph.js";
+import { Log, logLine } from "../log.js";
+import { badge, bar, command, fact, failed, firstLine, headline, isDone, isOver, joinCommand, left, mainStages, pace, prose, reached, reason, runState, share, sure } from "../parts.js";
+import { Rates } from "../rates.js";
+import { address } from "../router.js";
+import { controls } from "../session.js";
+import { html, nothing } from "../vendor/lit-html.js";
+
+/** Lines of the log around a failure. */
+const AROUND = 14;
+/** Charts of a run: one for each training, which the stage's own view has more of. */
+const MOST_CHARTS = 8;
+/** Every how many beats curves are asked for. */
+const CURVES_EVERY = 5;
+
+/** @param {Context} context @param {string} name @returns {View} */
+export function run(context, name) {
+  /** @type {Run | null} */
+  let it = null;
+  let beats = 0;
+  const rates = new Rates();
+  const log = new Log(name, null, context.draw);
+  /** @type {Map<string, {chart: Chart, key: string, curve: Curve}>} By stage. */
+  const charts = new Map();
+  /** @type {LogLine[]} */
+  let around = [];
+  let aroundOf = "";
+  /** @type {Map<string, string>} Addresses of pictures by stage and name. */
+  const pictures = new Map();
+  /** @type {Set<string>} */
+  const asked = new Set();
+  let [logScale, smooth, busy] = [false, true, false];
+
+  /** @param {AbortSignal} signal */
+  async function load(signal) {
+    const before = it;
+    it = /** @type {Run} */ (await get(runPath(name), signal));
+    rates.see(it);
+    const changed = before?.state !== it.state;
+    const broken = it.state === "failed" ? failed(it) : undefined;
+    if (broken && aroundOf !== `${broken.name}/${broken.key}`) {
+      around = await get(`${runPath(name)}/logs?stage=${encodeURIComponent(broken.name)}&last=${AROUND}`, signal);
+      aroundOf = `${broken.name}/${broken.key}`;
+    }
+    if (beats % CURVES_EVERY === 0 && (changed || !isOver(it) || charts.size === 0)) await look(signal);
+    if (!isOver(it) || changed) await log.load(signal);
+    void draw(it, signal);
+    beats += 1;
+  }
+
+  /** @param {AbortSignal} signal */
+  async function look(signal) {
+    const trained = (it?.stages ?? []).filter((stage) => !stage.of && /^(train|distill)\./.test(stage.kind));
+    const wanted = trained.filter((stage) => stage.state !== "waiting" && stage.state !== "skipped").slice(0, MOST_CHARTS);
+    for (const stage of wanted) {
+      const known = charts.get(stage.name);
+      if (known && isDone(stage) && known.curve.total > 0 && beats > 0 && known.chart.curve?.total === known.curve.total && beats % (CURVES_EVERY * 12) !== 0) continue;
+      const keys = (await curves(name, stage.name, signal)).get(stage.name);
+      const key = mainKey(keys);
+      const curve = key ? keys?.get(key) : undefined;
+      if (key && curve) charts.set(stage.name, { chart: known?.chart ?? new Chart(key), key, curve });
+    }
+  }
+
+  /** Fetches the pictures that stages drew. @param {Run} run @param {AbortSignal} signal */
+  async function draw(run, signal) {
+    for (const stage of mainStages(run)) {
+      if (!isDone(stage) || !stage.kind.startsWith("evaluate")) continue;
+      for (const output of Object.values(stage.outputs)) {
+        if (asked.has(output)) continue;
+        asked.add(output);
+        try {
+          const manifest = JSON.parse(new TextDecoder().decode(await blob(output, signal)));
+          for (const [file, { digest, bytes }] of Object.entries(manifest.files ?? {})) {
+            if (!file.endsWith(".png") || file.includes("/") || bytes > 8e6) continue;
+            const data = await blob(digest, signal);
+            pictures.set(`${stage.name} ${file}`, URL.createObjectURL(new Blob([data], { type: "image/png" })));
+          }
+          context.draw();
+        } catch (error) {
+          if (!(error instanceof CallError) && !(error instanceof SyntaxError)) return;
+        }
+      }
+    }
+  }
+
+  /** @param {string} action @param {string} done */
+  async function act(action, done) {
+    if (busy) return;
+    busy = true;
+    context.draw();
+    try {
+      await post(`${runPath(name)}/${action}`);
+      context.say(done);
+    } catch (error) {
+      if (!(error instanceof CallError)) throw error;
+      context.say(error.hint ? `${error.message}; ${error.hint}` : error.message);
+    }
+    busy = false;
+    aroundOf = "";
+    await context.refresh();
+  }
+
+  const resume = (main = true) => html`<button type="button" class=${main ? "main" : ""} ?disabled=${busy} @click=${() => act("resume", "It goes on.")}>Resume</button>`;
+
+  /** @param {Run} run */
+  function buttons(run) {
+    if (!controls(run.owner)) return nothing;
+    const cancel = () => {
+      if (sure(`Cancel ${run.run}? What it has finished stays, and it can be resumed.`)) void act("cancel", "Cancelled.");
+    };
+    return html`<p class="actions">
+      ${run.state === "running" ? html`<button type="button" ?disabled=${busy} @click=${() => act("pause", "Pausing: workers save first.")}>Pause</button>` : nothing}
+      ${run.state === "paused" || run.state === "cancelled" ? resume() : nothing}
+      ${run.state === "running" || run.state === "paused" ? html`<button type="button" class="danger" ?disabled=${busy} @click=${cancel}>Cancel</button>` : nothing}
+    </p>`;
+  }
+
+  /** @param {Run} run */
+  function cause(run) {
+    const stage = failed(run);
+    if (run.state !== "failed" || !stage) return nothing;
+    const last = around[around.length - 1];
+    const worker = last?.worker ?? stage.workers[0];
+    const message = stage.message ?? "";
+    const words = firstLine(message).slice(0, 60);
+    const marked = around.findLast((line) => words !== "" && line.text.includes(words)) ?? around.findLast((line) => /error|panick|failed|not finite/i.test(line.text));
+    const rest = message.slice(firstLine(message).length).trim();
+    return html`<section class="card cause" aria-labelledby="cause">
+      <h2 id="cause"><span aria-hidden="true">✕</span> <a href=${address("runs", run.run, stage.name)}>${stage.name}</a> failed</h2>
+      <p class="why clamp" dir="auto">${prose(firstLine(message) || "No reason was given.")}</p>
+      <p class="actions">${controls(run.owner) ? resume() : nothing}<a class="button" href="#log-title" @click=${toLog}>Log</a></p>
+      ${rest ? html`<pre class="rest" tabindex="0">${plain(rest)}</pre>` : nothing}
+      <p>${prose(whatToDo(message) ?? OTHERWISE)}</p>
+      <p class="dim small">${stage.kind}${(last?.attempt ?? stage.attempt) > 0 ? ` · attempt ${last?.attempt ?? stage.attempt}` : ""}${worker ? html` · worker ${worker}` : nothing}${stage.wall_s > 0 ? ` · after ${duration(stage.wall_s)}` : ""}</p>
+      ${around.length > 0 ? html`<div class="lines few" tabindex="0" role="group" aria-label="The last lines of its log">${around.map((line) => logLine(line, false, line === marked))}</div>` : nothing}
+      ${controls(run.owner) ? nothing : command(`trainer resume ${run.run}`, context)}
+    </section>`;
+  }
+
+  /** @param {Event} event */
+  function toLog(event) {
+    event.preventDefault();
+    const title = document.getElementById("log-title");
+    title?.setAttribute("tabindex", "-1");
+    title?.focus();
+    title?.scrollIntoView({ block: "start" });
+  }
+
+  /** @param {Run} run */
+  function waits(run) {
+    const stage = run.state === "running" ? mainStages(run).find((stage) => stage.wants_workers) : undefined;
+    return html`${run.storage ? html`<section class="card want bad"><p class="what"><b>The store is in trouble</b></p><p class="why">${prose(run.storage.what)}</p><p class="dim">Training goes on meanwhile; checkpoints are made later.</p></section>` : nothing}
+      ${stage ? html`<section class="card want warn"><p class="what"><b>${stage.name}</b> ${prose(firstLine(stage.message))}</p>${command(joinCommand(stage.wants_workers ?? 1), context)}</section>` : nothing}`;
+  }
+
+  /** @param {Run} run @param {Stage} stage */
+  function row(run, stage) {
+    const perSecond = rates.of(run, stage);
+    const at = stage.state === "running";
+    const result = headline(stage);
+    const { total, unit } = stage.progress;
+    return html`<tr>
+      <td>${badge(stage.state)}</td>
+      <th scope="row"><a href=${address("runs", run.run, stage.name)}>${stage.name}</a><span class="dim kind">${stage.kind}</span></th>
+      <td class="work">${at ? html`${bar(share(stage.progress), stage.name)}<span class="num small">${pace(stage, perSecond)}</span>` : stage.state === "waiting" ? html`<span class="dim small">reads ${(stage.needs ?? []).join(", ") || "files"}</span>` : stage.message ? html`<span class="small clamp" dir="auto">${prose(firstLine(stage.message))}</span>` : isDone(stage) && total > 1 ? html`<span class="dim small">${grouped(total)} ${unit}</span>` : nothing}</td>
+      <td class=${at ? "num" : "num wide"}>${at ? left(stage, perSecond) : ""}</td>
+      <td class=${at ? "num wide" : "num"}>${stage.wall_s > 0 ? duration(stage.wall_s) : ""}</td>
+      <td class="num wide">${result ? html`<span class="dim">${result[0]}</span> ${number(result[1])}` : nothing}</td>
+    </tr>`;
+  }
+
+  function curvesOf() {
+    if (charts.size === 0) return nothing;
+    for (const { chart, curve } of charts.values()) chart.show(curve, logScale, smooth);
+    const flip = (/** @type {() => void} */ change) => () => {
+      change();
+      context.draw();
+    };
+    return html`<section aria-labelledby="curves"><div class="row"><h2 id="curves">Curves</h2>
+        <span class="grow"></span><label class="check"><input type="checkbox" .checked=${smooth} @change=${flip(() => (smooth = !smooth))}> smooth</label>
+        <label class="check"><input type="checkbox" .checked=${logScale} @change=${flip(() => (logScale = !logScale))}> log scale</label></div>
+      <div class="charts">${inOrder(charts.keys()).sort((a, b) => order(a) - order(b)).map((stage) => {
+        const shown = charts.get(stage);
+        return shown ? html`<figure class="card chart"><figcaption><a href=${address("runs", name, stage)}>${stage}</a> <span class="dim">${shown.key}</span></figcaption><div role="img" aria-label=${inWords(shown.key, shown.curve)}>${shown.chart.element}</div></figure>` : nothing;
+      })}</div></section>`;
+  }
+
+  /** @param {string} stage */
+  const order = (stage) => it?.stages.findIndex((other) => other.name === stage) ?? 0;
+
+  /** @param {Run} run */
+  function sweeps(run) {
+    return run.sweeps?.length
+      ? html`<section aria-labelledby="sweeps"><h2 id="sweeps">Sweeps</h2>${run.sweeps.map((sweep) => {
+          const paths = [...new Set(sweep.trials.flatMap((trial) => Object.keys(trial.values)))];
+          return html`<div class="card table"><table><caption>${sweep.stage}: ${sweep.search} by ${sweep.metric}, ${sweep.mode === "min" ? "least" : "most"} is best; ${number(sweep.spent)} of ${number(sweep.planned)} steps</caption>
+            <thead><tr><th scope="col">Trial</th><th scope="col">State</th>${paths.map((path) => html`<th scope="col">${path}</th>`)}${sweep.rungs.map((rung) => html`<th scope="col" class="num">after ${number(rung)}</th>`)}</tr></thead>
+            <tbody>${sweep.trials.map((trial) => html`<tr class=${trial.trial === sweep.best ? "best" : ""}><th scope="row">${trial.trial}${trial.trial === sweep.best ? " ★ best" : ""}</th><td>${badge(trial.state === "stopped" ? "skipped" : trial.state, trial.state)}</td>${paths.map((path) => html`<td class="num">${text(trial.values[path])}</td>`)}${sweep.rungs.map((_, at) => html`<td class="num">${at < trial.results.length ? (trial.results[at] === null ? "failed" : number(trial.results[at])) : ""}</td>`)}</tr>`)}</tbody></table></div>`;
+        })}</section>`
+      : nothing;
+  }
+
+  /** @param {unknown} value */
+  const text = (value) => (typeof value === "number" ? number(value) : value === undefined ? "" : typeof value === "string" ? value : JSON.stringify(value));
+
+  /** @param {Run} run */
+  function products(run) {
+    const made = mainStages(run).filter((stage) => isDone(stage) && Object.keys(stage.outputs).length > 0);
+    if (made.length === 0) return nothing;
+    return html`<section aria-labelledby="products"><h2 id="products">Products</h2>
+      ${pictures.size > 0 ? html`<div class="pictures">${[...pictures].map(([title, url]) => html`<figure class="card"><a href=${url} target="_blank" rel="noopener"><img src=${url} alt=${`Drawn by ${title}`} loading="lazy"></a><figcaption class="dim">${title}</figcaption></figure>`)}</div>` : nothing}
+      <div class="card table"><table><caption class="unseen">What the stages gave</caption><thead><tr><th scope="col">Stage</th><th scope="col">Output</th><th scope="col">Digest</th></tr></thead>
+        <tbody>${made.flatMap((stage) => Object.entries(stage.outputs).map(([output, digest]) => html`<tr><th scope="row"><a href=${address("runs", run.run, stage.name)}>${stage.name}</a></th><td>${output}</td><td><code title=${digest}>${short(digest)}</code></td></tr>`))}</tbody></table></div></section>`;
+  }
+
+  function render() {
+    const run = it;
+    if (!run) return nothing;
+    const stages = mainStages(run);
+    const [done, all, part] = reached(run);
+    const seconds = stages.reduce((sum, stage) => sum + stage.wall_s, 0);
+    const state = runState(run);
+    return html`
+      <p class="path"><a href="/runs">Runs</a></p>
+      <div class="row head"><h1 tabindex="-1">${run.run}</h1>${badge(state)}<span class="grow"></span>${buttons(run)}</div>
+      ${cause(run)}${waits(run)}
+      <div class="card summary">${isOver(run) ? nothing : bar(part, "All stages")}
+        <dl class="facts">${fact("Stages", `${done} of ${all}`)}${fact("Work", seconds > 0 ? duration(seconds) : "")}${fact("Pipeline", run.pipeline)}${fact("Owner", run.owner?.project ? `${run.owner.name} (${run.owner.project})` : (run.owner?.name ?? ""))}${fact("Now", isOver(run) || !reason(run) ? "" : prose(reason(run)))}</dl></div>
+      <section aria-labelledby="stages"><h2 id="stages">Stages</h2>
+        ${stages.length > 1 && stages.length <= MOST && stages.some((stage) => stage.needs?.length) ? graph(run, stages) : nothing}
+        <div class="card table"><table class="stages"><caption class="unseen">${count(stages.length, "stage")} of ${run.run}</caption>
+          <thead><tr><th scope="col">State</th><th scope="col">Stage</th><th scope="col">Work</th><th scope="col" class="num wide">Left</th><th scope="col" class="num">Time</th><th scope="col" class="num wide">Result</th></tr></thead>
+          <tbody>${stages.map((stage) => row(run, stage))}</tbody></table></div></section>
+      ${sweeps(run)}${curvesOf()}${products(run)}${log.render()}`;
+  }
+
+  function close() {
+    for (const { chart } of charts.values()) chart.close();
+    for (const url of pictures.values()) URL.revokeObjectURL(url);
+  }
+
+  return { title: name, every: 1000, load, render, close };
+}

@@ -1,0 +1,126 @@
+//! One stage: its curves, numbers and log.
+
+import { get, runPath } from "../api.js";
+import { OTHERWISE, whatToDo } from "../advice.js";
+import { Chart, curves, inOrder, inWords } from "../chart.js";
+import { count, duration, grouped, number, plain, short } from "../format.js";
+import { Log } from "../log.js";
+import { badge, bar, command, fact, firstLine, isOver, joinCommand, left, pace, prose, share } from "../parts.js";
+import { Rates } from "../rates.js";
+import { address } from "../router.js";
+import { html, nothing } from "../vendor/lit-html.js";
+
+const CURVES_EVERY = 4;
+/** Charts at first; a stage of many losses has a button for the rest. */
+const FIRST = 12;
+/** Rows of the table under a chart. */
+const ROWS = 12;
+
+/** @param {Context} context @param {string} name @param {string} stageName @returns {View} */
+export function stage(context, name, stageName) {
+  /** @type {Run | null} */
+  let run = null;
+  let beats = 0;
+  const rates = new Rates();
+  const log = new Log(name, stageName, context.draw);
+  /** @type {Map<string, Curve>} */
+  let keys = new Map();
+  /** @type {Map<string, Chart>} */
+  const charts = new Map();
+  let [logScale, smooth, all, words] = [false, true, false, ""];
+  let finalSeen = false;
+
+  const find = () => run?.stages.find((stage) => stage.name === stageName);
+
+  /** @param {AbortSignal} signal */
+  async function load(signal) {
+    run = /** @type {Run} */ (await get(runPath(name), signal));
+    rates.see(run);
+    const it = find();
+    const live = it?.state === "running" || it?.state === "ready";
+    if (it && it.state !== "waiting" && ((live && beats % CURVES_EVERY === 0) || !finalSeen)) {
+      keys = (await curves(name, stageName, signal)).get(stageName) ?? new Map();
+      finalSeen = !live;
+    }
+    if (live) finalSeen = false;
+    if (it && (live || beats === 0 || !isOver(run))) await log.load(signal);
+    beats += 1;
+  }
+
+  /** @param {string} key @param {Curve} curve */
+  function chart(key, curve) {
+    let shown = charts.get(key);
+    if (!shown) charts.set(key, (shown = new Chart(key, 200)));
+    shown.show(curve, logScale, smooth);
+    const step = Math.max(1, Math.ceil(curve.x.length / ROWS));
+    const rows = curve.x.map((x, at) => ({ x, y: curve.mean[at] ?? null })).filter((_, at) => at % step === 0 || at === curve.x.length - 1);
+    return html`<figure class="card chart"><figcaption dir="auto">${plain(key)}</figcaption><div role="img" aria-label=${inWords(key, curve)}>${shown.element}</div>
+      <details class="values"><summary>As a table</summary><div class="table"><table><caption class="unseen">${plain(key)} by step</caption><thead><tr><th scope="col" class="num">Step</th><th scope="col" class="num">Value</th></tr></thead>
+        <tbody>${rows.map(({ x, y }) => html`<tr><td class="num">${grouped(x)}</td><td class="num">${number(y)}</td></tr>`)}</tbody></table></div></details></figure>`;
+  }
+
+  function curvesOf() {
+    if (keys.size === 0) return nothing;
+    const wanted = inOrder(keys.keys()).filter((key) => key.toLowerCase().includes(words.toLowerCase()));
+    const shown = all ? wanted : wanted.slice(0, FIRST);
+    const flip = (/** @type {() => void} */ change) => () => {
+      change();
+      context.draw();
+    };
+    /** @param {Event} event */
+    const search = (event) => {
+      words = /** @type {HTMLInputElement} */ (event.currentTarget).value;
+      context.draw();
+    };
+    return html`<section aria-labelledby="curves"><div class="row"><h2 id="curves">Curves</h2>
+        ${keys.size > 4 ? html`<label class="field grow"><span class="unseen">Curves that contain</span><input type="search" placeholder=${`Find among ${keys.size}`} .value=${words} @input=${search}></label>` : html`<span class="grow"></span>`}
+        <label class="check"><input type="checkbox" .checked=${smooth} @change=${flip(() => (smooth = !smooth))}> smooth</label>
+        <label class="check"><input type="checkbox" .checked=${logScale} @change=${flip(() => (logScale = !logScale))}> log scale</label></div>
+      <div class="charts">${shown.map((key) => chart(key, /** @type {Curve} */ (keys.get(key))))}</div>
+      ${wanted.length > shown.length ? html`<p class="center"><button type="button" @click=${flip(() => (all = true))}>${count(wanted.length - shown.length, "more curve")}</button></p>` : nothing}
+      <p class="dim small">Drag over a chart to zoom, press twice to see all of it. A red tick is a value that was no number.</p></section>`;
+  }
+
+  /** @param {Stage} it */
+  function numbers(it) {
+    const names = Object.keys(it.metrics).sort();
+    if (names.length === 0) return nothing;
+    return html`<section aria-labelledby="numbers"><h2 id="numbers">${it.state === "running" ? "Newest values" : "Results"}</h2>
+      <div class="card"><dl class="facts numbers">${names.map((name) => fact(name, number(it.metrics[name])))}</dl></div></section>`;
+  }
+
+  function render() {
+    const it = find();
+    if (!run) return nothing;
+    if (!it) return html`<p class="path"><a href="/runs">Runs</a> / <a href=${address("runs", name)}>${name}</a></p><h1 tabindex="-1">${name} has no stage ${stageName}</h1>`;
+    const perSecond = rates.of(run, it);
+    const readers = run.stages.filter((other) => other.needs?.includes(stageName));
+    const links = (/** @type {string[]} */ names) => names.map((other, at) => html`${at > 0 ? ", " : ""}<a href=${address("runs", name, other)}>${other}</a>`);
+    return html`
+      <p class="path"><a href="/runs">Runs</a> / <a href=${address("runs", name)}>${name}</a></p>
+      <div class="row head"><h1 tabindex="-1">${it.name}</h1>${badge(it.state)}<span class="dim">${it.kind}</span></div>
+      ${it.state === "failed" ? html`<section class="card cause"><p class="why" dir="auto">${prose(it.message)}</p><p>${prose(whatToDo(it.message) ?? OTHERWISE)}</p><p class="actions"><a class="button" href=${address("runs", name)}>To the run</a></p></section>` : nothing}
+      ${it.wants_workers ? html`<section class="card want warn"><p class="what">${prose(firstLine(it.message))}</p>${command(joinCommand(it.wants_workers), context)}</section>` : nothing}
+      <div class="card summary">
+        ${it.state === "running" && it.progress.total > 0 ? bar(share(it.progress), it.name) : nothing}
+        <dl class="facts">
+          ${fact("Progress", it.progress.total > 0 ? pace(it, it.state === "running" ? perSecond : undefined) : "")}
+          ${fact("Left", it.state === "running" ? left(it, perSecond) : "")}
+          ${fact("Time", it.wall_s > 0 ? duration(it.wall_s) : "")}
+          ${fact("Attempt", it.attempt > 0 ? String(it.attempt) : "")}
+          ${fact("Workers", it.workers.join(", "))}
+          ${fact("Instruction set", it.instruction_set ?? "")}
+          ${fact("Reads", it.needs?.length ? links(it.needs) : "")}
+          ${fact("Read by", readers.length > 0 ? links(readers.map((other) => other.name)) : "")}
+          ${fact("Key", it.key ? html`<code title=${it.key}>${short(it.key)}</code>` : "")}
+          ${Object.entries(it.outputs).map(([output, digest]) => fact(`Gives ${output}`, html`<code title=${digest}>${short(digest)}</code>`))}
+          ${fact("State", it.state !== "failed" && !it.wants_workers ? firstLine(it.message) : "")}
+        </dl></div>
+      ${curvesOf()}${numbers(it)}${log.render()}`;
+  }
+
+  const close = () => {
+    for (const shown of charts.values()) shown.close();
+  };
+  return { title: `${stageName} of ${name}`, every: 1000, load, render, close };
+}

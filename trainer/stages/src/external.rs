@@ -1,0 +1,74 @@
+//! Files and folders outside the store, by the settings that name them.
+//!
+//! The one way for a stage to a path of its settings. What is given was digested and is what the stage's key says; it is looked at again once
+//! it was read. A stage makes no path of its own: `tests/layers.rs` holds this.
+
+use std::collections::BTreeMap;
+
+use motion::DataPath;
+use motion::data_access::{AccessError, Opened};
+pub use motion::data_access::{DataAccess, open_roots};
+use protocol::Digest;
+
+use crate::context::{AttemptContext, StageError};
+
+/// The files and folders that a task's settings name, by field.
+#[derive(Debug)]
+pub struct Given(BTreeMap<String, Opened>);
+
+impl Given {
+    /// The path in the field `field`, if there is one.
+    pub fn get(&self, field: &str) -> Option<&DataPath> {
+        self.0.get(field).map(Opened::path)
+    }
+
+    /// The path in the field `field`.
+    ///
+    /// # Errors
+    /// If it names nothing.
+    pub fn path(&self, field: &str) -> Result<&DataPath, StageError> {
+        self.get(field).ok_or_else(|| StageError::Input(format!("`{field}` is empty; name a file or folder")))
+    }
+}
+
+/// Opens all that the settings of the task name, has it read, and refuses what changed meanwhile.
+///
+/// # Errors
+/// If something may not be read, is not what the stage expects, or `read` fails.
+pub fn read<C: AttemptContext + ?Sized, T>(
+    cx: &mut C,
+    read: impl FnOnce(&mut C, &Given) -> Result<T, StageError>,
+) -> Result<T, StageError> {
+    let access = cx.data();
+    let task = cx.task();
+    let mut given = Given(BTreeMap::new());
+    for folder in task.settings.folders() {
+        let expected = task.inputs.get(&folder.field);
+        given.0.insert(folder.field.clone(), access.open(folder, expected).map_err(refusal)?);
+    }
+    let value = read(cx, &given)?;
+    given.0.values().try_for_each(|opened| access.expect_unchanged(opened)).map_err(refusal)?;
+    Ok(value)
+}
+
+/// Digests of all that the settings of the task name, for a stage that came without them.
+///
+/// # Errors
+/// If something may not or cannot be read.
+pub fn digests(cx: &dyn AttemptContext) -> Result<BTreeMap<String, Digest>, StageError> {
+    let access = cx.data();
+    let folders = cx.task().settings.folders().into_iter();
+    folders.map(|folder| Ok((folder.field.clone(), access.digest(&folder).map_err(refusal)?))).collect()
+}
+
+fn refusal(error: AccessError) -> StageError {
+    let text = error.to_string();
+    match error {
+        AccessError::NoRoots { .. }
+        | AccessError::Outside { .. }
+        | AccessError::Differs { .. }
+        | AccessError::Unreadable(_) => StageError::Input(text),
+        // Another try finds it settled, or different.
+        AccessError::Changed { .. } | AccessError::Unresolved { .. } => StageError::Fault(text),
+    }
+}

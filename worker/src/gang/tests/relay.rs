@@ -1,0 +1,233 @@
+//! Links that are slow, late or cut in one direction, by a relay between the members.
+
+use std::io::{Read, Write};
+use std::net::{Shutdown, SocketAddr, TcpListener, TcpStream};
+use std::sync::mpsc;
+
+use super::*;
+use crate::gang::exchange::{Contribution, Interrupt, Met};
+use crate::gang::frame::MAX_PAYLOAD;
+use crate::gang::handshake;
+
+const BARRIER: &str = "barrier `test`";
+
+/// Effect of a relay on the bytes of one direction.
+#[derive(Debug, Default)]
+struct Direction {
+    bytes_per_second: AtomicU64,
+    late_ms: AtomicU64,
+    /// Accepts bytes but never delivers them.
+    swallows: AtomicBool,
+}
+
+#[derive(Debug, Clone)]
+struct Relay {
+    address: SocketAddr,
+    /// From the dialer to the dialled member.
+    there: Arc<Direction>,
+    back: Arc<Direction>,
+}
+
+impl Relay {
+    fn to(server: SocketAddr) -> Self {
+        let listener = TcpListener::bind("127.0.0.1:0").expect("a free port");
+        let address = listener.local_addr().expect("bound");
+        let relay = Self { address, there: Arc::default(), back: Arc::default() };
+        let (there, back) = (relay.there.clone(), relay.back.clone());
+        thread::spawn(move || {
+            for client in listener.incoming().flatten() {
+                let Ok(server) = TcpStream::connect(server) else { continue };
+                let twice = |stream: &TcpStream| stream.try_clone().expect("a socket twice");
+                pass(twice(&client), twice(&server), there.clone());
+                pass(server, client, back.clone());
+            }
+        });
+        relay
+    }
+
+    fn slow_down(&self, bytes_per_second: u64, late_ms: u64) {
+        for direction in [&self.there, &self.back] {
+            direction.bytes_per_second.store(bytes_per_second, Ordering::SeqCst);
+            direction.late_ms.store(late_ms, Ordering::SeqCst);
+        }
+    }
+}
+
+fn pass(mut from: TcpStream, mut to: TcpStream, direction: Arc<Direction>) {
+    // Bounded, so that the sender is slowed down too.
+    let (sender, receiver) = mpsc::sync_channel::<(Instant, Vec<u8>)>(64);
+    let reading = direction.clone();
+    thread::spawn(move || {
+        let mut buffer = vec![0; 4096];
+        while let Ok(n @ 1..) = from.read(&mut buffer) {
+            if reading.swallows.load(Ordering::SeqCst) {
+                continue;
+            }
+            let due = Instant::now() + Duration::from_millis(reading.late_ms.load(Ordering::SeqCst));
+            if sender.send((due, buffer[..n].to_vec())).is_err() {
+                return;
+            }
+        }
+    });
+    thread::spawn(move || {
+        for (due, bytes) in receiver {
+            thread::sleep(due.saturating_duration_since(Instant::now()));
+            if to.write_all(&bytes).is_err() {
+                return;
+            }
+            let rate = direction.bytes_per_second.load(Ordering::SeqCst);
+            if rate > 0 {
+                thread::sleep(Duration::from_secs_f64(bytes.len() as f64 / rate as f64));
+            }
+        }
+        let _ = to.shutdown(Shutdown::Write);
+    });
+}
+
+/// Two members; the second dials the first through a relay.
+fn pair(timing: Timing) -> (Relay, [Arc<Mesh>; 2]) {
+    let mut gang = Gang::new(2, timing);
+    let relay = Relay::to(gang.seats[0].endpoint.address());
+    Arc::get_mut(&mut gang).expect("not shared yet").seats[0].member.peer_address = relay.address.to_string();
+    let meshes = [0, 1].map(|own| mesh(&gang, &[0, 1], own, "s").0);
+    thread::scope(|scope| {
+        for mesh in &meshes {
+            scope.spawn(|| assert_eq!(exchange::rendezvous(mesh, Some(5), &[], &|| None), Ok(Met::Keep)));
+        }
+    });
+    (relay, meshes)
+}
+
+fn slow(worker: &str) -> LostPeer {
+    LostPeer { worker: worker.into(), cause: LossCause::Slow }
+}
+
+/// Each frame takes longer than the time limit of a silent peer.
+#[test]
+fn p20_bytes_that_move_keep_a_link_of_30_kb_a_second_and_300_ms() {
+    let (relay, [ahead, behind]) = pair(QUICK);
+    relay.slow_down(30_000, 300);
+    let begun = Instant::now();
+    let state = vec![7u8; 3 * MAX_PAYLOAD];
+    thread::scope(|scope| {
+        scope.spawn(|| assert_eq!(exchange::rendezvous(&ahead, Some(6), &[&state], &|| None), Ok(Met::Keep)));
+        assert_eq!(exchange::rendezvous(&behind, Some(5), &[], &|| None), Ok(Met::Behind(0, 6)));
+        let mut room = vec![0; state.len()];
+        assert_eq!(exchange::adopt(&behind, 0, &mut [&mut room], true, &|| None), Ok(Vec::new()));
+        assert!(room == state);
+    });
+    assert!(begun.elapsed() > QUICK.patience * 2, "it took {:.1?}", begun.elapsed());
+    assert_eq!((ahead.lost(), behind.lost()), (vec![], vec![]));
+    [ahead, behind].into_iter().for_each(|mesh| mesh.close(None));
+}
+
+#[test]
+fn p20_a_cut_in_one_direction_is_noticed_by_both() {
+    for is_there in [true, false] {
+        let (relay, meshes) = pair(QUICK);
+        let direction = if is_there { &relay.there } else { &relay.back };
+        direction.swallows.store(true, Ordering::SeqCst);
+        let begun = Instant::now();
+        thread::scope(|scope| {
+            for (mesh, peer) in meshes.iter().zip([1, 0]) {
+                scope.spawn(move || assert_eq!(mesh.next(peer, BARRIER, &|| None), Err(Halt::Peer)));
+            }
+        });
+        assert!(begun.elapsed() < QUICK.patience * 4, "after {:.1?}", begun.elapsed());
+        assert_eq!([meshes[0].lost(), meshes[1].lost()], [[unreachable("w1")], [unreachable("w0")]]);
+        meshes.into_iter().for_each(|mesh| mesh.close(None));
+    }
+}
+
+/// A member reports its activity during a long send without pauses too.
+#[test]
+fn signs_of_life_go_out_between_the_frames_of_a_long_payload() {
+    let gang = Gang::new(2, QUICK);
+    let (mesh, _) = mesh(&gang, &[0, 1], 0, "s");
+    let stream = TcpStream::connect(gang.seats[0].endpoint.address()).expect("listening");
+    let handshake::Session { mut receives, .. } =
+        handshake::dial(&stream, &task(), Generation(7), 1, 0, "s").expect("welcome");
+    let over = AtomicBool::new(false);
+    thread::scope(|scope| {
+        scope.spawn(|| {
+            let payload = vec![0; MAX_PAYLOAD];
+            while !over.load(Ordering::SeqCst) {
+                let head = Head::new(Kind::State, 1, 0, 0);
+                mesh.send(1, BARRIER, head, &payload, &|| over.load(Ordering::SeqCst).then_some(Halt::Regroup)).ok();
+            }
+        });
+        let (mut large, mut signs, mut reader) = (0, 0, &stream);
+        while signs < 3 {
+            match frame::read_sealed(&mut reader, MAX_PAYLOAD, &mut receives).expect("whole").kind {
+                Kind::KeepAlive => signs += 1,
+                _ => large += 1,
+            }
+            assert!(large < 200_000, "{signs} signs of life among {large} frames");
+        }
+        over.store(true, Ordering::SeqCst);
+        let _ = stream.shutdown(Shutdown::Both);
+    });
+    mesh.close(None);
+}
+
+fn step(mesh: &Mesh, step: u64, numbers: &[f32], interrupt: Interrupt<'_>) -> Result<(), Halt> {
+    let own = mesh.config.rank;
+    let parts = vec![(own..own + 1, numbers)];
+    let computed = Duration::from_millis(20);
+    let contribution = Contribution { step, slices: 2, parts, drain: false, saved: false, computed, durable: 0 };
+    exchange::exchange(mesh, &contribution, interrupt).map(drop)
+}
+
+/// Two reachable links on which a member alone would be faster: one has too little bandwidth, the other too much
+/// latency.
+#[test]
+fn p20_a_link_that_costs_more_than_the_peer_brings_is_named_slow() {
+    let timing = Timing { slow: Duration::from_secs(2), ..QUICK };
+    for (rate, late_ms, length) in [(30_000, 0, 200_000), (0, 300, 1_000)] {
+        let (relay, meshes) = pair(timing);
+        relay.slow_down(rate, late_ms);
+        let over = AtomicBool::new(false);
+        let begun = Instant::now();
+        thread::scope(|scope| {
+            for mesh in &meshes {
+                let over = &over;
+                scope.spawn(move || {
+                    let numbers = vec![1.0; length];
+                    let interrupt = || over.load(Ordering::SeqCst).then_some(Halt::Regroup);
+                    for at in 5.. {
+                        if step(mesh, at, &numbers, &interrupt).is_err() {
+                            return;
+                        }
+                    }
+                });
+            }
+            wait_until("both name each other", || meshes[0].lost() == [slow("w1")] && meshes[1].lost() == [slow("w0")]);
+            over.store(true, Ordering::SeqCst);
+        });
+        eprintln!("{rate} B/s and {late_ms} ms are named after {:.1?}", begun.elapsed());
+        meshes.into_iter().for_each(|mesh| mesh.close(None));
+    }
+}
+
+/// Without a relay no peer is named, although the steps are short.
+#[test]
+fn a_good_link_is_not_named_slow() {
+    let timing = Timing { slow: Duration::from_millis(500), ..QUICK };
+    let (_relay, meshes) = pair(timing);
+    thread::scope(|scope| {
+        for mesh in &meshes {
+            scope.spawn(move || {
+                let begun = Instant::now();
+                for at in 5.. {
+                    step(mesh, at, &[1.0; 1000], &|| None).expect("summed");
+                    // Both stop after the same step.
+                    if at == 400 || begun.elapsed() > Duration::from_secs(60) {
+                        return;
+                    }
+                }
+            });
+        }
+    });
+    assert_eq!([meshes[0].lost(), meshes[1].lost()], [[], []]);
+    meshes.into_iter().for_each(|mesh| mesh.close(None));
+}
