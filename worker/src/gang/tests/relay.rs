@@ -201,8 +201,17 @@ fn p20_a_link_that_costs_more_than_the_peer_brings_is_named_slow() {
                     }
                 });
             }
-            wait_until("both name each other", || meshes[0].lost() == [slow("w1")] && meshes[1].lost() == [slow("w0")]);
+            let until = Instant::now() + Duration::from_secs(20);
+            let lost = loop {
+                let lost = [meshes[0].lost(), meshes[1].lost()];
+                if lost == [[slow("w1")], [slow("w0")]] || Instant::now() > until {
+                    break lost;
+                }
+                thread::sleep(Duration::from_millis(5));
+            };
+            // Before the assertion: the threads of the scope would never end after a panic.
             over.store(true, Ordering::SeqCst);
+            assert_eq!(lost, [[slow("w1")], [slow("w0")]], "{rate} B/s and {late_ms} ms");
         });
         eprintln!("{rate} B/s and {late_ms} ms are named after {:.1?}", begun.elapsed());
         meshes.into_iter().for_each(|mesh| mesh.close(None));

@@ -1,0 +1,16 @@
+//! The server over real sockets.
+#![allow(clippy::unwrap_used, clippy::print_stdout, reason = "a test may panic, and prints what it measured")]
+
+#[path = "../simulation/pipelines.rs"]
+mod pipelines;
+#[path = "../common/shell.rs"]
+mod shell;
+
+mod access;
+mod crowd;
+mod http;
+mod limits;
+mod owners;
+mod page;
+mod tls;
+mod workers;

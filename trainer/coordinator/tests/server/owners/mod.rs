@@ -1,0 +1,9 @@
+//! Tests of owners: visibility and control of runs and models, promotion by pipelines, revoked tokens, and the audit
+//! log.
+
+mod audit;
+mod fuzz;
+mod lab;
+mod matrix;
+mod promotion;
+mod tokens;

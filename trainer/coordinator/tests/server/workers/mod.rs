@@ -1,0 +1,8 @@
+//! Attacks by a valid worker token or a faulty worker on others: names, grants, manifests and blobs.
+
+mod blobs;
+mod bystanders;
+mod fuzz;
+mod grants;
+mod matrix;
+mod names;
