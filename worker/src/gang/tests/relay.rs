@@ -95,6 +95,8 @@ fn pair(timing: Timing) -> (Relay, [Arc<Mesh>; 2]) {
             scope.spawn(|| assert_eq!(exchange::rendezvous(mesh, Some(5), &[], &|| None), Ok(Met::Keep)));
         }
     });
+    // As a stage does once its members have met; no peer is named while one of them starts or saves.
+    meshes.iter().for_each(|mesh| mesh.config.busy.set(Phase::Working));
     (relay, meshes)
 }
 
