@@ -9,6 +9,8 @@ export CARGO_TARGET_DIR=${MUTATIONS_TARGET:-$root/target/mutations}
 git -C "$root" worktree add --quiet --force --detach "$copy" HEAD
 trap 'git -C "$root" worktree remove --force "$copy"' EXIT
 cd "$copy"
+# Each fault is compiled anew and tested until the first program with a failure.
+export CARGO_INCREMENTAL=1 CARGO_PROFILE_DEV_DEBUG=0
 log=$copy/mutation.log
 wanted=("$@")
 missed=0
@@ -24,7 +26,7 @@ mutation() {
         return
     fi
     for crate in $crates; do
-        if cargo test --quiet --locked --no-fail-fast -p "$crate" --lib --tests >"$log" 2>&1; then continue; fi
+        if cargo test --quiet --locked -p "$crate" --lib --tests >"$log" 2>&1; then continue; fi
         if grep -q '^test result: FAILED' "$log"; then
             echo "$name: $(grep -E '^    [a-z_:0-9]+$' "$log" | sort -u | tr -s ' \n' ' ')"
         else

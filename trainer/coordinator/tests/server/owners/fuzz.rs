@@ -154,7 +154,7 @@ async fn no_request_changes_or_shows_what_is_anothers() -> TestResult {
                 assert!(!text.contains(CANARY), "{} {} {}: {text}", kind.name, request.path, request.body);
             }
         }
-        // Calls of workers need secrets, which `tests/workers` guesses.
+        // Calls of workers need secrets, which `server/workers` guesses.
         assert!(done > 0 || kind.name == "node", "{}: no request did anything", kind.name);
         for (project, standing) in before {
             assert_eq!(lab.standing(project).await?, standing, "{} changed what is {project:?}'s", kind.name);

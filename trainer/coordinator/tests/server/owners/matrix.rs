@@ -1,5 +1,5 @@
 //! Every client call with every kind of token, on its own, another owner's and protected objects. The calls come from
-//! the server's table; a new call without a rule here fails the test. `tests/access.rs` tests each call by scope,
+//! the server's table; a new call without a rule here fails the test. `server/access.rs` tests each call by scope,
 //! without objects.
 
 use coordinator::shell::routes;
@@ -56,7 +56,7 @@ fn moves(kind: &Kind, alias: &str, project: Project) -> Expected {
     }
 }
 
-/// The cases of a call; `None` for worker calls, which `tests/workers` covers.
+/// The cases of a call; `None` for worker calls, which `server/workers` covers.
 fn cases(lab: &Lab, kind: &Kind, method: &'static str, path: &'static str) -> Option<Vec<Case>> {
     let admin = if kind.has("admin") { Expected::Done } else { Expected::Forbidden };
     let filtered = if kind.has("read") { Expected::Filtered } else { Expected::Forbidden };
@@ -91,7 +91,7 @@ fn cases(lab: &Lab, kind: &Kind, method: &'static str, path: &'static str) -> Op
             }
         }
         // Only a digest gives access to a blob, and the next test shows that other digests are not revealed. Reads of
-        // workers are tested in `tests/workers`.
+        // workers are tested in `server/workers`.
         ("GET", "/v1/blobs/{digest}") if !kind.has("read") => return None,
         ("GET", "/v1/blobs/{digest}") => {
             for project in Project::ALL {
