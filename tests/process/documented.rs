@@ -160,6 +160,9 @@ fn the_units_of_systemd() {
 
     let (text, worker) = unit("stride-worker@.service");
     assert_eq!(worker["EnvironmentFile"], "/etc/stride/worker.env");
+    // Only systemd can enforce these; that they are there is all that can be tested here.
+    assert_eq!(worker["IPAddressDeny"], "any");
+    assert!(worker["IPAddressAllow"].starts_with("localhost ") && !worker["IPAddressAllow"].contains("any"));
     // The environment file in the unit's own comment.
     let shown = text.lines().filter_map(|line| line.strip_prefix("#   ")).filter_map(|line| line.split_once('='));
     let environment: BTreeMap<String, String> = shown
@@ -214,6 +217,8 @@ fn the_container_file_builds_what_there_is() {
         line("FROM docker.io/library/rust:").contains(version.trim_matches('"')),
         "the toolchain is that of Cargo.toml"
     );
+    let bases: Vec<&str> = text.lines().filter(|line| line.starts_with("FROM ")).collect();
+    assert!(bases.len() == 2 && bases.iter().all(|base| base.contains("@sha256:")), "bases by digest: {bases:?}");
 
     let build = words(line("RUN cargo build"));
     for (_, program) in build.iter().zip(&build[1..]).filter(|(option, _)| *option == "--bin") {
