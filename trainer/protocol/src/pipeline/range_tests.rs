@@ -2,7 +2,7 @@
 
 use serde_json::{Value, json};
 
-use super::ranges::{Range, range};
+use super::ranges::{Place, Range};
 use super::*;
 use crate::stage::*;
 use crate::{ArtifactKind, Digest, Steps};
@@ -130,6 +130,19 @@ fn path(pointer: &str) -> String {
     keys.collect::<Vec<_>>().join(".")
 }
 
+/// The range beside the field at `pointer` of a stage. A number without one fails the test.
+fn range(stage: &Value, pointer: &str) -> Range {
+    let keys: Vec<&str> = pointer.trim_start_matches('/').split('/').collect();
+    let kind = stage["kind"].as_str().unwrap();
+    let top = if ["workers", "checkpoint"].contains(&keys[0]) { Place::of_placement() } else { Place::of_kind(kind) };
+    let step =
+        |place: Place<'static>, key: &&str| if key.parse::<usize>().is_ok() { place.entry() } else { place.key(key) };
+    let place = keys.iter().fold(top, step);
+    place
+        .range
+        .unwrap_or_else(|| panic!("`{}` of `{kind}` has no `schemars(range(..))` beside its field", path(pointer)))
+}
+
 /// Each stage as JSON as in the file, placement included.
 fn written() -> Vec<(String, Value)> {
     let placement = serde_json::to_value(Placement::default()).unwrap();
@@ -151,12 +164,8 @@ fn the_default_of_every_numeric_setting_lies_in_its_range() {
         for pointer in found {
             let path = path(&pointer);
             let number = value.pointer(&pointer).unwrap();
-            let (range, _) = range(&path, number);
-            let inside = match range {
-                Range::Whole(from, to) => number.as_u64().is_some_and(|n| (from..=to).contains(&n)),
-                Range::Real(from, to) => number.as_f64().is_some_and(|n| (from..=to).contains(&n)),
-            };
-            assert!(inside, "`{path}` of `{name}` is {number}, outside of {range:?}");
+            let range = range(&value, &pointer);
+            assert!(range.holds(number), "`{path}` of `{name}` is {number}, outside of {range:?}");
         }
     }
 }
@@ -174,7 +183,7 @@ fn a_number_out_of_range_is_refused_where_it_stands_and_none_breaks_the_reader()
         let mut found = Vec::new();
         numbers(value, "", &mut found);
         for pointer in &found {
-            let (range, _) = range(&path(pointer), value.pointer(pointer).unwrap());
+            let range = range(value, pointer);
             for number in NUMBERS {
                 let mut changed = brief.clone();
                 changed[i].1 = value.clone();

@@ -209,7 +209,8 @@ fn kind_of_value(property: &Value) -> String {
         (Value::Array(_), _) => "list of texts".to_owned(),
         _ => "mapping".to_owned(),
     };
-    let number = |key: &str| property[key].as_f64();
+    let list = [&property["items"], &property["prefixItems"][0]];
+    let number = |key: &str| std::iter::once(property).chain(list).find_map(|schema| schema[key].as_f64());
     let range = match (number("minimum"), number("exclusiveMinimum"), number("maximum"), number("exclusiveMaximum")) {
         (Some(low), _, Some(high), _) => format!(", {low} to {high}"),
         (Some(low), _, _, Some(high)) => format!(", {low} to below {high}"),

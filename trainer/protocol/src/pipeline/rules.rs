@@ -15,9 +15,7 @@ pub(super) fn stage(settings: &StageSettings, placement: &Placement) -> Vec<Prob
     {
         problems.add("checkpoint.keep.metric", message, "");
     }
-    for settings in [serde_json::to_value(settings), serde_json::to_value(placement)].iter().flatten() {
-        ranges::check(&mut problems, settings);
-    }
+    ranges::check(&mut problems, settings, placement);
     problems.0
 }
 

@@ -11,8 +11,10 @@ use super::Problems;
 #[serde(default)]
 pub struct Augment {
     /// Standard deviation of the curvature that is added to a path, 1/m.
+    #[schemars(range(min = 0.0, max = 1e3))]
     pub bend: f64,
     /// Standard deviation of the factor on a path's length, around 1.
+    #[schemars(range(min = 0.0, max = 1.0))]
     pub stretch: f64,
 }
 

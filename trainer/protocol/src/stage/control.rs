@@ -28,6 +28,7 @@ pub struct ControlHints {
     pub joints: Vec<String>,
     /// Percent of the frames that get targets: drawn from this range, then rounded down to frames. [0, 100] in the
     /// spatial setting means 1 to all but one frame, each number equally likely, as published.
+    #[schemars(extend("minimum" = 0.0, "maximum" = 100.0), extend("x-unit" = "percent of the frames"))]
     pub density: (f64, f64),
 }
 

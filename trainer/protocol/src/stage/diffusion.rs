@@ -40,8 +40,10 @@ pub struct Diffusion {
     /// Growth of the noise over the timesteps.
     pub schedule: NoiseSchedule,
     /// Share of the variance that becomes noise at the first timestep; for `scaled_linear` and `linear`.
+    #[schemars(range(min = 0.0, max = 1.0), extend("x-unit" = "of the variance"))]
     pub beta_first: f64,
     /// Share of the variance that becomes noise at the last timestep.
+    #[schemars(range(min = 0.0, max = 1.0), extend("x-unit" = "of the variance"))]
     pub beta_last: f64,
     /// Quantity that the network predicts.
     pub prediction: Prediction,

@@ -27,16 +27,21 @@ pub struct Distillation {
     /// Stage that gives the caption embeddings.
     pub text: String,
     /// Range of the guidance scale w, which is drawn from it, in the form `cond + w (cond - uncond)`.
+    #[schemars(extend("minimum" = 0.0, "maximum" = 1e3))]
     pub guidance: (f64, f64),
     /// Width of the guidance embedding.
+    #[schemars(range(min = 4, max = 16_384), extend("x-unit" = "channels"))]
     pub guidance_dim: usize,
     /// Solver step k; the grid has 1000/k points.
+    #[schemars(range(min = 1, max = 1_000), extend("x-unit" = "timesteps"))]
     pub skip: usize,
     /// Distance of the consistency loss.
     pub distance: Distance,
     /// Pseudo-Huber constant c.
+    #[schemars(range(min = 0.0, max = 1e6))]
     pub huber_c: f64,
     /// Decay of the target network.
+    #[schemars(range(min = 0.0, max = 1.0))]
     pub ema: f64,
     /// Applies dropout in the frozen networks, as the original script does by mistake.
     pub upstream_dropout: bool,

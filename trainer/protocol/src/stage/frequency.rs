@@ -39,14 +39,18 @@ pub enum Over {
 #[serde(default)]
 pub struct LowFrequency {
     /// Weight of the term; 0 leaves it out.
+    #[schemars(range(min = 0.0, max = 1e6))]
     pub weight: f64,
     /// Number K of compared coefficients of the cosine transform. Coefficient k is at `k fps / 2n` Hz in n frames.
+    #[schemars(range(min = 1, max = 10_000), extend("x-unit" = "coefficients"))]
     pub keep: usize,
     /// Distance of the slow parts.
     pub distance: Norm,
     /// Lowest noise at which the term acts, as a share of the timesteps.
+    #[schemars(range(min = 0.0, max = 1.0), extend("x-unit" = "of the timesteps"))]
     pub from: f64,
     /// Highest noise at which the term acts, as a share of the timesteps.
+    #[schemars(range(min = 0.0, max = 1.0), extend("x-unit" = "of the timesteps"))]
     pub to: f64,
     /// Transforms only a clip's own frames; the published code transforms padding too.
     pub masked: bool,
@@ -66,15 +70,19 @@ impl Default for LowFrequency {
 #[serde(default)]
 pub struct Semantic {
     /// Weight of the term; 0 leaves it out.
+    #[schemars(range(min = 0.0, max = 1e6))]
     pub weight: f64,
     /// Stage that gives the evaluator for the embeddings. No evaluation may measure with the same one.
     pub evaluator: String,
     /// Lowest noise at which the term acts, as a share of the timesteps.
+    #[schemars(range(min = 0.0, max = 1.0), extend("x-unit" = "of the timesteps"))]
     pub from: f64,
     /// Highest noise at which the term acts, as a share of the timesteps.
+    #[schemars(range(min = 0.0, max = 1.0), extend("x-unit" = "of the timesteps"))]
     pub to: f64,
     /// Threshold of the embeddings' cosine, below which the term has a gradient; with 1 it always has, as in the
     /// published code.
+    #[schemars(range(min = -1.0, max = 1.0))]
     pub threshold: f64,
     /// Samples over which the mean is taken.
     pub over: Over,

@@ -11,14 +11,19 @@ use crate::limits;
 #[serde(default)]
 pub struct Network {
     /// Width H of the tokens.
+    #[schemars(range(min = 1, max = 16_384), extend("x-unit" = "channels"))]
     pub width: usize,
     /// Number of transformer blocks in the skip stack; odd.
+    #[schemars(range(min = 1, max = 255), extend("x-unit" = "layers"))]
     pub layers: usize,
     /// Number of attention heads; divides `width`.
+    #[schemars(range(min = 1, max = 1_024), extend("x-unit" = "heads"))]
     pub heads: usize,
     /// Width of the feed-forward layer.
+    #[schemars(range(min = 1, max = 65_536), extend("x-unit" = "channels"))]
     pub feed_forward: usize,
     /// Probability of dropout.
+    #[schemars(range(min = 0.0, max = 1.0))]
     pub dropout: f64,
     /// Initial values of the learned position tables.
     pub positions: Positions,
@@ -78,8 +83,10 @@ pub enum Positions {
 #[serde(default)]
 pub struct LatentShape {
     /// Number N of latent tokens.
+    #[schemars(range(min = 1, max = crate::limits::LATENT_TOKENS), extend("x-unit" = "tokens"))]
     pub tokens: usize,
     /// Width d of a latent token.
+    #[schemars(range(min = 1, max = 16_384), extend("x-unit" = "numbers a token"))]
     pub dim: usize,
 }
 

@@ -46,8 +46,10 @@ impl Placement {
 #[serde(default)]
 pub struct WorkerRange {
     /// Smallest number; with fewer the stage yields and waits.
+    #[schemars(range(min = 1, max = 10_000), extend("x-unit" = "workers"))]
     pub min: usize,
     /// Largest number; 0 means no limit.
+    #[schemars(range(min = 0, max = 10_000), extend("x-unit" = "workers"))]
     pub max: usize,
 }
 
@@ -62,6 +64,7 @@ impl Default for WorkerRange {
 #[serde(default)]
 pub struct CheckpointPolicy {
     /// Number of steps between checkpoints; 0 saves only when the stage yields.
+    #[schemars(range(min = 0, max = 1_000_000_000))]
     pub every: Steps,
     /// Checkpoints to keep.
     pub keep: Keep,
@@ -78,11 +81,14 @@ impl Default for CheckpointPolicy {
 #[serde(default)]
 pub struct Keep {
     /// Number of newest checkpoints to keep.
+    #[schemars(range(min = 1, max = 10_000), extend("x-unit" = "checkpoints"))]
     pub latest: usize,
     /// Number of newest checkpoints to keep once the stage has ended and its value is stored. `trainer run --verify`
     /// begins at them; 2 lets it check the last interval.
+    #[schemars(range(min = 0, max = 10_000), extend("x-unit" = "checkpoints"))]
     pub ended: usize,
     /// Number of best checkpoints by `metric` to keep.
+    #[schemars(range(min = 0, max = 10_000), extend("x-unit" = "checkpoints"))]
     pub best: usize,
     /// A value that the stage saves with its checkpoints; each is a mean of recorded values over the last hundred
     /// steps.

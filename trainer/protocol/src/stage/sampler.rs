@@ -57,11 +57,14 @@ impl Solver {
 pub struct Sampler {
     /// Number of network evaluations. A PCM student has as many as phases. A masked token generator makes this many
     /// iterations, MMM's for the longest motion. An autoregressive generator has no number of steps, so this is 1.
+    #[schemars(range(min = 1, max = 1_000), extend("x-unit" = "steps"))]
     pub steps: usize,
     /// Guidance scale. Teacher and masked token generator: g in `uncond + g (cond - uncond)`. Student: the embedded w,
     /// which is g - 1. Autoregressive and MMM's generators have none: 0.
+    #[schemars(range(min = 0.0, max = 1e3))]
     pub guidance: f64,
     /// For LCM: timesteps, first to last; empty uses evenly spaced points of the training grid from 999 down.
+    #[schemars(inner(range(min = 0, max = 999)))]
     pub timesteps: Vec<usize>,
     /// Solver from noise to a motion.
     pub solver: Solver,

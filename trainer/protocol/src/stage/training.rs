@@ -10,8 +10,10 @@ use crate::Steps;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct Batch {
     /// Examples per optimizer update, over all workers.
+    #[schemars(range(min = 1, max = 65_536), extend("x-unit" = "examples"))]
     pub global: usize,
     /// Number of forward/backward passes that compute the batch; divides `global`.
+    #[schemars(range(min = 1, max = 4_096), extend("x-unit" = "slices"))]
     pub slices: usize,
 }
 
@@ -42,12 +44,16 @@ pub enum Decay {
 #[serde(default)]
 pub struct Optimizer {
     /// Decay of the first moment.
+    #[schemars(range(min = 0.0, max = 1.0))]
     pub beta1: f64,
     /// Decay of the second moment.
+    #[schemars(range(min = 0.0, max = 1.0))]
     pub beta2: f64,
     /// Added to the root of the second moment.
+    #[schemars(range(min = 0.0, max = 1.0))]
     pub eps: f64,
     /// Decoupled weight decay.
+    #[schemars(range(min = 0.0, max = 1e3))]
     pub weight_decay: f64,
 }
 
@@ -70,12 +76,15 @@ impl Optimizer {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Training {
     /// Number of optimizer updates.
+    #[schemars(range(min = 1, max = 1_000_000_000))]
     pub steps: Steps,
     /// Global batch and its slices.
     pub batch: Batch,
     /// Peak learning rate.
+    #[schemars(range(min = 0.0, max = 1e3))]
     pub lr: f64,
     /// Linear warm-up; the first update has rate 0 when it is positive.
+    #[schemars(range(min = 0, max = 1_000_000_000))]
     pub warmup: Steps,
     /// Decay of the rate after the warm-up.
     pub decay: Decay,
@@ -83,10 +92,12 @@ pub struct Training {
     #[serde(default)]
     pub optimizer: Optimizer,
     /// Largest global norm of gradients, to which they are scaled down; 0 disables clipping.
+    #[schemars(range(min = 0.0, max = 1e6))]
     pub max_grad_norm: f64,
     /// Step at which a sweep's rung stops before the schedule's end, leaving its state for the next rung. Not for
     /// users: the reader accepts only keys of the default.
     #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(range(min = 0, max = 1_000_000_000))]
     pub stop: Option<Steps>,
 }
 

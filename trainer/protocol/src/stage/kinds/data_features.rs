@@ -22,10 +22,12 @@ pub struct DataFeatures {
     /// `.yaml`; empty detects it for each file.
     pub map: String,
     /// Length of the files' unit; 0 detects it for each file.
+    #[schemars(range(min = 0.0, max = 1000.0), extend("x-unit" = "metres"))]
     pub metres_per_unit: f64,
     /// Upward axis of the files.
     pub up: UpAxis,
     /// Frame rate of arrays without one; 0 means 20 for 22 joints, 12.5 for 21.
+    #[schemars(range(min = 0.0, max = 10_000.0), extend("x-unit" = "frames a second"))]
     pub fps: f64,
     /// Bone lengths of the uniform skeleton, a `.npy` of offsets `[J, 3]` or lengths `[J]`; empty means HumanML3D's.
     /// KIT-ML's are not public.
@@ -37,12 +39,15 @@ pub struct DataFeatures {
     /// Division of clips into splits.
     pub splits: Splits,
     /// Share of the validation clips, for `source`.
+    #[schemars(range(min = 0.0, max = 1.0), extend("x-unit" = "of the clips"))]
     pub val: f64,
     /// Share of the test clips, for `source`.
+    #[schemars(range(min = 0.0, max = 1.0), extend("x-unit" = "of the clips"))]
     pub test: f64,
     /// Leaves out broken files and reports them; otherwise they fail the stage.
     pub skip_broken: bool,
     /// Number of shards.
+    #[schemars(range(min = 1, max = crate::limits::SHARDS), extend("x-unit" = "shards"))]
     pub shards: usize,
 }
 

@@ -11,10 +11,13 @@ use crate::stage::{DataFormat, Output, Problems, Ref, Shape, StageSpec};
 #[serde(default)]
 pub struct DataSynthetic {
     /// Number of clips before mirroring.
+    #[schemars(range(min = 1, max = 100_000), extend("x-unit" = "clips"))]
     pub clips: usize,
     /// Share of the validation clips.
+    #[schemars(range(min = 0.0, max = 1.0), extend("x-unit" = "of the clips"))]
     pub val: f64,
     /// Share of the test clips.
+    #[schemars(range(min = 0.0, max = 1.0), extend("x-unit" = "of the clips"))]
     pub test: f64,
     /// Adds a mirrored twin of every clip.
     pub mirror: bool,

@@ -26,18 +26,23 @@ pub struct DistillDiscord {
     /// Stage that gives the flow decoder to be distilled.
     pub teacher: String,
     /// Frames of an example; a multiple of 4. Shorter clips are left out.
+    #[schemars(range(min = 4, max = 10_000), extend("x-unit" = "frames"))]
     pub window: usize,
     /// Windows that make an epoch.
     pub windows_of: WindowsOf,
     /// Number of intervals of the grid between noise and data. The teacher makes one step over each.
+    #[schemars(range(min = 1, max = 1_000), extend("x-unit" = "intervals"))]
     pub intervals: usize,
     /// Number of the student's jumps for decoding motion.
+    #[schemars(range(min = 1, max = 1_000), extend("x-unit" = "steps"))]
     pub solver_steps: usize,
     /// Distance of the consistency loss.
     pub distance: Distance,
     /// Pseudo-Huber constant c.
+    #[schemars(range(min = 0.0, max = 1e6))]
     pub huber_c: f64,
     /// Decay of the target network.
+    #[schemars(range(min = 0.0, max = 1.0))]
     pub ema: f64,
     /// Stage or version, such as `discord@prod`, whose flow decoder supplies initial weights where shapes fit; empty
     /// starts from the teacher's weights.

@@ -11,10 +11,13 @@ use crate::stage::{Distillation, Family, Neighbours, Optimizer, Output, Problems
 #[serde(default)]
 pub struct DistillPcm {
     /// M, the number of phases and of sampling steps.
+    #[schemars(range(min = 1, max = 1_000), extend("x-unit" = "phases"))]
     pub phases: usize,
     /// Weight of the adversarial term; 0 trains without a discriminator.
+    #[schemars(range(min = 0.0, max = 1e6))]
     pub adversarial: f64,
     /// Learning rate of the discriminator; 0 uses `lr`.
+    #[schemars(range(min = 0.0, max = 1e3))]
     pub discriminator_lr: f64,
     /// AdamW constants of the discriminator.
     pub discriminator_optimizer: Optimizer,

@@ -15,10 +15,12 @@ pub struct EncodeLatents {
     /// Stage that gives the VAE.
     pub vae: String,
     /// Number of random crops per entry.
+    #[schemars(range(min = 1, max = 256), extend("x-unit" = "crops of an entry"))]
     pub crops: usize,
     /// Changes the paths of the training split's crops, for a `train.control` on little data.
     pub augment: Augment,
     /// Number of shards.
+    #[schemars(range(min = 1, max = crate::limits::SHARDS), extend("x-unit" = "shards"))]
     pub shards: usize,
 }
 

@@ -20,8 +20,10 @@ pub struct EncodeTokens {
     pub tokenizer: String,
     /// Pads clips with zeros to this many frames before encoding, as MoMask does (196); 0 adds none. A token depends on
     /// some 90 frames on either side, so ids differ.
+    #[schemars(range(min = 0, max = 10_000), extend("x-unit" = "frames"))]
     pub padded: usize,
     /// Number of shards.
+    #[schemars(range(min = 1, max = crate::limits::SHARDS), extend("x-unit" = "shards"))]
     pub shards: usize,
 }
 

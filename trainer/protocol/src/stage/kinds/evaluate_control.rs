@@ -25,27 +25,35 @@ pub struct EvaluateControl {
     /// Cases of joints: a joint, or `six`, `twelve` or `all` of them with targets together.
     pub joints: Vec<String>,
     /// Densities of targets in percent of the frames.
+    #[schemars(inner(range(min = 0.0, max = 100.0)), extend("x-unit" = "percent of the frames"))]
     pub percent: Vec<f64>,
     /// Densities of targets as numbers of frames.
+    #[schemars(inner(range(min = 1, max = 10_000)), extend("x-unit" = "frames"))]
     pub frames: Vec<usize>,
     /// Distance in metres beyond which a target is missed.
+    #[schemars(range(min = 0.0, max = 1e3), extend("x-unit" = "metres"))]
     pub threshold: f64,
     /// Factor on the ControlNet's residuals and on the changes by feedback.
+    #[schemars(range(min = 0.0, max = 1e3))]
     pub scale: f64,
     /// Number of rounds of feedback on generated latents; each motion keeps the result of its best round. By default it
     /// is the number in the control part's training.
+    #[schemars(range(min = 0, max = limits::FEEDBACK_ROUNDS), extend("x-unit" = "rounds"))]
     pub feedback: Option<usize>,
     /// Number of steps that refine generated latents towards the targets; 0, as published, refines nothing.
+    #[schemars(range(min = 0, max = limits::REFINE_STEPS), extend("x-unit" = "steps"))]
     pub refine: usize,
     /// Sampler for the model.
     pub sampler: Sampler,
     /// Number of repeats with other noise, captions, crops and pools.
+    #[schemars(range(min = 1, max = 100), extend("x-unit" = "repeats"))]
     pub repeats: usize,
     /// Split of the clips. Choose on `val`; keep `test` for the final result.
     pub split: Split,
     /// Uses all clips if the split has fewer than a pool of 32, and reports it; otherwise so small a split is refused.
     pub all_if_small: bool,
     /// Number of shards.
+    #[schemars(range(min = 1, max = crate::limits::SHARDS), extend("x-unit" = "shards"))]
     pub shards: usize,
 }
 
@@ -102,15 +110,6 @@ impl StageSpec for EvaluateControl {
         }
         p.above_zero("threshold", self.threshold);
         p.not_negative("scale", self.scale);
-        if let Some(rounds) = self.feedback
-            && rounds > limits::FEEDBACK_ROUNDS
-        {
-            let most = limits::FEEDBACK_ROUNDS;
-            p.add("feedback", format!("`feedback` is {rounds}; expected at most {most}"), "");
-        }
-        if self.refine > limits::REFINE_STEPS {
-            p.add("refine", format!("`refine` is {}; expected at most {}", self.refine, limits::REFINE_STEPS), "");
-        }
         self.sampler.check(p);
         p.positive("repeats", self.repeats);
         p.shards(self.shards);

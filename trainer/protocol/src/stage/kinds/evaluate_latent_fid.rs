@@ -23,16 +23,20 @@ pub struct EvaluateLatentFid {
     /// Sampler for the model.
     pub sampler: Sampler,
     /// Number of repeats with other noise.
+    #[schemars(range(min = 1, max = 100), extend("x-unit" = "repeats"))]
     pub repeats: usize,
     /// Number of samples per entry and repeat.
+    #[schemars(range(min = 1, max = 100), extend("x-unit" = "samples of an entry"))]
     pub samples: usize,
     /// Number of principal components of the train latents in which distances are computed.
+    #[schemars(range(min = 1, max = 4_096), extend("x-unit" = "components"))]
     pub components: usize,
     /// Split of the real clips. Use `all` on small sets, where the distance of real to real is large; each split then
     /// also has its own values (`latent_fid_test`). The distance of real latents to real ones accompanies each value:
     /// `_floor`, `_halves`.
     pub split: Split,
     /// Number of shards.
+    #[schemars(range(min = 1, max = crate::limits::SHARDS), extend("x-unit" = "shards"))]
     pub shards: usize,
 }
 

@@ -38,6 +38,7 @@ pub struct EvaluateRecognition {
     /// Sampler for the model.
     pub sampler: Sampler,
     /// Number of motions, divided among the activities in turn.
+    #[schemars(range(min = 1, max = 10_000), extend("x-unit" = "motions"))]
     pub motions: usize,
     /// Split of the clips for captions and lengths, and for the comparison with real motion.
     pub split: Split,

@@ -22,6 +22,7 @@ pub struct EvaluateReconstruction {
     pub decoder: String,
     /// Number of steps of the flow decoder's solver, or of a student's jumps; 0 uses its own number. A step of solver
     /// `midpoint` is two evaluations of the network, a step of `euler` one.
+    #[schemars(range(min = 0, max = 1_000), extend("x-unit" = "steps"))]
     pub decoder_steps: usize,
     /// Stage that gives the evaluator for FID, of reconstructions against the clips themselves; empty leaves FID out.
     pub evaluator: String,
@@ -30,6 +31,7 @@ pub struct EvaluateReconstruction {
     /// Split of the clips.
     pub split: Split,
     /// Number of shards.
+    #[schemars(range(min = 1, max = crate::limits::SHARDS), extend("x-unit" = "shards"))]
     pub shards: usize,
 }
 

@@ -18,10 +18,12 @@ pub struct EvaluateSpectrum {
     /// Stage that gives the clips.
     pub dataset: String,
     /// Ends of the bands in hertz, ascending; an additional band ends at half the frame rate.
+    #[schemars(inner(range(min = 1e-3, max = 1e3)), extend("x-unit" = "hertz"))]
     pub bands: Vec<f64>,
     /// Sampler for the model.
     pub sampler: Sampler,
     /// Number of motions, one per entry; all entries if there are fewer.
+    #[schemars(range(min = 1, max = 10_000), extend("x-unit" = "motions"))]
     pub motions: usize,
     /// Split of the clips.
     pub split: Split,

@@ -14,10 +14,13 @@ use crate::{ArtifactKind, limits};
 #[serde(default)]
 pub struct MultiModality {
     /// Number of captions per repeat; 0 leaves the metric out.
+    #[schemars(range(min = 0, max = 1_000), extend("x-unit" = "captions"))]
     pub captions: usize,
     /// Number of motions per caption.
+    #[schemars(range(min = 0, max = 1_000), extend("x-unit" = "samples of a caption"))]
     pub samples: usize,
     /// Number of compared pairs per caption.
+    #[schemars(range(min = 0, max = 1_000), extend("x-unit" = "pairs of a caption"))]
     pub pairs: usize,
 }
 
@@ -53,13 +56,16 @@ pub struct EvaluateT2m {
     pub shuffled: bool,
     /// Probability that a word of the model's caption is replaced by another of the same meaning, from a table of ours;
     /// the evaluator reads the original caption. 0 changes nothing.
+    #[schemars(range(min = 0.0, max = 1.0), extend("x-unit" = "of the words"))]
     pub perturbed: f64,
     /// Sampler for the model.
     pub sampler: Sampler,
     /// Number of repeats with other noise, captions, crops and pools.
+    #[schemars(range(min = 1, max = 100), extend("x-unit" = "repeats"))]
     pub repeats: usize,
     /// Sizes of the pools in which a caption's own motion is ranked. R-precision and MM-Dist use the first; metrics of
     /// the others have the suffix `_poolN`.
+    #[schemars(inner(range(min = 4, max = 4_096)), extend("x-unit" = "motions"))]
     pub pools: Vec<usize>,
     /// Leaves out of every metric but MultiModality the clips that do not fill a pool of the first size, as loaders
     /// that drop the last batch do. These clips are drawn again in each repeat. Otherwise only R-precision and MM-Dist
@@ -73,6 +79,7 @@ pub struct EvaluateT2m {
     /// refused.
     pub all_if_small: bool,
     /// Number of shards.
+    #[schemars(range(min = 1, max = crate::limits::SHARDS), extend("x-unit" = "shards"))]
     pub shards: usize,
 }
 

@@ -89,12 +89,15 @@ pub struct ImportModel {
     pub model: String,
     /// Number of attention heads; 0 uses the published number: 4 (MLD, MotionLCM, MDM, DisCoRD), 6 (MoMask), 16
     /// (T2M-GPT, MMM).
+    #[schemars(range(min = 0, max = 1_024), extend("x-unit" = "heads"))]
     pub heads: usize,
     /// For `mld`, `lcm`: ReLU on the caption's embedding.
     pub text_activation: TextActivation,
     /// For `lcm`: range of the guidance scales w in its training.
+    #[schemars(extend("minimum" = 0.0, "maximum" = 1e3))]
     pub guidance: (f64, f64),
     /// For `lcm`: the solver's step k in training, which samplers without `timesteps` follow: 100 (v2), 20 (v1).
+    #[schemars(range(min = 1, max = 1_000), extend("x-unit" = "timesteps"))]
     pub skip: usize,
     /// For `control`: targets in its training.
     pub hints: ControlHints,
@@ -102,18 +105,23 @@ pub struct ImportModel {
     /// hints.
     pub hint_statistics: String,
     /// For `momask`: tokens of the longest motion. The files of other models contain it.
+    #[schemars(range(min = 1, max = 4_096), extend("x-unit" = "tokens"))]
     pub longest: usize,
     /// For `tokenizer`: factor between the dilations of neighbouring blocks.
+    #[schemars(range(min = 1, max = 16))]
     pub growth: usize,
     /// For `mdm`: timesteps of its cosine schedule: 1000, or 50 in the authors' later model.
+    #[schemars(range(min = 2, max = 1_000), extend("x-unit" = "timesteps"))]
     pub timesteps: usize,
     /// For `mdm`: masks padding in attention, as in the later model.
     pub mask_frames: bool,
     /// For `mdm`: frames of the longest motion.
+    #[schemars(range(min = 4, max = 10_000), extend("x-unit" = "frames"))]
     pub max_frames: usize,
     /// For `discord`: solver of the flow.
     pub solver: FlowSolver,
     /// For `discord`: number of steps of the solver.
+    #[schemars(range(min = 1, max = 1_000), extend("x-unit" = "steps"))]
     pub solver_steps: usize,
 }
 

@@ -39,8 +39,10 @@ pub struct TextEmbed {
     pub ids: ClipIds,
     /// Largest number of tokens of a caption, its end included; 0 uses the number in the encoder's folder. MDM reads
     /// 22.
+    #[schemars(range(min = 0, max = 4_096), extend("x-unit" = "tokens"))]
     pub max_tokens: usize,
     /// Number of shards.
+    #[schemars(range(min = 1, max = crate::limits::SHARDS), extend("x-unit" = "shards"))]
     pub shards: usize,
     /// Stage whose captions are embedded.
     pub dataset: String,

@@ -39,12 +39,15 @@ pub enum ControlMean {
 #[serde(default)]
 pub struct ControlLoss {
     /// Weight of the latent term: on a student's clean latent, or on a teacher's predicted noise.
+    #[schemars(range(min = 0.0, max = 1e6))]
     pub latent: f64,
     /// Weight of a term of ours on the trajectory encoder's tokens, which have the shape of latents: their distance
     /// from the clean latent. It trains the encoder directly, without the ControlNet, whose layers are initialised to
     /// zero.
+    #[schemars(range(min = 0.0, max = 1e6))]
     pub tokens: f64,
     /// Weight of the motion term, which compares joints through the frozen decoder; 0 leaves the decoder out.
+    #[schemars(range(min = 0.0, max = 1e6))]
     pub control: f64,
     /// Distance of the motion term.
     pub distance: ControlDistance,
@@ -68,8 +71,10 @@ impl Default for ControlLoss {
 pub struct ControlFeedback {
     /// Number of rounds. Each decodes the latent, and a network changes it by the motion's distance from the targets.
     /// 0, as published, has no such network.
+    #[schemars(range(min = 0, max = limits::FEEDBACK_ROUNDS), extend("x-unit" = "rounds"))]
     pub rounds: usize,
     /// Learning rate of the network of `feedback`; 0 uses `lr`.
+    #[schemars(range(min = 0.0, max = 1e3))]
     pub lr: f64,
 }
 
@@ -92,17 +97,21 @@ pub struct TrainControl {
     /// Terms of the loss.
     pub loss: ControlLoss,
     /// Range of a student's guidance scale w, which is drawn from it; v1 fixes it at 6.5. A teacher has none.
+    #[schemars(extend("minimum" = 0.0, "maximum" = 1e3))]
     pub guidance: (f64, f64),
     /// A student trains at timesteps `k - 1`, `2k - 1` and so on to 999 (v2: k = 100); 1 uses all timesteps (v1). A
     /// teacher uses all.
+    #[schemars(range(min = 1, max = 1_000), extend("x-unit" = "timesteps"))]
     pub skip: usize,
     /// Rounds of feedback on generated latents.
     pub feedback: ControlFeedback,
     /// Size of the trajectory encoder, and of the network of `feedback`. The ControlNet has the denoiser's size.
     pub network: Network,
     /// Width of the layers between trajectory tokens and ControlNet.
+    #[schemars(range(min = 1, max = 16_384), extend("x-unit" = "channels"))]
     pub embedding: usize,
     /// Learning rate of the trajectory encoder; 0 uses `lr`.
+    #[schemars(range(min = 0.0, max = 1e3))]
     pub trajectory_lr: f64,
     /// Stage or version, such as `motionlcm@prod`, whose control part supplies initial weights where shapes fit; empty
     /// starts from the denoiser's weights.
@@ -173,10 +182,6 @@ impl StageSpec for TrainControl {
         p.positive("embedding", self.embedding);
         p.not_negative("trajectory_lr", self.trajectory_lr);
         p.not_negative("feedback.lr", self.feedback.lr);
-        if self.feedback.rounds > limits::FEEDBACK_ROUNDS {
-            let (rounds, most) = (self.feedback.rounds, limits::FEEDBACK_ROUNDS);
-            p.add("feedback.rounds", format!("`feedback.rounds` is {rounds}; expected at most {most}"), "");
-        }
         self.training.check(p);
     }
 

@@ -97,18 +97,23 @@ pub enum FlowProjection {
 #[serde(default)]
 pub struct FlowNetwork {
     /// Width of the U-Net's first level (the second has twice as much), or of the transformer.
+    #[schemars(range(min = 1, max = 16_384), extend("x-unit" = "channels"))]
     pub width: usize,
     /// Width of the condition on a frame.
+    #[schemars(range(min = 1, max = 16_384), extend("x-unit" = "channels"))]
     pub condition: usize,
     /// Residual blocks per level, or blocks of the transformer.
+    #[schemars(range(min = 1, max = 255), extend("x-unit" = "layers"))]
     pub layers: usize,
     /// Number of attention heads.
+    #[schemars(range(min = 1, max = 1_024), extend("x-unit" = "heads"))]
     pub heads: usize,
     /// Adds attention to the U-Net, which the paper found to be worse.
     pub attention: bool,
     /// Conversion of tokens into the condition, for a U-Net.
     pub projection: FlowProjection,
     /// Probability of dropout.
+    #[schemars(range(min = 0.0, max = 1.0))]
     pub dropout: f64,
 }
 
@@ -145,14 +150,17 @@ pub struct TrainDiscord {
     /// Size of the network.
     pub network: FlowNetwork,
     /// Frames of an example; a multiple of 4. Shorter clips are left out.
+    #[schemars(range(min = 4, max = 10_000), extend("x-unit" = "frames"))]
     pub window: usize,
     /// Windows that make an epoch.
     pub windows_of: WindowsOf,
     /// Solver of the flow for decoding motion.
     pub solver: FlowSolver,
     /// Number of steps of the solver.
+    #[schemars(range(min = 1, max = 1_000), extend("x-unit" = "steps"))]
     pub solver_steps: usize,
     /// Decay of the moving average of the weights, which is the result; 0 uses the weights themselves.
+    #[schemars(range(min = 0.0, max = 1.0))]
     pub ema: f64,
     /// Stage or version, such as `discord@prod`, whose flow decoder supplies initial weights where shapes fit; empty
     /// starts from random ones.

@@ -13,14 +13,19 @@ use crate::{ArtifactKind, Steps};
 #[serde(default)]
 pub struct EvaluatorNetwork {
     /// Width of a movement, and between the two convolutions that compute it.
+    #[schemars(range(min = 1, max = 4_096), extend("x-unit" = "channels"))]
     pub movement: usize,
     /// Width of the GRU over movements.
+    #[schemars(range(min = 1, max = 4_096), extend("x-unit" = "channels"))]
     pub motion: usize,
     /// Width of the GRU over words.
+    #[schemars(range(min = 1, max = 4_096), extend("x-unit" = "channels"))]
     pub text: usize,
     /// Width of an embedding.
+    #[schemars(range(min = 1, max = 4_096), extend("x-unit" = "channels"))]
     pub embedding: usize,
     /// Probability of dropout in the movement encoder, first phase only.
+    #[schemars(range(min = 0.0, max = 1.0))]
     pub dropout: f64,
 }
 
@@ -35,14 +40,19 @@ impl Default for EvaluatorNetwork {
 #[serde(default)]
 pub struct MovementPhase {
     /// Share of the steps in this phase.
+    #[schemars(range(min = 0.0, max = 1.0), extend("x-unit" = "of the steps"))]
     pub until: f64,
     /// Frames of an example.
+    #[schemars(range(min = 1, max = 10_000), extend("x-unit" = "frames"))]
     pub window: usize,
     /// Examples per update; 0 uses `batch.global`.
+    #[schemars(range(min = 0, max = 65_536), extend("x-unit" = "examples"))]
     pub batch: usize,
     /// Weight of the mean absolute value of movements.
+    #[schemars(range(min = 0.0, max = 1e6))]
     pub sparsity: f64,
     /// Weight of the mean difference of neighbouring movements.
+    #[schemars(range(min = 0.0, max = 1e6))]
     pub smoothness: f64,
 }
 
@@ -66,10 +76,13 @@ pub struct TrainEvaluator {
     /// Settings of the first phase.
     pub movement: MovementPhase,
     /// Divisor of the deviations of root and contacts, which increases their weight. The published files have about 25.
+    #[schemars(range(min = 0.0, max = 1e6))]
     pub emphasis: f64,
     /// Distance up to which captions and motions that do not match are separated.
+    #[schemars(range(min = 0.0, max = 1e6))]
     pub margin: f64,
     /// Decay of the moving average of the weights, which is the result; 0 uses the weights themselves.
+    #[schemars(range(min = 0.0, max = 1.0))]
     pub ema: f64,
     /// Stage or version, such as `motionlcm@prod`, whose evaluator supplies initial weights where shapes fit; empty
     /// starts from random ones.

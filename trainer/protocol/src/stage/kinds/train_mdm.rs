@@ -15,14 +15,19 @@ use crate::{ArtifactKind, Steps};
 #[serde(default)]
 pub struct MdmNetwork {
     /// Width of the tokens; even.
+    #[schemars(range(min = 1, max = 16_384), extend("x-unit" = "channels"))]
     pub width: usize,
     /// Number of transformer blocks.
+    #[schemars(range(min = 1, max = 255), extend("x-unit" = "layers"))]
     pub layers: usize,
     /// Number of attention heads; divides `width`.
+    #[schemars(range(min = 1, max = 1_024), extend("x-unit" = "heads"))]
     pub heads: usize,
     /// Width of the feed-forward layer.
+    #[schemars(range(min = 1, max = 65_536), extend("x-unit" = "channels"))]
     pub feed_forward: usize,
     /// Probability of dropout.
+    #[schemars(range(min = 0.0, max = 1.0))]
     pub dropout: f64,
 }
 
@@ -73,15 +78,19 @@ pub struct TrainMdm {
     /// Noise schedule and prediction.
     pub diffusion: Diffusion,
     /// Number of timesteps of the schedule: 1000 in the paper, 50 in its authors' later model.
+    #[schemars(range(min = 2, max = 1_000), extend("x-unit" = "timesteps"))]
     pub timesteps: usize,
     /// Masks frames of padding in attention, which the authors call a fix; the paper's model attends to them.
     pub mask_frames: bool,
     /// Frames of the longest motion.
+    #[schemars(range(min = 4, max = 10_000), extend("x-unit" = "frames"))]
     pub max_frames: usize,
     /// Probability that a caption is dropped.
+    #[schemars(range(min = 0.0, max = 1.0), extend("x-unit" = "of the captions"))]
     pub guidance_dropout: f64,
     /// Decay of the moving average of the weights, which is the result; 0 uses the weights themselves. The authors'
     /// model of 50 steps has 0.9999.
+    #[schemars(range(min = 0.0, max = 1.0))]
     pub ema: f64,
     /// Losses of Free-T2M.
     pub losses: FrequencyLosses,

@@ -29,12 +29,15 @@ pub struct TrainMld {
     /// Applies a ReLU to the text embedding (v1); v2 removed it.
     pub text_relu: bool,
     /// Probability that a caption is replaced by the empty one.
+    #[schemars(range(min = 0.0, max = 1.0), extend("x-unit" = "of the captions"))]
     pub guidance_dropout: f64,
     /// Decay of the moving average of the weights, which is the result; 0 uses the weights themselves.
+    #[schemars(range(min = 0.0, max = 1.0))]
     pub ema: f64,
     /// Losses of Free-T2M, on motions from the frozen decoder.
     pub losses: FrequencyLosses,
     /// Share of the batch whose latents are decoded for `losses`: decoding costs more than denoising.
+    #[schemars(range(min = 0.0, max = 1.0), extend("x-unit" = "of the batch"))]
     pub decoded: f64,
     /// Batch, schedule and optimizer.
     #[serde(flatten)]

@@ -20,22 +20,30 @@ const LEVELS: usize = 4;
 #[serde(default)]
 pub struct StableMoFusionNetwork {
     /// Number of channels that the multipliers scale.
+    #[schemars(range(min = 1, max = 16_384), extend("x-unit" = "channels"))]
     pub width: usize,
     /// Channels of each level of the U-Net as a multiple of `width`; at most 4 levels.
+    #[schemars(inner(range(min = 1, max = 64)))]
     pub multipliers: Vec<usize>,
     /// Width of the timestep's embedding; even.
+    #[schemars(range(min = 2, max = 16_384), extend("x-unit" = "channels"))]
     pub time: usize,
     /// Width of a token.
+    #[schemars(range(min = 1, max = 4_096), extend("x-unit" = "channels"))]
     pub text: usize,
     /// Number of blocks of the text transformer.
+    #[schemars(range(min = 1, max = 255), extend("x-unit" = "layers"))]
     pub text_layers: usize,
     /// Number of heads of the text transformer; divides `text`.
+    #[schemars(range(min = 1, max = 1_024), extend("x-unit" = "heads"))]
     pub text_heads: usize,
     /// Feed-forward width of the text transformer.
+    #[schemars(range(min = 1, max = 65_536), extend("x-unit" = "channels"))]
     pub text_feed_forward: usize,
     /// Uses softmax cross-attention instead of the linear one.
     pub full_attention: bool,
     /// Probability of dropout.
+    #[schemars(range(min = 0.0, max = 1.0))]
     pub dropout: f64,
 }
 
@@ -114,17 +122,23 @@ pub struct TrainStableMoFusion {
     /// Noise schedule and prediction.
     pub diffusion: Diffusion,
     /// Number of timesteps of the schedule.
+    #[schemars(range(min = 2, max = 1_000), extend("x-unit" = "timesteps"))]
     pub timesteps: usize,
     /// Divisor of the deviations of root and contact features, which increases their weight.
+    #[schemars(range(min = 1e-3, max = 1e3))]
     pub feature_bias: f64,
     /// Frames of the longest motion.
+    #[schemars(range(min = 4, max = 10_000), extend("x-unit" = "frames"))]
     pub max_frames: usize,
     /// Probability that a caption is dropped.
+    #[schemars(range(min = 0.0, max = 1.0), extend("x-unit" = "of the captions"))]
     pub guidance_dropout: f64,
     /// Decay of the moving average of the weights, which is the result; 0 uses the weights themselves. As published,
     /// the weight of an update is `1 - ema` times `106667 ema_every / steps`, at most 1.
+    #[schemars(range(min = 0.0, max = 1.0))]
     pub ema: f64,
     /// Updates of the weights per update of the average; the first of these copies.
+    #[schemars(range(min = 1, max = 1_000_000), extend("x-unit" = "updates"))]
     pub ema_every: u64,
     /// Losses of Free-T2M.
     pub losses: FrequencyLosses,

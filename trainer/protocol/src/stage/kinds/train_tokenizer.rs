@@ -16,12 +16,16 @@ const SQUARES_A_BLOCK: usize = 16;
 #[serde(default)]
 pub struct TokenizerNetwork {
     /// Width of the convolutions.
+    #[schemars(range(min = 1, max = 16_384), extend("x-unit" = "channels"))]
     pub width: usize,
     /// Number of residual blocks in each of the two levels.
+    #[schemars(range(min = 1, max = 16), extend("x-unit" = "blocks"))]
     pub depth: usize,
     /// Factor between the dilations of neighbouring blocks.
+    #[schemars(range(min = 1, max = 16))]
     pub growth: usize,
     /// Probability of dropout in the blocks: 0.2 in MoMask, none in T2M-GPT and MMM.
+    #[schemars(range(min = 0.0, max = 1.0))]
     pub dropout: f64,
 }
 
@@ -36,10 +40,13 @@ impl Default for TokenizerNetwork {
 #[serde(default)]
 pub struct TokenizerLoss {
     /// Smooth L1 on normalised features.
+    #[schemars(range(min = 0.0, max = 1e6))]
     pub feature: f64,
     /// Smooth L1 on local positions ("velocity" upstream).
+    #[schemars(range(min = 0.0, max = 1e6))]
     pub position: f64,
     /// Squared distance of the encoder's rows to their codes.
+    #[schemars(range(min = 0.0, max = 1e6))]
     pub commitment: f64,
 }
 
@@ -79,12 +86,16 @@ pub struct TrainTokenizer {
     /// Stage that gives the clips.
     pub dataset: String,
     /// Number of codes of a codebook.
+    #[schemars(range(min = 2, max = 65_536), extend("x-unit" = "codes"))]
     pub codes: usize,
     /// Width of a code.
+    #[schemars(range(min = 1, max = 4_096), extend("x-unit" = "numbers a code"))]
     pub code_dim: usize,
     /// Number of codebooks; each quantises the residuals of those before it.
+    #[schemars(range(min = 1, max = 64), extend("x-unit" = "codebooks"))]
     pub quantizers: usize,
     /// Probability that a step leaves out the codebooks above a drawn one.
+    #[schemars(range(min = 0.0, max = 1.0), extend("x-unit" = "of the steps"))]
     pub quantize_dropout: f64,
     /// Draws codes by their distances in training, instead of using the nearest.
     pub drawn: bool,
@@ -95,6 +106,7 @@ pub struct TrainTokenizer {
     /// Weights of the loss terms.
     pub loss: TokenizerLoss,
     /// Frames of an example; a multiple of 4. Shorter clips are left out.
+    #[schemars(range(min = 4, max = 10_000), extend("x-unit" = "frames"))]
     pub window: usize,
     /// Windows that make an epoch.
     pub windows_of: WindowsOf,

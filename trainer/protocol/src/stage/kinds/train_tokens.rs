@@ -29,18 +29,25 @@ pub enum TokenGenerator {
 #[serde(default)]
 pub struct TokenNetwork {
     /// Width H of the network.
+    #[schemars(range(min = 1, max = 16_384), extend("x-unit" = "channels"))]
     pub width: usize,
     /// Number of blocks: of each half of T2M-GPT's and MMM's network, of each of MoMask's two networks.
+    #[schemars(range(min = 1, max = 255), extend("x-unit" = "layers"))]
     pub layers: usize,
     /// Number of attention heads; divides `width`.
+    #[schemars(range(min = 1, max = 1_024), extend("x-unit" = "heads"))]
     pub heads: usize,
     /// Width of the feed-forward layer; a multiple of `width` for T2M-GPT and MMM.
+    #[schemars(range(min = 1, max = 65_536), extend("x-unit" = "channels"))]
     pub feed_forward: usize,
     /// Probability of dropout.
+    #[schemars(range(min = 0.0, max = 1.0))]
     pub dropout: f64,
     /// Width of MoMask's token embeddings. T2M-GPT's have the network's width, MMM's are the tokenizer's codes.
+    #[schemars(range(min = 1, max = 4_096), extend("x-unit" = "channels"))]
     pub embedding: usize,
     /// For MMM: number of blocks that attend to the caption's words, counted among `layers` of the first half.
+    #[schemars(range(min = 0, max = 255), extend("x-unit" = "blocks"))]
     pub word_blocks: usize,
 }
 
@@ -93,11 +100,14 @@ pub struct TrainTokens {
     /// Size of the network.
     pub network: TokenNetwork,
     /// Tokens of the longest motion; longer ones are cut at random.
+    #[schemars(range(min = 1, max = 4_096), extend("x-unit" = "tokens"))]
     pub longest: usize,
     /// For `autoregressive` and `mmm`: probability that a random code replaces a token of the input.
+    #[schemars(range(min = 0.0, max = 1.0), extend("x-unit" = "of the tokens"))]
     pub corruption: f64,
     /// For `masked`: probability that the first layer's network gets no caption; the residual network has twice this,
     /// 0.1 and 0.2 as published.
+    #[schemars(range(min = 0.0, max = 1.0), extend("x-unit" = "of the captions"))]
     pub guidance_dropout: f64,
     /// Stage or version, such as `momask@prod`, whose generator supplies initial weights where shapes fit; empty starts
     /// from random ones.

@@ -13,19 +13,25 @@ use crate::stage::{
 #[serde(default)]
 pub struct VaeLoss {
     /// Smooth L1 on normalised features.
+    #[schemars(range(min = 0.0, max = 1e6))]
     pub feature: f64,
     /// Smooth L1 on recovered joints, in metres.
+    #[schemars(range(min = 0.0, max = 1e6))]
     pub joint: f64,
     /// Smooth L1 on local positions ("velocity" upstream).
+    #[schemars(range(min = 0.0, max = 1e6))]
     pub velocity: f64,
     /// Smooth L1 on the speed of ankles and feet, in m/s, which reduces sliding (our choice, similar to MDM's L_vel and
     /// L_foot).
+    #[schemars(range(min = 0.0, max = 1e6))]
     pub feet: f64,
     /// KL divergence from the standard normal, a mean over all elements.
+    #[schemars(range(min = 0.0, max = 1e6))]
     pub kl: f64,
     /// Leaves out padded frames (v2); false is v1's plain mean.
     pub masked: bool,
     /// Share of the steps before the terms on joints and feet start; early, the root drift dominates the posture.
+    #[schemars(range(min = 0.0, max = 1.0), extend("x-unit" = "of the steps"))]
     pub joint_from: f64,
 }
 
@@ -40,12 +46,16 @@ impl Default for VaeLoss {
 #[serde(default)]
 pub struct Windows {
     /// Shortest crop in frames.
+    #[schemars(range(min = 1, max = 10_000), extend("x-unit" = "frames"))]
     pub min: usize,
     /// Longest crop in frames.
+    #[schemars(range(min = 1, max = 10_000), extend("x-unit" = "frames"))]
     pub max: usize,
     /// Share of the steps that train on windows; 0 turns them off.
+    #[schemars(range(min = 0.0, max = 1.0), extend("x-unit" = "of the steps"))]
     pub until: f64,
     /// Examples per update in this part; 0 uses `batch.global`.
+    #[schemars(range(min = 0, max = 65_536), extend("x-unit" = "examples"))]
     pub batch: usize,
 }
 
@@ -73,6 +83,7 @@ pub struct TrainVae {
     /// on new ones.
     pub augment: Augment,
     /// Decay of the moving average of the weights, which is the result; 0 uses the weights themselves.
+    #[schemars(range(min = 0.0, max = 1.0))]
     pub ema: f64,
     /// Stage or version, such as `motionlcm@prod`, whose VAE supplies initial weights where shapes fit; empty starts
     /// from random ones.
