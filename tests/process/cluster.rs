@@ -83,7 +83,8 @@ fn coordinator_away(down: Duration) {
         let stage = cluster.stage(&run, "vae");
         let over = stage["state"] != "running";
         // Until a worker has polled, the progress is that of the newest checkpoint.
-        let polled = down.is_zero() || ["w1", "w2"].iter().all(|name| cluster.said(name).contains("the coordinator is back"));
+        let polled =
+            down.is_zero() || ["w1", "w2"].iter().all(|name| cluster.said(name).contains("the coordinator is back"));
         (over || polled && stage["progress"]["done"].as_u64() > Some(0)).then_some(stage)
     });
     let (was, is) = (before["progress"]["done"].as_u64(), back["progress"]["done"].as_u64());

@@ -96,14 +96,10 @@ impl<'a> Deciding<'a> {
             Fact::ExecutionState { key, .. } => {
                 self.touched.insert(*key);
                 self.touched.extend(self.state.mended_for(*key));
-                runs.extend(
-                    self.state
-                        .executions
-                        .get(key)
-                        .into_iter()
-                        .flat_map(|execution| execution.users.iter())
-                        .map(|(run, _)| *run),
-                );
+                // Also the runs whose executions wait for the recomputation of its value.
+                let waiting = self.state.waiting_for(*key);
+                let executions = waiting.iter().chain([key]).filter_map(|key| self.state.executions.get(key));
+                runs.extend(executions.flat_map(|execution| execution.users.iter()).map(|(run, _)| *run));
             }
             Fact::ExecutionPlacement { key, .. }
             | Fact::ExecutionSource { key, .. }

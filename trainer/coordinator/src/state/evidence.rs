@@ -177,9 +177,11 @@ impl<'a> Complaints<'a> {
         if !(over || is_urgent && ranks.clone().all(|rank| is_heard(rank) || self.is_clear_about(rank, is_heard))) {
             return Verdict::Open;
         }
+        let any_holds = self.words.iter().flatten().any(|word| word.holds.is_some());
         let standing = |rank: usize| match self.words[rank] {
             Some(word) if is_heard(rank) => word.holds.map_or(Standing::Empty, Standing::Holds),
-            Some(word) if word.holds.is_none() => Standing::Absent,
+            // It may have taken the state from a holder, or have had it in an earlier generation, after that report.
+            Some(word) if word.holds.is_none() && word.grant.fence == self.task.fence && !any_holds => Standing::Absent,
             Some(_) | None => Standing::Late,
         };
         Verdict::Leave(self.leave(&ranks.map(standing).collect::<Vec<_>>(), suspicions))

@@ -41,7 +41,7 @@ impl State {
     }
 
     /// Executions that wait directly or indirectly for the recomputation of `input`.
-    pub(super) fn waiting_for(&self, input: Digest) -> BTreeSet<Digest> {
+    pub(crate) fn waiting_for(&self, input: Digest) -> BTreeSet<Digest> {
         let mut all = BTreeSet::new();
         let mut found = vec![input];
         while let Some(key) = found.pop() {

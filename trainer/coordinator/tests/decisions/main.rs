@@ -1,6 +1,7 @@
 //! Decisions without a disk, a network or a clock.
 
 #[path = "../common/mod.rs"]
+#[allow(dead_code, reason = "shared with the simulation")]
 mod common;
 
 mod batches;

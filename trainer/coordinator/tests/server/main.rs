@@ -4,6 +4,7 @@
 #[path = "../simulation/pipelines.rs"]
 mod pipelines;
 #[path = "../common/shell.rs"]
+#[allow(dead_code, reason = "shared with other tests")]
 mod shell;
 
 mod access;

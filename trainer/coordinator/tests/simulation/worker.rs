@@ -154,6 +154,11 @@ impl FakeWorker {
         self.stuck_until > now
     }
 
+    /// Returns true if it has reported the end of its task, so that its gang cannot step with it.
+    pub(crate) fn has_reported(&self) -> bool {
+        matches!(self.saving, Saving::Report(_) | Saving::Over)
+    }
+
     fn assignment(&self) -> Option<&Assignment> {
         self.desired.as_ref()?.assignments.first()
     }

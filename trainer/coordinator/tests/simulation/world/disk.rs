@@ -290,10 +290,15 @@ impl World {
             };
             let left =
                 before.iter().filter(|member| !after.contains(member)).filter(had_to_leave).filter_map(live).max();
-            let kept = after.iter().filter_map(kept).max();
+            // Members without the state continue from the newest checkpoint, and without one from the beginning.
+            let saved = state.task(&task).ok().and_then(|(_, task)| task.newest()).map_or(0, |saved| saved.step);
+            let kept = after.iter().filter_map(kept).max().unwrap_or(saved);
             assert!(
-                left.is_none_or(|left| kept.is_some_and(|kept| kept + 1 >= left)),
-                "`{task}` went from step {left:?} to {kept:?}: {before:?} to {after:?}"
+                left.is_none_or(|left| kept + 1 >= left),
+                "`{task}` went from step {left:?} to {kept:?} at {}: {before:#?} to {after:#?}; reports: {:#?}, workers: {:#?}",
+                self.now.0,
+                state.heard.words,
+                self.workers
             );
         }
     }

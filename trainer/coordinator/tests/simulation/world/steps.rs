@@ -400,7 +400,9 @@ impl World {
             let apart = |peer: &&FakeWorker| peers.iter().any(|other| is_cut(&peer.name, &other.name));
             let hangs = peers.len() > 1 && peers.iter().any(|peer| peer.is_stuck(now));
             let in_step = |peer: &&FakeWorker| peer.runs(now) && peer.grant().is_some_and(|g| g.fence == grant.fence);
-            let together = !hangs && !peers.is_empty() && !peers.iter().any(apart) && peers.iter().all(in_step);
+            let ended = peers.len() > 1 && peers.iter().any(|peer| peer.has_reported());
+            let together =
+                !hangs && !ended && !peers.is_empty() && !peers.iter().any(apart) && peers.iter().all(in_step);
             let furthest = together.then(|| peers.iter().filter_map(|peer| peer.live(&grant)).max());
             let saved = task.and_then(|task| task.newest()).map_or(0, |saved| saved.step);
             let chaos = self.chaos();
