@@ -90,7 +90,7 @@ pub fn is_divided(words: &Words, task: &Task) -> bool {
 /// The rank of a member by its state and presence.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 enum Standing {
-    /// Silent despite time to poll, and known to have only initial state.
+    /// Silent despite time to poll. Reported only initial state in this generation, in which no member holds more.
     Absent,
     /// Polling, with only initial state.
     Empty,
