@@ -24,9 +24,9 @@ use super::sentences::SentenceArgs;
 use super::stream::{self, Opening, StreamArgs};
 use super::words;
 use crate::client::Target;
-use crate::print::{self, Output};
-use crate::problem::{Problem, Result};
 use crate::reader::Reader;
+use crate::report::print::{self, Output};
+use crate::report::problem::{Problem, Result};
 
 #[derive(Debug, Args)]
 #[command(mut_arg("out", |out| out.required(false).required_unless_present("stream")))]

@@ -9,14 +9,14 @@ use protocol::message::{RunState, RunView, Submit};
 
 use super::args::PipelineArgs;
 use super::spectrum;
-use crate::advice::advice;
 use crate::client::{Client, Target};
-use crate::pipeline_file;
-use crate::print::{self, Output};
-use crate::problem::{Problem, Result, exit};
-use crate::progress::Progress;
+use crate::local::advice::advice;
+use crate::local::pipeline_file;
 use crate::reader::Reader;
-use crate::summary::{self, Summary};
+use crate::report::print::{self, Output};
+use crate::report::problem::{Problem, Result, exit};
+use crate::report::progress::Progress;
+use crate::report::summary::{self, Summary};
 
 #[derive(Debug, Args)]
 pub(crate) struct SubmitArgs {
