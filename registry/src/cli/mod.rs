@@ -31,7 +31,7 @@ use crate::backup::{BackupError, Summary};
 use crate::forget::Forgotten;
 use crate::leaderboard::{self, Comparison, Leaderboard, Style};
 use crate::retention::{GRACE_MS, Plan};
-use crate::versions::{BEST, Gate, LATEST, Model, ModelRef, Promotion, Version};
+use crate::versions::{BEST, Expect, Gate, LATEST, Model, ModelRef, Promotion, Version};
 use crate::{LineageNode, OpenError, QueryError, ReadStore, Store, StoreId, WriteError, fsck};
 
 /// The table of exit codes for `--help`. They have the same meaning in `trainer`.
@@ -242,20 +242,9 @@ async fn answer(command: Command, store: &ReadStore, holder: Option<(&Store, &st
             Data::History { model, history }
         }
         Command::Promote { reference, to, expect, require, reason } => {
-            let reference: ModelRef = reference.parse().map_err(invalid)?;
-            let alias: Alias = to.parse().map_err(invalid)?;
-            for gate in &require {
-                gate.parse::<Gate>().map_err(invalid)?;
-            }
-            let Some(pick) = reference.pick else {
-                let model = reference.model;
-                return Err(invalid(format!(
-                    "`{model}` has several versions: say `{model}@best` or `{model}:VERSION`"
-                )));
-            };
             let (store, actor) = writes()?;
-            let promotion = store.promote(&reference.model, pick, &alias, expect, require, &reason, actor).await?;
-            Data::Promotion { promotion }
+            let order = Move { reference: &reference, to: &to, expect, require, reason: &reason };
+            Data::Promotion { promotion: promote(store, actor, order).await? }
         }
         Command::Rollback { model, alias, to, expect, reason } => {
             let (model, alias): (ModelName, Alias) = (model.parse().map_err(invalid)?, alias.parse().map_err(invalid)?);
@@ -270,69 +259,104 @@ async fn answer(command: Command, store: &ReadStore, holder: Option<(&Store, &st
         Command::Leaderboard { of, published, style } => {
             Data::Leaderboard { leaderboard: leaderboard(store, &of, published).await?, style }
         }
-        Command::Lineage { reference } => {
-            let digest = match reference.parse::<Digest>() {
-                Ok(digest) => digest,
-                Err(_) => store.resolve(&reference).await?.artifact,
-            };
-            let nodes = store.lineage(digest).await?;
-            if nodes.iter().all(|node| node.kind.is_none() && node.inputs.is_empty()) && !exists(store, digest).await? {
-                return Err(Refused::from(QueryError::NotFound(format!("no artifact {digest}"))));
-            }
-            Data::Lineage { nodes }
-        }
-        Command::Audit { limit } => {
-            let dir = store.dir().to_owned();
-            let read = tokio::task::spawn_blocking(move || audit::read(&dir, limit.min(MOST_LINES))).await;
-            let failed = |e: &dyn std::fmt::Display| QueryError::Storage(format!("the audit log cannot be read: {e}"));
-            Data::Audit { entries: read.map_err(|e| failed(&e))?.map_err(|e| failed(&e))? }
-        }
-        Command::Fsck => {
-            let report = store.fsck().await?;
-            if !report.problems.is_empty() {
-                let message = format!("{} problems found; the first: {}", report.problems.len(), report.problems[0]);
-                let hint = "restore the store from a backup, or remove the damaged blobs under `blobs/` and run the pipelines \
-                            that made them again";
-                let mut answer = Answer::refused(error("damaged", message, Some(hint)));
-                answer.data = Some(Data::Fsck { report });
-                return Err(answer.into());
-            }
-            Data::Fsck { report }
-        }
+        Command::Lineage { reference } => lineage(store, &reference).await?,
+        Command::Audit { limit } => audit(store, limit).await?,
+        Command::Fsck => verified(store.fsck().await?)?,
         Command::Gc { dry_run, grace_minutes } => {
             let grace_ms = grace_minutes.map_or(GRACE_MS, |minutes| i64::from(minutes) * 60_000);
             let plan = if dry_run { store.gc_plan(grace_ms).await? } else { writes()?.0.gc(grace_ms).await? };
             Data::Gc { dry_run, plan }
         }
         Command::Forget { run, ended_before, leftovers_before } => {
-            let mut runs = Vec::new();
-            match (run, ended_before, leftovers_before) {
+            let store = writes()?.0;
+            let runs = match (run, ended_before, leftovers_before) {
                 (Some(run), None, None) => {
                     let run = RunId::new(run);
-                    let gone = writes()?.0.forget(&run).await?;
-                    runs.push((run, gone));
+                    let gone = store.forget(&run).await?;
+                    vec![(run, gone)]
                 }
-                // One transaction each, so that other writes can proceed in between.
-                (None, Some(before_ms), None) => {
-                    for run in store.ended_before(before_ms).await? {
-                        let gone = writes()?.0.forget(&run).await?;
-                        runs.push((run, gone));
-                    }
-                }
-                (None, None, Some(before_ms)) => {
-                    for run in store.ended_before(before_ms).await? {
-                        let gone = writes()?.0.forget_leftovers(&run, before_ms).await?;
-                        if gone != Forgotten::default() {
-                            runs.push((run, gone));
-                        }
-                    }
-                }
+                (None, Some(before_ms), None) => forget_ended(store, before_ms).await?,
+                (None, None, Some(before_ms)) => forget_leftovers(store, before_ms).await?,
                 _ => return Err(invalid("`forget` needs one run, or one of `ended_before` and `leftovers_before`")),
-            }
+            };
             Data::Forgotten { runs }
         }
     };
     Ok(Answer::done(data))
+}
+
+/// A promotion as written.
+struct Move<'a> {
+    reference: &'a str,
+    to: &'a str,
+    expect: Option<Expect>,
+    require: Vec<String>,
+    reason: &'a str,
+}
+
+async fn promote(store: &Store, actor: &str, order: Move<'_>) -> Result<Promotion, Refused> {
+    let reference: ModelRef = order.reference.parse().map_err(invalid)?;
+    let alias: Alias = order.to.parse().map_err(invalid)?;
+    for gate in &order.require {
+        gate.parse::<Gate>().map_err(invalid)?;
+    }
+    let Some(pick) = reference.pick else {
+        let model = reference.model;
+        return Err(invalid(format!("`{model}` has several versions: say `{model}@best` or `{model}:VERSION`")));
+    };
+    let Move { expect, require, reason, .. } = order;
+    Ok(store.promote(&reference.model, pick, &alias, expect, require, reason, actor).await?)
+}
+
+async fn lineage(store: &ReadStore, reference: &str) -> Result<Data, Refused> {
+    let digest = match reference.parse::<Digest>() {
+        Ok(digest) => digest,
+        Err(_) => store.resolve(reference).await?.artifact,
+    };
+    let nodes = store.lineage(digest).await?;
+    if nodes.iter().all(|node| node.kind.is_none() && node.inputs.is_empty()) && !exists(store, digest).await? {
+        return Err(Refused::from(QueryError::NotFound(format!("no artifact {digest}"))));
+    }
+    Ok(Data::Lineage { nodes })
+}
+
+async fn audit(store: &ReadStore, limit: usize) -> Result<Data, Refused> {
+    let dir = store.dir().to_owned();
+    let read = tokio::task::spawn_blocking(move || audit::read(&dir, limit.min(MOST_LINES))).await;
+    let failed = |e: &dyn std::fmt::Display| QueryError::Storage(format!("the audit log cannot be read: {e}"));
+    Ok(Data::Audit { entries: read.map_err(|e| failed(&e))?.map_err(|e| failed(&e))? })
+}
+
+/// Returns the report, or an error with the report if it has problems.
+fn verified(report: fsck::Report) -> Result<Data, Refused> {
+    let Some(first) = report.problems.first() else { return Ok(Data::Fsck { report }) };
+    let message = format!("{} problems found; the first: {first}", report.problems.len());
+    let hint = "restore the store from a backup, or remove the damaged blobs under `blobs/` and run the pipelines \
+                that made them again";
+    let mut answer = Answer::refused(error("damaged", message, Some(hint)));
+    answer.data = Some(Data::Fsck { report });
+    Err(answer.into())
+}
+
+/// Deletes runs in one transaction each, so that other writes can proceed in between.
+async fn forget_ended(store: &Store, before_ms: i64) -> Result<Vec<(RunId, Forgotten)>, Refused> {
+    let mut runs = Vec::new();
+    for run in store.ended_before(before_ms).await? {
+        let gone = store.forget(&run).await?;
+        runs.push((run, gone));
+    }
+    Ok(runs)
+}
+
+async fn forget_leftovers(store: &Store, before_ms: i64) -> Result<Vec<(RunId, Forgotten)>, Refused> {
+    let mut runs = Vec::new();
+    for run in store.ended_before(before_ms).await? {
+        let gone = store.forget_leftovers(&run, before_ms).await?;
+        if gone != Forgotten::default() {
+            runs.push((run, gone));
+        }
+    }
+    Ok(runs)
 }
 
 /// Returns the version that a reference names. A model alone means its best version, or its newest if no metric ranks
