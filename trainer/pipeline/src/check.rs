@@ -2,10 +2,11 @@
 
 use std::collections::BTreeSet;
 
-use crate::definition::{Pipeline, PipelineStage, StageInput};
-use crate::{graph, rules, sweep_rules, trial, yaml};
 use protocol::stage::{Register, StageSettings};
 use protocol::{StageName, limits};
+
+use crate::definition::{Pipeline, PipelineStage, StageInput};
+use crate::{graph, rules, sweep_rules, trial, yaml};
 
 impl Pipeline {
     /// Applies the rules that need no text, for a pipeline that arrived as JSON.

@@ -2,11 +2,10 @@
 
 use std::collections::BTreeMap;
 
-use serde::{Deserialize, Serialize};
-
 use protocol::stage::{Backend, ExternalFolder, Placement, StageIdentity, StageSettings, Target, VersionInput};
 use protocol::sweep::{Derived, Sweep};
 use protocol::{ArtifactKind, Digest, Seed, StageName};
+use serde::{Deserialize, Serialize};
 
 /// An immutable DAG of stages, in an order in which each stage comes after its inputs.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

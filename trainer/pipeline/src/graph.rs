@@ -2,12 +2,13 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use crate::definition::{PipelineStage, StageInput};
-use crate::rules::Problems;
 use protocol::model_ref::{ModelRef, names_version};
 use protocol::stage::{Neighbour, Neighbours, Register, Shape, StageSettings, VersionInput};
 use protocol::sweep::Domain;
 use protocol::{ArtifactKind, StageName, limits};
+
+use crate::definition::{PipelineStage, StageInput};
+use crate::rules::Problems;
 
 /// Largest number of stages that a message lists.
 const LISTED: usize = 20;

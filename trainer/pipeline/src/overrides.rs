@@ -1,12 +1,12 @@
 //! `--set a.b=c`: values are written over the tree before its check, so that they are checked like the file.
 
+use protocol::limits;
+use protocol::spelling::nearest;
 use serde_json::Value;
 
 use crate::diagnostic::Position;
 use crate::schema::list_keys;
 use crate::yaml::{self, Budget, Content, Entry, Node};
-use protocol::limits;
-use protocol::spelling::nearest;
 
 /// Top-level keys of a pipeline.
 pub(crate) const TOP_KEYS: [&str; 6] = ["name", "seed", "backend", "dataset", "text", "stages"];

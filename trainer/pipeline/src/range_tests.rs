@@ -1,11 +1,11 @@
 //! Every numeric setting of every kind, tested with numbers that no setting should accept.
 
+use protocol::stage::*;
+use protocol::{ArtifactKind, Digest, Steps};
 use serde_json::{Value, json};
 
 use crate::ranges::{Place, Range};
 use crate::*;
-use protocol::stage::*;
-use protocol::{ArtifactKind, Digest, Steps};
 
 /// Each of these replaces a setting.
 const NUMBERS: &[&str] = &[

@@ -7,12 +7,12 @@
 use std::collections::BTreeMap;
 use std::sync::LazyLock;
 
+use protocol::limits;
+use protocol::stage::{Placement, Problem, Problems, StageSettings};
 use schemars::JsonSchema as _;
 use serde_json::Value;
 
 use crate::described::generator;
-use protocol::limits;
-use protocol::stage::{Placement, Problem, Problems, StageSettings};
 
 /// Schemas of the settings of each kind.
 static KINDS: LazyLock<BTreeMap<&str, Value>> = LazyLock::new(|| {

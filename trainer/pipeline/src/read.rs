@@ -2,6 +2,12 @@
 
 use std::collections::BTreeMap;
 
+use protocol::id::{is_name, is_stage_name};
+use protocol::limits;
+use protocol::spelling::nearest;
+use protocol::stage::{Backend, DataOpen, DataSynthetic, Placement, StageSettings, TextEmbed};
+use protocol::sweep::Sweep;
+use protocol::{Seed, StageName};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
@@ -15,12 +21,6 @@ use crate::rules::{self, Problem};
 use crate::schema::{Mistake, list_keys, overlay};
 use crate::yaml::{self, Budget, Content, Entry, Node};
 use crate::{graph, sweep_rules, trial};
-use protocol::id::{is_name, is_stage_name};
-use protocol::limits;
-use protocol::spelling::nearest;
-use protocol::stage::{Backend, DataOpen, DataSynthetic, Placement, StageSettings, TextEmbed};
-use protocol::sweep::Sweep;
-use protocol::{Seed, StageName};
 
 /// Reads a pipeline. `file` is its name in messages, `sets` are overrides such as `stages.vae.lr=1e-4`.
 ///
@@ -100,6 +100,18 @@ struct Written {
     path: String,
 }
 
+/// Stages of a file: all of them, and the readable ones with their settings.
+#[derive(Default)]
+struct Found {
+    written: Vec<Written>,
+    stages: Vec<PipelineStage>,
+}
+
+/// Place of the key of a stage under `stages`.
+fn declared(root: &Node, name: &str) -> Option<Position> {
+    root.entry("stages").and_then(|stages| stages.value.entry(name)).map(|stage| stage.key_at)
+}
+
 impl Reader {
     fn pipeline(&mut self, text: &str, sets: &[String]) -> Option<Pipeline> {
         let mut budget = Budget::default();
@@ -166,12 +178,17 @@ impl Reader {
     /// All stages of the file, and the readable ones with their settings. A stage with mistakes is only in the first
     /// list.
     fn stages(&mut self, root: &Node) -> (Vec<Written>, Vec<PipelineStage>) {
-        let mut written = Vec::new();
-        let mut stages = Vec::new();
-        let declared = |name: &str| root.entry("stages").and_then(|e| e.value.entry(name)).map(|e| e.key_at);
+        let mut found = Found::default();
+        self.dataset_stage(root, &mut found);
+        self.text_stage(root, &mut found);
+        self.named_stages(root, &mut found);
+        (found.written, found.stages)
+    }
 
+    /// The stage of the top-level key `dataset`.
+    fn dataset_stage(&mut self, root: &Node, found: &mut Found) {
         if let Some(entry) = root.entry("dataset") {
-            if let Some(at) = declared("dataset") {
+            if let Some(at) = declared(root, "dataset") {
                 self.mistake(
                     at,
                     "stages.dataset",
@@ -179,20 +196,23 @@ impl Reader {
                     None,
                 );
             }
-            written.push(Written::implicit("dataset", entry));
+            found.written.push(Written::implicit("dataset", entry));
             if let Some(settings) = self.dataset(entry) {
-                stages.push(stage("dataset", settings, Placement::default()));
+                found.stages.push(stage("dataset", settings, Placement::default()));
             }
-        } else if declared("dataset").is_none() {
+        } else if declared(root, "dataset").is_none() {
             let help = "such as `dataset: {format: synthetic}` or `dataset: {format: humanml3d, path: data/HumanML3D}`";
             self.mistake(root.at, "dataset", "the pipeline has no `dataset`", Some(help.into()));
             // Readers of the stage need not report it again.
-            written.push(Written { name: "dataset".into(), key_at: root.at, node: None, path: "dataset".into() });
+            found.written.push(Written { name: "dataset".into(), key_at: root.at, node: None, path: "dataset".into() });
         }
+    }
 
+    /// The stage of the top-level key `text`, or its default.
+    fn text_stage(&mut self, root: &Node, found: &mut Found) {
         match root.entry("text") {
             Some(entry) => {
-                if let Some(at) = declared("text") {
+                if let Some(at) = declared(root, "text") {
                     self.mistake(
                         at,
                         "stages.text",
@@ -200,18 +220,21 @@ impl Reader {
                         None,
                     );
                 }
-                written.push(Written::implicit("text", entry));
+                found.written.push(Written::implicit("text", entry));
                 if let Some(settings) = self.typed::<TextEmbed>(&entry.value, "`text`", "text", &[]) {
-                    stages.push(stage("text", StageSettings::TextEmbed(settings), Placement::default()));
+                    found.stages.push(stage("text", StageSettings::TextEmbed(settings), Placement::default()));
                 }
             }
-            None if declared("text").is_none() => {
-                written.push(Written { name: "text".into(), key_at: root.at, node: None, path: "text".into() });
-                stages.push(stage("text", StageSettings::TextEmbed(TextEmbed::default()), Placement::default()));
+            None if declared(root, "text").is_none() => {
+                found.written.push(Written { name: "text".into(), key_at: root.at, node: None, path: "text".into() });
+                found.stages.push(stage("text", StageSettings::TextEmbed(TextEmbed::default()), Placement::default()));
             }
             None => {}
         }
+    }
 
+    /// The stages of the top-level key `stages`.
+    fn named_stages(&mut self, root: &Node, found: &mut Found) {
         match root.entry("stages") {
             None => self.mistake(
                 root.at,
@@ -229,7 +252,7 @@ impl Reader {
                 }
                 Some(entries) => {
                     for entry in entries {
-                        written.push(Written {
+                        found.written.push(Written {
                             name: StageName::new(&*entry.key),
                             key_at: entry.key_at,
                             node: Some(entry.value.clone()),
@@ -239,18 +262,17 @@ impl Reader {
                             let mut stage = stage(&entry.key, settings, placement);
                             stage.sweep = sweep;
                             stage.inputs.extend(trial::references(&stage));
-                            stages.push(stage);
+                            found.stages.push(stage);
                         }
                     }
                 }
                 None => {
-                    let found = entry.value.describe();
-                    let message = format!("`stages` is {found}; expected a mapping from names to stages");
+                    let shown = entry.value.describe();
+                    let message = format!("`stages` is {shown}; expected a mapping from names to stages");
                     self.mistake(entry.value.at, "stages", message, Some("such as `vae: {kind: train.vae}`".into()));
                 }
             },
         }
-        (written, stages)
     }
 
     fn dataset(&mut self, entry: &Entry) -> Option<StageSettings> {

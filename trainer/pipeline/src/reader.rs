@@ -1,13 +1,13 @@
 //! Reader of a pipeline file that collects its mistakes: the common part of reading a stage and a sweep.
 
+use protocol::spelling::nearest;
+use protocol::stage::StageSettings;
 use serde::Serialize;
 use serde_json::Value;
 
 use crate::diagnostic::Position;
 use crate::schema::{Mistake, list_keys, overlay};
 use crate::yaml::Node;
-use protocol::spelling::nearest;
-use protocol::stage::StageSettings;
 
 pub(crate) struct Reader {
     pub(crate) mistakes: Vec<Mistake>,

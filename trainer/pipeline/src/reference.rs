@@ -7,11 +7,11 @@
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
 
+use protocol::stage::{DataOpen, DataSynthetic, ImportModel, Placement, Shape, StageSettings, Target, TextEmbed};
 use serde_json::{Map, Value, json};
 
 use crate::described::{described, described_as, generator};
 use crate::{read, sweep};
-use protocol::stage::{DataOpen, DataSynthetic, ImportModel, Placement, Shape, StageSettings, Target, TextEmbed};
 
 /// JSON Schema (draft 2020-12) of a pipeline file.
 pub fn json_schema() -> Value {

@@ -1,8 +1,9 @@
 //! Rules for a single stage: those of its kind, and of its placement. Rules between stages are in `graph`.
 
-use crate::ranges;
 use protocol::stage::{Placement, StageSettings};
 pub(crate) use protocol::stage::{Problem, Problems};
+
+use crate::ranges;
 
 /// Checks a single stage.
 pub(crate) fn stage(settings: &StageSettings, placement: &Placement) -> Vec<Problem> {

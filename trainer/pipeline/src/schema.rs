@@ -4,11 +4,11 @@
 //! the set of keys. Any other value is a leaf, checked by inserting the user's value and deserialising with serde. So a
 //! field is declared once, in its struct.
 
+use protocol::spelling::nearest;
 use serde::de::DeserializeOwned;
 use serde_json::Value;
 
 use crate::yaml::{Content, Node};
-use protocol::spelling::nearest;
 
 /// A mistake at a position of the tree.
 #[derive(Debug)]

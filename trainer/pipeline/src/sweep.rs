@@ -4,6 +4,9 @@
 
 use std::collections::BTreeMap;
 
+use protocol::ArtifactKind;
+use protocol::stage::{Mode, StageSettings};
+use protocol::sweep::{Domain, EVALUATE, Rungs, SearchKind, Sweep, evaluated_field, setting};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
@@ -13,9 +16,6 @@ use crate::diagnostic::Position;
 use crate::reader::Reader;
 use crate::schema::{list_keys, overlay, unknown_key};
 use crate::yaml::{Content, Entry, Node};
-use protocol::ArtifactKind;
-use protocol::stage::{Mode, StageSettings};
-use protocol::sweep::{Domain, EVALUATE, Rungs, SearchKind, Sweep, evaluated_field, setting};
 
 /// Kinds of domains.
 const DOMAINS: [&str; 3] = ["choice", "uniform", "log_uniform"];

@@ -1,5 +1,10 @@
 //! The rules of `sweep:`. Every value of a choice and both ends of a range are checked as values of the stage.
 
+use protocol::limits;
+use protocol::spelling::nearest;
+use protocol::stage::{Placement, StageSettings};
+use protocol::sweep::{self, Domain, MAX_TRIALS, Rungs, SearchKind, Sweep, Values, evaluated_field};
+use protocol::{ArtifactKind, StageName, Steps};
 use serde_json::Value;
 
 use crate::definition::PipelineStage;
@@ -7,11 +12,6 @@ use crate::graph::{self, ByStage};
 use crate::rules::{self, Problem, Problems};
 use crate::schema::list_keys;
 use crate::trial_values::trial_settings;
-use protocol::limits;
-use protocol::spelling::nearest;
-use protocol::stage::{Placement, StageSettings};
-use protocol::sweep::{self, Domain, MAX_TRIALS, Rungs, SearchKind, Sweep, Values, evaluated_field};
-use protocol::{ArtifactKind, StageName};
 
 /// Checks a stage's sweep without other stages.
 pub(crate) fn rules(stage: &PipelineStage) -> Vec<Problem> {
@@ -31,6 +31,17 @@ pub(crate) fn rules(stage: &PipelineStage) -> Vec<Problem> {
     if !p.0.is_empty() {
         return problems.0;
     }
+    metric_rules(p, sweep);
+    search_rules(p, sweep);
+    rung_rules(p, sweep, training.steps);
+    value_rules(p, stage, sweep);
+    // Problems of the stage's placement are reported there.
+    p.0.extend(rules::stage(&sweep.evaluate, &Placement::default()).into_iter().map(in_evaluation));
+    problems.0
+}
+
+/// Checks that the evaluation gives the metric.
+fn metric_rules(p: &mut Problems, sweep: &Sweep) {
     if sweep.metric.trim().is_empty() {
         p.add("sweep.metric", "`metric` is missing: the value of `evaluate` that decides which trial is best", "");
     }
@@ -46,6 +57,10 @@ pub(crate) fn rules(stage: &PipelineStage) -> Vec<Problem> {
         let help = format!("{meant}name one of {}", list_keys(names.map(String::as_str)));
         p.add("sweep.metric", message, &help);
     }
+}
+
+/// Checks that the search method fits the space and the number of trials.
+fn search_rules(p: &mut Problems, sweep: &Sweep) {
     if !(1..=1000).contains(&sweep.parallel) {
         p.add("sweep.parallel", format!("`parallel` is {}; expected 1 to 1000", sweep.parallel), "");
     }
@@ -77,8 +92,12 @@ pub(crate) fn rules(stage: &PipelineStage) -> Vec<Problem> {
             }
         }
     }
+}
+
+/// Checks the budgets at which trials are compared; `steps` are those of the whole training.
+fn rung_rules(p: &mut Problems, sweep: &Sweep, steps: Steps) {
     if sweep.search == SearchKind::Asha {
-        let (Rungs { first, factor }, steps) = (sweep.rungs, training.steps);
+        let Rungs { first, factor } = sweep.rungs;
         if first.0 == 0 || first >= steps {
             let message =
                 format!("`rungs.first` is {first}; expected fewer steps than the stage's {steps}, and at least 1");
@@ -91,6 +110,10 @@ pub(crate) fn rules(stage: &PipelineStage) -> Vec<Problem> {
         let message = format!("`rungs` are for `asha`; with `{}` every trial trains to the end", sweep.search.name());
         p.add("sweep.rungs", message, "leave them out");
     }
+}
+
+/// Checks every value of a choice and both ends of a range as a value of the stage.
+fn value_rules(p: &mut Problems, stage: &PipelineStage, sweep: &Sweep) {
     for (path, domain) in &sweep.space {
         let field = format!("sweep.space.{path}");
         let whole = sweep.setting(&stage.settings, path).is_some_and(|value| value.is_number() && !value.is_f64());
@@ -108,9 +131,6 @@ pub(crate) fn rules(stage: &PipelineStage) -> Vec<Problem> {
             }
         }
     }
-    // Problems of the stage's placement are reported there.
-    p.0.extend(rules::stage(&sweep.evaluate, &Placement::default()).into_iter().map(in_evaluation));
-    problems.0
 }
 
 /// Checks a sweep that arrived as JSON as the reader does: each path is a searchable setting, each domain has values.

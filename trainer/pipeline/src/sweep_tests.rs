@@ -2,9 +2,10 @@
 
 use std::collections::BTreeMap;
 
-use crate::*;
 use protocol::sweep::{Domain, SearchKind, Values, rung_name};
 use protocol::{Digest, Steps};
+
+use crate::*;
 
 pub(crate) const GOOD: &str = "name: p
 dataset: {format: synthetic, clips: 10}

@@ -3,9 +3,10 @@
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
-use crate::*;
 use protocol::stage::{Keep, Mode};
 use protocol::{Digest, Seed};
+
+use crate::*;
 
 /// A valid pipeline; cases replace a part of it.
 const GOOD: &str = "name: p

@@ -1,12 +1,13 @@
 //! Effects of a sweep on the pipeline: its inputs, its readers, and the stages of a trial.
 
+use protocol::stage::{Placement, Shape, StageSettings, Target, WorkerRange};
+use protocol::sweep::{Derived, STATE_OUTPUT, Values, evaluated_field, rung_name};
+use protocol::{ArtifactKind, StageName, Steps};
+
 use crate::definition::{IN_EVALUATION, PipelineStage, StageInput};
 use crate::graph;
 use crate::rules::{Problem, Problems};
 use crate::trial_values::trial_settings;
-use protocol::stage::{Placement, Shape, StageSettings, Target, WorkerRange};
-use protocol::sweep::{Derived, STATE_OUTPUT, Values, evaluated_field, rung_name};
-use protocol::{ArtifactKind, StageName, Steps};
 
 /// Optional suffix of a swept stage's name; a reference to a swept stage always means its best trial.
 const BEST: &str = "@best";

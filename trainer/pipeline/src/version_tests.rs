@@ -2,8 +2,9 @@
 
 use std::collections::BTreeMap;
 
-use crate::read;
 use protocol::Digest;
+
+use crate::read;
 
 const GOOD: &str = "name: p
 dataset: {format: synthetic, clips: 10}

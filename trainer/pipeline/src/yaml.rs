@@ -7,11 +7,11 @@
 
 use std::collections::HashMap;
 
+use protocol::limits;
 use saphyr_parser::{Event, Parser, ScalarStyle, ScanError, Span};
 use serde_json::{Number, Value};
 
 use crate::diagnostic::Position;
-use protocol::limits;
 
 /// Remaining size that may be read.
 #[derive(Debug)]
