@@ -254,7 +254,7 @@ pub(super) fn is_known(generator: &Generator, label: &str, caption: &str) -> Res
         print::note(&format!("note: the sentence is empty: {label} draws without being told what"));
     } else if !known {
         print::note(&format!(
-            "note: the text encoder of {label} knows nothing of `{caption}`, which so gives the motion of an empty sentence"
+            "note: the text encoder of {label} has no word of `{caption}`; the motion is that of an empty sentence"
         ));
     }
     Ok(known)

@@ -115,7 +115,7 @@ pub(crate) async fn submit(args: SubmitArgs) -> Result<u8> {
     let until = args.until.map(StageName::new);
     pipeline_file::check_stage(&file.pipeline, until.as_ref())?;
     let Some(client) = Client::running(&args.target).await? else {
-        let problem = Problem::usage("no server is running on this store, so nobody would do the work");
+        let problem = Problem::usage("no server is running on this store, so no worker would do the work");
         return Err(problem.hint("`trainer serve` starts one, `trainer run` needs none; or name one with --server"));
     };
     advice(&file.pipeline).iter().for_each(|note| print::note(&format!("note: {note}")));
