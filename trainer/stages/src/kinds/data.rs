@@ -37,14 +37,14 @@ fn log_report(cx: &mut dyn AttemptContext, report: &OpenReport) {
         cx.log(&format!("skipped {skip}, {}: {}", skip.split, skip.reason.heading()));
     }
     if !report.shared.is_empty() {
-        cx.log(&format!("warning: in more than one split: {}", report.shared.join(", ")));
+        cx.log(&format!("warning: clips in more than one split: {}", report.shared.join(", ")));
     }
 }
 
 impl Plain for DataSynthetic {
     fn run(&self, cx: &mut dyn AttemptContext) -> Result<Outcome, StageError> {
         if self.clips == 0 {
-            return Err(StageError::Input("`clips` is 0, expected at least 1".into()));
+            return Err(StageError::Input("`clips` is 0; expected at least 1".into()));
         }
         let (seed, clips) = (cx.task().seed, self.clips as u64);
         let world = RefCell::new(&mut *cx);

@@ -159,7 +159,7 @@ fn slice_gradient<M: Module>(module: &M, loss: Tensor<1>) -> Vec<f32> {
 /// The result of a slice that trains only `module`, on all of `losses`.
 fn slice_result<M: Module>(module: &M, losses: &Losses, terms: &[&'static str]) -> Result<SliceResult, StageError> {
     let total = losses.total().ok_or_else(|| {
-        StageError::Input("every weight of the loss is 0, so there is nothing to learn; set one".into())
+        StageError::Input("every weight of the loss is 0, so nothing is learned; set at least one above 0".into())
     })?;
     let gradients = vec![slice_gradient(module, total)];
     Ok(SliceResult { gradients, terms: losses.values(terms), ..SliceResult::default() })
@@ -177,7 +177,7 @@ pub(crate) fn word(setting: &impl serde::Serialize) -> String {
 
 /// The error for an evaluation on a split without entries.
 fn no_entries(split: Split) -> StageError {
-    StageError::Input(format!("the split `{}` has no entries; set `split` to one that has", word(&split)))
+    StageError::Input(format!("the split `{}` has no entries; set `split` to one that has entries", word(&split)))
 }
 
 /// The error for a training split without clips.

@@ -138,14 +138,14 @@ impl Map for EvaluateT2m {
         few.iter().for_each(|few| cx.log(few));
         if plan.split != self.split {
             cx.log(&format!(
-                "the split `{}` is too small for pools of {}: measured on all {entries} entries",
+                "the split `{}` is too small for pools of {}; all {entries} entries are measured",
                 word(&self.split),
                 self.largest_pool()
             ));
         }
         if samples < entries {
             cx.log(&format!(
-                "{} of {entries} entries fill no pool of {pool}; each repeat leaves out others",
+                "{} of {entries} entries do not fill a pool of {pool}; each repeat leaves out different ones",
                 entries - samples
             ));
         }
