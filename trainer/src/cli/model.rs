@@ -14,7 +14,7 @@ use protocol::stage::Sampler;
 use protocol::{ArtifactKind, Digest, Manifest};
 use registry::cli::{Command, Data};
 use stages::context::StageError;
-use stages::kinds::REPORT_FILE;
+use stages::evaluation::REPORT_FILE;
 
 use crate::reader::Reader;
 use crate::report::problem::{Problem, Result, exit};

@@ -8,7 +8,7 @@ use motion::DataPath;
 use pipeline::Pipeline;
 use protocol::StageName;
 use protocol::stage::{DataFeatures, DataFormat, DataOpen, DataSynthetic};
-use stages::estimate::{Entries, Estimate, estimate};
+use stages::run::estimate::{Entries, Estimate, estimate};
 
 /// Time limit of all trial runs; the stage that reaches it is the last.
 const BUDGET: Duration = Duration::from_secs(30);

@@ -12,7 +12,7 @@ use protocol::{ArtifactKind, Digest, RunId, StageName, Steps, TaskId};
 use registry::{ReadStore, RunRow, StageResultRow};
 use serde::Serialize;
 use serde_json::Value;
-use stages::estimate::Estimate;
+use stages::run::estimate::Estimate;
 
 use crate::local::fleet;
 use crate::local::missing::Missing;
@@ -112,8 +112,8 @@ impl Plan {
             long(seconds),
             long(wall),
             self.workers,
-            stages::estimate::STEPS - 1,
-            stages::estimate::EXAMPLES,
+            stages::run::estimate::STEPS - 1,
+            stages::run::estimate::EXAMPLES,
         );
         if untried > 0 {
             text.push_str(&format!(

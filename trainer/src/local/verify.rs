@@ -16,7 +16,7 @@ use protocol::stage::Shape;
 use protocol::{Digest, Manifest, RunId, StageName, TaskId};
 use registry::ReadStore;
 use serde::Serialize;
-use stages::verify::{Rerun, rerun, state_digest};
+use stages::run::verify::{Rerun, rerun, state_digest};
 
 use crate::report::print::{self, Output};
 use crate::report::problem::{Problem, Result, exit};

@@ -519,6 +519,11 @@ impl Latents {
     }
 }
 
+/// The name of a setting's value, such as `humanml3d` or `test`.
+pub(crate) fn word(setting: &impl serde::Serialize) -> String {
+    serde_json::to_value(setting).ok().and_then(|value| Some(value.as_str()?.to_owned())).unwrap_or_default()
+}
+
 #[cfg(test)]
 mod tests {
     use protocol::stage::DataSynthetic;

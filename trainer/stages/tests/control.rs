@@ -13,11 +13,11 @@ use protocol::stage::{
     TrainMld, TrainVae, Training,
 };
 use protocol::{Digest, Manifest, Seed, Steps};
+use stage_lab::{Bench, Script};
 use stages::context::Outcome;
-use stages::control::ControlOptions;
 use stages::generate::Generator;
-use stages::hint::{Hint, metres};
-use stages::testing::{Bench, Script};
+use stages::parts::control::ControlOptions;
+use stages::parts::hint::{Hint, metres};
 
 const STEPS: u64 = 9;
 

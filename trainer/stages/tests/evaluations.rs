@@ -15,12 +15,12 @@ use protocol::stage::{
     Sampler, Split, StageSettings, TextEmbed, TrainLength, TrainVae, Training,
 };
 use protocol::{ArtifactKind, Digest, Manifest, Seed, Steps};
+use stage_lab::Bench;
 use stages::artifacts::{self, DenoiserMeta, Latents, MODEL_FILE, VaeMeta, to_meta};
 use stages::generate::Generator;
-use stages::generator::{self, Batch as Motions};
-use stages::testing::Bench;
-use stages::text;
-use stages::timing::{Times, WARM_UP, sentences, time};
+use stages::generate::generator::{self, Batch as Motions};
+use stages::generate::timing::{Times, WARM_UP, sentences, time};
+use stages::parts::text;
 
 const LATENT: LatentShape = LatentShape { tokens: 2, dim: 4 };
 

@@ -19,13 +19,13 @@ use protocol::stage::{
     TrainLength, Training,
 };
 use protocol::{ArtifactKind, Digest, Manifest, Seed, Steps};
+use stage_lab::{Bench, Script};
 use stages::artifacts::{self, DenoiserMeta, MODEL_FILE, VaeMeta, to_meta};
 use stages::context::Outcome;
-use stages::evaluator::{EvaluatorMeta, TrainedEvaluator};
-use stages::kinds::REPORT_FILE;
-use stages::testing::{Bench, Script};
-use stages::text;
-use stages::words::WordsMeta;
+use stages::evaluation::REPORT_FILE;
+use stages::parts::evaluator::{EvaluatorMeta, TrainedEvaluator};
+use stages::parts::text;
+use stages::parts::words::WordsMeta;
 
 const LATENT: LatentShape = LatentShape { tokens: 2, dim: 4 };
 

@@ -8,9 +8,9 @@ use protocol::stage::{
     StageSettings, TextEmbed, TrainEvaluator, TrainMdm, TrainMld, TrainStableMoFusion, Training,
 };
 use protocol::{Digest, Seed, Steps};
+use stage_lab::{Bench, Script};
 use stages::context::Outcome;
 use stages::generate::Generator;
-use stages::testing::{Bench, Script};
 
 const STEPS: u64 = 9;
 

@@ -5,9 +5,9 @@ use std::fs;
 use motion::dataset::Split;
 use protocol::Seed;
 use protocol::stage::{DataFeatures, DataFormat, Splits, StageSettings, UpAxis};
+use stage_lab::Bench;
 use stages::artifacts;
 use stages::context::StageError;
-use stages::testing::Bench;
 
 fn bench() -> Bench {
     Bench::new(burn::tensor::Device::flex(), 7, 1)

@@ -13,10 +13,10 @@ use protocol::stage::{
     TrainEvaluator, TrainTokenizer, TrainTokens, Training,
 };
 use protocol::{Digest, Seed, Steps};
+use stage_lab::{Bench, Script};
 use stages::context::StageError;
 use stages::generate::Generator;
-use stages::testing::{Bench, Script};
-use stages::tokenizer::TrainedTokenizer;
+use stages::parts::tokenizer::TrainedTokenizer;
 
 const STEPS: u64 = 14;
 

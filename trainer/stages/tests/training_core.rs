@@ -11,9 +11,9 @@ use protocol::{ArtifactKind, Seed, Steps};
 use safetensors::SafeTensors;
 use serde_json::json;
 
+use stage_lab::{Bench, Script};
 use stages::artifacts;
 use stages::context::{GangContext, Outcome, StageError};
-use stages::testing::{Bench, Script};
 use stages::train::{
     AfterStep, Average, BufferPlan, Buffers, Clip, GroupPlan, Objective, SliceResult, SumPlan, TrainState, Trained,
     Turns, train,

@@ -11,8 +11,8 @@ use models::networks::{Init, Vae};
 use protocol::artifact::FileEntry;
 use protocol::stage::{DataFormat, LatentShape, Positions, StageSettings, TrainVae};
 use protocol::{ArtifactKind, Digest, Manifest, Seed};
+use stage_lab::{Bench, Script};
 use stages::artifacts::{MODEL_FILE, VaeMeta};
-use stages::testing::{Bench, Script};
 
 fn bench(members: usize) -> Bench {
     Bench::new(burn::tensor::Device::flex(), 7, members)

@@ -4,7 +4,7 @@
 use std::thread;
 use std::time::{Duration, Instant};
 
-use stages::stream::{Ask, MotionStream, Segment};
+use stages::generate::stream::{Ask, MotionStream, Segment};
 use tokio::sync::{mpsc, oneshot};
 
 use super::opening::{Beginning, Opening};

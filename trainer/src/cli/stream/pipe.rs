@@ -9,7 +9,7 @@ use mocap::export::{Motion, Outs};
 use motion::Skeleton;
 use motion::waypoints::Waypoint;
 use stages::generate::Generator;
-use stages::stream::{MotionStream, Segment};
+use stages::generate::stream::{MotionStream, Segment};
 
 use super::super::{model, out};
 use super::course::{Course, Pace};

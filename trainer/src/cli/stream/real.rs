@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use motion::{DataPath, Skeleton, npy};
-use stages::evaluation::junction::{Jump, jumps, usual};
+use stages::metrics::junction::{Jump, jumps, usual};
 
 use super::report::Real;
 use crate::report::problem::{Problem, Result};

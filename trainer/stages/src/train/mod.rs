@@ -12,8 +12,13 @@
 //! [`Objective::after`] changes them from sums over the slices.
 
 mod buffers;
+pub(crate) mod consistency;
+pub(crate) mod data;
+pub(crate) mod feature_diffusion;
+pub(crate) mod frequency;
 mod group;
 mod losses;
+pub(crate) mod network;
 mod order;
 mod state;
 mod tree;

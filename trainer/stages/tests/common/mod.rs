@@ -8,7 +8,7 @@ use protocol::stage::{
     TrainLength, TrainMld, TrainVae, Training,
 };
 use protocol::{Digest, Steps};
-use stages::testing::Bench;
+use stage_lab::Bench;
 
 fn network() -> Network {
     Network { width: 16, layers: 3, heads: 2, feed_forward: 32, ..Network::default() }
