@@ -41,7 +41,7 @@ fn measures_are_taken_and_misused_with_the_reason() {
     // A mistake that only the data reveals stops one stage. The message explains it and names the stage once.
     let config = Bench::config("smoke.yaml");
     let said = bench.run(&["run", &config, "--set", "stages.t2m_real.split=test"]).expect_code(1).stderr;
-    assert!(["the split `test` has", "among 32", "split: all"].iter().all(|part| said.contains(part)), "{said}");
+    assert!(["the split `test` has", "pools of 32", "split: all"].iter().all(|part| said.contains(part)), "{said}");
     let error = said.rsplit("error: ").next().expect("an error");
     assert!(error.starts_with("stage `t2m_real` failed: "), "{said}");
     assert_eq!(error.matches("stage `").count(), 1, "the stage is named once:\n{said}");

@@ -178,7 +178,7 @@ mod tests {
         protocol::show_excerpts();
         let said = |members: &[(&str, Vec<u8>)]| read_bytes(&archive(members)).unwrap_err();
         assert!(said(&[("poses", kit.clone()), ("trans", kit.clone())]).contains("body parameters"));
-        assert!(said(&[("x", kit.clone())]).contains("has x, expected joints"));
+        assert!(said(&[("x", kit.clone())]).contains("has x; expected joints"));
         assert!(said(&[("joints", kit.clone()), ("fps", number("<f8", &0_f64.to_le_bytes()))]).contains("frame rate"));
         assert!(said(&[("joints", npy::to_bytes(&[4, 5, 3], &data[..60]).unwrap())]).contains("[4, 5, 3]"));
         assert!(

@@ -297,7 +297,7 @@ mod tests {
         assert_eq!((map.len(), map[1].captions.len()), (2, 2));
         assert!(of_table(file, "source_path,new_name\nx.bvh,000.npy\n").unwrap()[0].captions.is_empty());
         for (content, part) in [
-            ("a,b\n1,2\n", "captions.csv:1: columns a, b; expected one of clip"),
+            ("a,b\n1,2\n", "captions.csv:1: the columns are a, b; expected one of clip"),
             ("clip,text\na,b,c\n", "captions.csv:2: the row has 3 fields; expected 2"),
             ("clip,text\na,\"b\n", "captions.csv:2: a quote is not closed"),
             ("clip,text\na,b#c\n", "captions.csv:2: caption `b#c`"),

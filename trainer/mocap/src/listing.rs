@@ -308,9 +308,12 @@ mod tests {
         ]);
         let said = list(&local(folder.path()), None).unwrap_err();
         let text = said.to_string();
-        for part in
-            ["has the same clip id `a_b`", "a_b.txt:1: 1 field", "`b` may be c_b or d_b", "`c_b` is in more than one"]
-        {
+        for part in [
+            "has the same clip id `a_b`",
+            "a_b.txt:1: the line has 1 field",
+            "`b` may be c_b or d_b",
+            "`c_b` is in more than one",
+        ] {
             assert!(text.contains(part), "{part}: {text}");
         }
         let empty = tempfile::tempdir().unwrap();

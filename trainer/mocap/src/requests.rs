@@ -249,9 +249,18 @@ mod tests {
     fn every_mistake_is_named_with_its_line() {
         for (text, json, words) in [
             ("", false, &["x: has no sentence"][..]),
-            ("walks#soon\nruns\njumps#0", false, &["x:1: `soon` is not a length", "4.5s", "x:3: a length of 0 frames"]),
-            ("walks#-1s", false, &["x:1: a length of -1 s"]),
-            ("walks#infs", false, &["x:1: a length of inf s"]),
+            (
+                "walks#soon\nruns\njumps#0",
+                false,
+                &[
+                    "x:1: `soon` is not a length",
+                    "4.5s",
+                    "x:3: the length is 0 \
+                                                                                           frames",
+                ],
+            ),
+            ("walks#-1s", false, &["x:1: the length is -1 s"]),
+            ("walks#infs", false, &["x:1: the length is inf s"]),
             ("{\"caption\": \"a\", \"frames\": 1, \"seconds\": 1}", true, &["x:1: has both"]),
             ("{\"text\": \"a\"}", true, &["x:1:", "`text`", "\"caption\""]),
             ("{\"caption\": \"a\", \"frames\": -3}", true, &["x:1:"]),

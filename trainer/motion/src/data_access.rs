@@ -229,7 +229,7 @@ mod tests {
         }
         for climbing in [at("root/../secret"), "../secret".into(), "set/../../secret".into()] {
             let said = refused(&climbing);
-            assert!(said.contains("leads out of the data root"), "{said}");
+            assert!(said.contains("is outside the data root"), "{said}");
         }
         let none = DataAccess::beneath(vec![], "here");
         let said = none.digest(&folder_of(&at("root/set/a"))).unwrap_err().to_string();
@@ -256,12 +256,12 @@ mod tests {
         for path in ["root/set/file", "root/set/folder/secret", "root/set/magic/etc/passwd", "root/set/round"] {
             let path = opened(path);
             let said = path.read(9).unwrap_err().to_string();
-            assert!(said.contains("leads out of the data root"), "{said}");
+            assert!(said.contains("is outside the data root"), "{said}");
             assert!(path.has_entry() && !path.exists() && !path.is_folder());
             assert!(path.hold().is_err() && path.digest().is_err());
         }
         let said = opened("root/set").tree().unwrap_err().to_string();
-        assert!(said.contains("leads out of the data root"), "{said}");
+        assert!(said.contains("is outside the data root"), "{said}");
         // What a reader of paths is given cannot be led elsewhere.
         let held = opened("root/set/a").hold().unwrap();
         fs::remove_file(at("root/set/a")).unwrap();

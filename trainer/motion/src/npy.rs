@@ -198,7 +198,7 @@ mod tests {
         assert_eq!(parse(file, &bytes, false).unwrap(), Array { shape: vec![2, 3], data });
         let cut = parse(file, &bytes[..bytes.len() - 5], false).unwrap_err().to_string();
         assert!(
-            cut.contains("clip.npy: 19 bytes of data") && cut.contains("expected 24") && cut.contains("truncated"),
+            cut.contains("clip.npy: has 19 bytes of data") && cut.contains("expected 24") && cut.contains("truncated"),
             "{cut}"
         );
         assert!(matches!(parse(file, b"hello", false), Err(NpyError::Header { .. })));
@@ -224,8 +224,8 @@ mod tests {
             let said = parse(file, bytes, true).unwrap_err().to_string();
             assert!(said.contains(part), "{part}: {said}");
         };
-        refuse(&with_header(2, u32::MAX, b"{}", b""), "a header of 4294967295 bytes");
-        refuse(&with_header(1, 900, b"{}", b""), "cut off");
+        refuse(&with_header(2, u32::MAX, b"{}", b""), "its header has 4294967295 bytes");
+        refuse(&with_header(1, 900, b"{}", b""), "truncated");
         refuse(&with_header(9, 2, b"{}", b""), "version 9");
         let shaped = |shape: &str, data: &[u8]| {
             let header = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}\n");

@@ -49,7 +49,7 @@ const CASES: &[(&str, &str, &str, &[&str])] = &[
     ("first: 100,", "first: 900,", "14:22", &["fewer steps than the stage's 900"]),
     ("{first: 100, factor: 3}", "{factor: 3}", "14:14", &["`rungs.first` is 0"]),
     ("factor: 3", "factor: 1", "14:35", &["`rungs.factor` is 1; expected 2 to 1000"]),
-    ("search: asha", "search: random", "14:14", &["`rungs` are for `asha`"]),
+    ("search: asha", "search: random", "14:14", &["only `asha` has `rungs`"]),
     ("        skip:", "        skp:", "17:9", &["unknown key `skp` in `space` of stage `pcm`; did you mean `skip`?"]),
     ("        skip: {choice: [50, 100]}", "        steps: {choice: [50]}", "17:9", &["`steps` cannot be searched"]),
     ("        skip: {choice: [50, 100]}", "        teacher: {choice: [mld]}", "17:9", &["names a stage"]),

@@ -88,7 +88,7 @@ const CASES: &[(&str, &str, &str, &[&str])] = &[
         &["`max_tokens` is 2; expected 0, or at least 3"],
     ),
     ("seed: 7", "text: {shards: 0}", "2:16", &["`shards` is 0; expected 1 to"]),
-    ("seed: 7", "text: {dataset: vae}", "2:17", &["`vae` gives a VAE, but `dataset` needs a dataset"]),
+    ("seed: 7", "text: {dataset: vae}", "2:17", &["`vae` outputs a VAE, but `dataset` needs a dataset"]),
     // Mistakes in stages.
     (
         "kind: train.vae",
@@ -152,7 +152,7 @@ const CASES: &[(&str, &str, &str, &[&str])] = &[
         "{kind: distill.pcm,",
         "{kind: distill.pcm, teacher: latents,",
         "14:",
-        &["`latents` gives latents, but `teacher` needs a model", "`mld`"],
+        &["`latents` outputs latents, but `teacher` needs a model", "`mld`"],
     ),
     ("{kind: distill.pcm,", "{kind: distill.pcm, teacher: lcm,", "14:", &["is a student", "needs a `train.mld` stage"]),
     (
@@ -170,7 +170,7 @@ const CASES: &[(&str, &str, &str, &[&str])] = &[
     ("from: pcm", "from: [pcm, lcm]", "17:", &["no `evaluate.*` stage evaluates `lcm`"]),
     ("from: pcm", "from: [pcm, pcm]", "17:", &["lists `pcm` twice"]),
     ("from: pcm, ", "", "17:3", &["`from` is missing"]),
-    ("model: m,", "model: 'a b',", "17:", &["is not a model name"]),
+    ("model: m,", "model: 'a b',", "17:", &["is not a valid model name"]),
     (
         "  out: ",
         "  t2m: {kind: evaluate.t2m, model: pcm, sampler: {steps: 2, guidance: 4}, evaluator: judge}\n  judge: {kind: train.evaluator}\n  out: ",
@@ -186,8 +186,8 @@ const CASES: &[(&str, &str, &str, &[&str])] = &[
         &["`out` has 2 phase(s)"],
     ),
     ("from: pcm,", "from: pcm, sampler: 4,", "17:", &["expected a mapping"]),
-    ("from: pcm,", "from: pcm, length: vae,", "17:", &["`vae` gives a VAE, but `length` needs a length estimator"]),
-    ("{kind: train.mld,", "{kind: train.mld, text_relu: true,", "12:", &["`hashed` half of the words", "leave it out"]),
+    ("from: pcm,", "from: pcm, length: vae,", "17:", &["`vae` outputs a VAE, but `length` needs a length estimator"]),
+    ("{kind: train.mld,", "{kind: train.mld, text_relu: true,", "12:", &["half of the words of `hashed`", "remove it"]),
     (
         "  fid: {kind: evaluate.latent_fid,",
         "  more: {kind: data.synthetic}\n  fid: {kind: evaluate.latent_fid, dataset: more,",
@@ -216,7 +216,7 @@ const CASES: &[(&str, &str, &str, &[&str])] = &[
         "  recon: ",
         "  t2m: {kind: evaluate.t2m, model: mld, length: vae, evaluator: judge}\n  judge: {kind: train.evaluator}\n  recon: ",
         "15:",
-        &["`vae` gives a VAE, but `length` needs a length estimator"],
+        &["`vae` outputs a VAE, but `length` needs a length estimator"],
     ),
     (
         "  recon: ",
@@ -367,7 +367,7 @@ fn overrides_are_checked_like_the_file() {
         ("vea.lr=1", "did you mean `vae`?"),
         ("lr", "expected `key.path=value`"),
         ("stages.vae.lr=[", "cannot parse"),
-        ("stages.vae.lr.x=1", "which has no keys"),
+        ("stages.vae.lr.x=1", "has no keys"),
         ("stages.vae.lr=abc", "--set stages.vae.lr=abc: `lr` of stage `vae` is the string `abc`; expected a number"),
         ("stages.vae.batch.global=9", "not a multiple of the 4 slices"),
         ("stages..lr=1", "is not a path of keys"),
@@ -410,7 +410,7 @@ fn a_small_text_does_not_become_a_large_one() {
     let long = "x".repeat(7_000);
     refused(&format!("a: &a \"{long}\"\nb: [{}]\n", vec!["*a"; 10_000].join(",")), "bytes of text");
     refused(&format!("a: \"{}\"", "x".repeat(500 << 10)), "the string has 512000 bytes");
-    refused(&format!("\"{}\": 1", "k".repeat(300)), "a key of 300 bytes");
+    refused(&format!("\"{}\": 1", "k".repeat(300)), "the key has 300 bytes");
     // Anchors within anchors are copies too.
     let nested = (0..60).map(|i| format!("&a{i} [")).collect::<String>() + &"x,".repeat(2_000) + &"]".repeat(60);
     refused(&format!("a: {nested}"), "values after aliases are expanded");
@@ -426,7 +426,7 @@ fn a_small_text_does_not_become_a_large_one() {
 
     let set = |sets: Vec<String>| read("p.yaml", GOOD, &sets).unwrap_err().to_string();
     assert!(set(vec![format!("vae.{}=1", vec!["a"; 30_000].join("."))]).contains("its path has 30001 keys"));
-    assert!(set(vec![format!("vae.{}=1", "a".repeat(300))]).contains("a key of 300 bytes"));
+    assert!(set(vec![format!("vae.{}=1", "a".repeat(300))]).contains("the key has 300 bytes"));
     let bomb = format!("vae.lr=[&a {}, {}]", "x".repeat(1_000), vec!["*a"; 500].join(","));
     assert!(set(vec![bomb; 40]).contains("after aliases are expanded"), "overrides share one budget");
     assert!(set(vec!["seed=1".into(); 1_001]).contains("1001 overrides"));

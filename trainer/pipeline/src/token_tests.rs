@@ -51,10 +51,10 @@ fn what_does_not_fit_is_refused_where_it_stands() {
         ("tokens: tokens, tokenizer: residual", "tokens: ids, tokenizer: residual", 11, "was encoded with `plain`"),
         ("tokens: ids, tokenizer: plain", "tokens: tokens, tokenizer: residual", 12, "has 6 codebooks; expected 1"),
         ("model: momask, decoder", "model: mmm, decoder", 14, "`flow` decodes the codes of `residual`"),
-        ("tokenizer: residual, decoder: flow", "tokenizer: plain, decoder: flow", 21, "is of `plain`"),
+        ("tokenizer: residual, decoder: flow", "tokenizer: plain, decoder: flow", 21, "has the codes of `plain`"),
         ("decoder: latent_flow", "decoder: flow", 20, "`flow` decodes the codes of `residual`"),
         ("model: momask, decoder: flow", "model: momask, decoder: latent_flow", 14, "decodes the latents of `vae`"),
-        ("tokenizer: residual, teacher: flow", "tokenizer: plain, teacher: flow", 19, "is of `plain`"),
+        ("tokenizer: residual, teacher: flow", "tokenizer: plain, teacher: flow", 19, "has the codes of `plain`"),
         ("teacher: flow}", "teacher: latent_flow}", 19, "decodes the latents of `vae`"),
         // Clips of another skeleton.
         (
@@ -84,7 +84,7 @@ fn what_does_not_fit_is_refused_where_it_stands() {
         ("generator: mmm, ", "generator: mmm, text: words, ", 12, "embeds the captions of `kit`"),
         ("generator: mmm, ", "generator: mmm, dataset: kit, ", 12, "but `dataset` is `kit`"),
         ("generator: mmm, ", "generator: mmm, network: {word_blocks: 10}, ", 12, "`network.layers`, 9"),
-        ("guidance: 0}", "guidance: 2}", 22, "`mmm` has none"),
+        ("guidance: 0}", "guidance: 2}", 22, "`mmm` has no guidance"),
         // Kinds that need denoising, or latents.
         (
             "kind: evaluate.t2m, model: mmm, evaluator: judge",

@@ -75,11 +75,11 @@ fn versions_are_refused_where_none_can_be() {
     for (from, to, line, words) in [
         ("vae: motionlcm@prod}", "vae: 'motionlcm@'}", 5, "is not a model version"),
         ("teacher: teachers:3", "teacher: 'teachers:x'", 7, "`x` is not a number"),
-        ("teacher: teachers:3,", "teacher: teachers:3, latents: motionlcm@prod,", 7, "holds latents"),
+        ("teacher: teachers:3,", "teacher: teachers:3, latents: motionlcm@prod,", 7, "do not contain latents"),
         ("from: lcm", "from: motionlcm@prod", 12, "expected a stage that outputs a model"),
         ("from: lcm", "from: motionlcm@best", 12, "expected a stage that outputs a model"),
         ("model: motionlcm@prod", "model: lcm@best", 8, "`lcm` has no `sweep`"),
-        ("{kind: train.tokenizer", "{kind: train.tokenizer, dataset: d@1", 10, "holds a dataset"),
+        ("{kind: train.tokenizer", "{kind: train.tokenizer, dataset: d@1", 10, "do not contain a dataset"),
         ("vae: motionlcm@prod, init", "vae: motionlcm@best, init", 6, "was encoded with `motionlcm@prod`"),
     ] {
         assert!(GOOD.contains(from), "{from}");

@@ -183,7 +183,7 @@ mod tests {
             assert_eq!(seconds(text), Ok(Length::Seconds(4.0)), "{text}");
         }
         assert!(seconds("-4").unwrap_err().contains("expected more than 0"));
-        assert!(seconds("4ss").unwrap_err().contains("no length"));
+        assert!(seconds("4ss").unwrap_err().contains("not a length"));
     }
 
     #[test]

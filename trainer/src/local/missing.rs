@@ -127,7 +127,7 @@ mod tests {
         let expected = [
             ("dataset", "path", "no such folder"),
             ("judge", "path", "no such folder"),
-            ("judge", "words", "no `our_vab_words.pkl` in it"),
+            ("judge", "words", "the folder has no `our_vab_words.pkl`"),
         ];
         assert_eq!(shown, expected);
         assert!(found[0].line().contains("AMASS") && found[1].line().contains("text-to-motion"), "{found:#?}");

@@ -212,7 +212,7 @@ mod tests {
             ("x", "epoch", "`x` is `epoch`; expected `step`, `time` or `hours`"),
             ("to", "inf", "`to` is `inf`; expected a number"),
             ("buckets", "0", "`buckets` is `0`; expected a number from 1 to 4000"),
-            ("points", "5", "there is no `points` of curves"),
+            ("points", "5", "unknown parameter `points`"),
         ] {
             let refused = read(&[("run", "a"), (name, value)]).err().map(|failure| format!("{failure:?}"));
             assert!(refused.as_ref().is_some_and(|refused| refused.contains(says)), "{refused:?}");

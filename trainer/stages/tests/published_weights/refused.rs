@@ -97,7 +97,7 @@ fn nothing_of_a_file_is_run_and_none_but_weights_are_read() {
     let long_header = [&(1_u64 << 60).to_le_bytes()[..], b"{}"].concat();
     for (name, bytes, words) in [
         ("pickle.tar", pickle, "expected a dict"),
-        ("short.ckpt", b"PK".to_vec(), "has 2 bytes; expected a checkpoint"),
+        ("short.ckpt", b"PK".to_vec(), "has 2 bytes; expected a torch checkpoint"),
         ("long.safetensors", long_header, "header"),
         ("no.ckpt", b"PK\x03\x04 is no archive at all".to_vec(), "no.ckpt: "),
     ] {

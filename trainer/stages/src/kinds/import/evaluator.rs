@@ -308,7 +308,7 @@ mod tests {
         assert!(said.contains("need a network of"), "{said}");
         let mut long = small();
         long[..8].copy_from_slice(&(90_u64 << 20).to_le_bytes());
-        assert!(sizes(&long).unwrap_err().contains("a header of 94371840 bytes"));
+        assert!(sizes(&long).unwrap_err().contains("the header has 94371840 bytes"));
     }
 
     #[test]
