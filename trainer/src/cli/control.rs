@@ -11,8 +11,8 @@ use motion::waypoints::{self, Waypoint};
 use protocol::Manifest;
 use protocol::artifact::Role;
 use protocol::limits::{FEEDBACK_ROUNDS, REFINE_STEPS};
-use stages::parts::control::ControlOptions;
 use stages::generate::{Generated, Generator};
+use stages::parts::control::ControlOptions;
 use stages::parts::hint::{Hint, metres};
 
 use super::model::{self, Found};

@@ -6,8 +6,8 @@ use clap::Args;
 use models::device::DeviceInfo;
 use protocol::stage::Sampler;
 use serde_json::json;
-use stages::generate::{DEFAULT_FRAMES, Generator};
 use stages::generate::timing::{self, Times, WARM_UP};
+use stages::generate::{DEFAULT_FRAMES, Generator};
 
 use super::model::{self, Found};
 use super::sampler::SamplerArgs;

@@ -7,9 +7,9 @@ use burn::tensor::Device;
 use clap::Args;
 use motion::Skeleton;
 use protocol::Seed;
-use stages::parts::control::ControlOptions;
 use stages::generate::Generator;
 use stages::generate::stream::{BLEND, MotionStream, Settings};
+use stages::parts::control::ControlOptions;
 
 use super::super::endpoint_args::EndpointArgs;
 use super::super::model::{self, Found};

@@ -3,8 +3,8 @@
 use std::time::{Duration, Instant};
 
 use serde_json::{Value, json};
-use stages::metrics::junction::{Jump, JunctionMeter, usual};
 use stages::generate::stream::{Joining, Segment};
+use stages::metrics::junction::{Jump, JunctionMeter, usual};
 
 /// Running mean and maximum of many values.
 #[derive(Debug, Clone, Copy, Default)]
