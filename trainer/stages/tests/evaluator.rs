@@ -222,7 +222,7 @@ fn pools_have_names_of_their_own_and_drop_last_leaves_out_what_fills_none() {
     };
     let (both, log, meta) = measured(&mut bench, &of(&[16, 8], false), &inputs);
     assert_eq!(
-        (&meta["pools"], log.iter().any(|line| line.contains("fill no pool"))),
+        (&meta["pools"], log.iter().any(|line| line.contains("do not fill a pool"))),
         (&serde_json::json!([16, 8]), false)
     );
     let (eight, ..) = measured(&mut bench, &of(&[8], false), &inputs);
@@ -434,10 +434,10 @@ fn what_an_evaluator_does_not_fit_is_refused_with_the_reason() {
     let kit = bench.blobs().put(manifest.to_bytes()).unwrap();
 
     for (data, evaluator, settings, reason) in [
-        (store(&bench, &normalised, data), evaluator, &test, "another scale"),
-        (store(&bench, &millimetres, data), evaluator, &test, "another scale"),
+        (store(&bench, &normalised, data), evaluator, &test, "do not have the evaluator's scale"),
+        (store(&bench, &millimetres, data), evaluator, &test, "do not have the evaluator's scale"),
         (store(&bench, &nothing, data), evaluator, &test, "`test` has no entries"),
-        (data, evaluator, &few, "ranks a motion among 32"),
+        (data, evaluator, &few, "needs pools of 32"),
         (data, kit, &test, "`kit` skeletons"),
         (data, data, &test, "kind Dataset"),
     ] {

@@ -322,7 +322,7 @@ async fn curves_come_in_buckets_as_json_and_packed() -> TestResult {
     assert!(points[1].1.is_nan());
 
     for (query, expected, says) in [
-        (String::new(), 400, "no curve was asked for"),
+        (String::new(), 400, "the query names no run"),
         ("?run=none".to_owned(), 404, "is not known"),
         (format!("?run={run}&run=none"), 404, "is not known"),
         (format!("?run={run}&stage=none"), 404, "has no stage `none`"),

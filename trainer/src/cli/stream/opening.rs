@@ -61,7 +61,7 @@ pub(in crate::cli) struct StreamArgs {
 
 fn rate(text: &str) -> std::result::Result<f64, String> {
     let value = text.parse::<f64>().ok().filter(|rate| (0.1..=1000.0).contains(rate));
-    value.ok_or_else(|| format!("`{text}` is no rate; expected 0.1 to 1000 frames per second"))
+    value.ok_or_else(|| format!("`{text}` is not a frame rate; expected 0.1 to 1000 frames per second"))
 }
 
 impl StreamArgs {

@@ -23,7 +23,7 @@ pub(crate) fn measured(
     let model = generator::open(&manifest, &*blobs, &cx.device())?;
     generator::check_sampler(&*model, sampler)?;
     if model.format() != dataset.format {
-        return Err(StageError::Input("`model` draws motions of another skeleton than `dataset` has".into()));
+        return Err(StageError::Input("`model` and `dataset` have different skeletons".into()));
     }
     Ok((dataset, model))
 }
