@@ -304,6 +304,11 @@ pub fn dataset(blobs: &dyn Blobs, manifest: &Manifest) -> Result<Dataset, StageE
     from_files(blobs, manifest, |fetch| Dataset::from_files(fetch))
 }
 
+/// Reads the input `dataset`.
+pub fn input_dataset(cx: &dyn AttemptContext) -> Result<Dataset, StageError> {
+    dataset(&*cx.blobs(), &input(cx, "dataset", ArtifactKind::Dataset)?.1)
+}
+
 /// Reads only the captions of a dataset.
 pub fn captions(blobs: &dyn Blobs, manifest: &Manifest) -> Result<Vec<Caption>, StageError> {
     from_files(blobs, manifest, |fetch| Dataset::captions_from_files(fetch))

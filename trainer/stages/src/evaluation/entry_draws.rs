@@ -60,8 +60,7 @@ impl EntryDraws {
     ) -> Result<Self, StageError> {
         let blobs = cx.blobs();
         let refuse = |text: String| Err(StageError::Input(text));
-        let (_, manifest) = artifacts::input(cx, "dataset", ArtifactKind::Dataset)?;
-        let dataset = artifacts::dataset(&*blobs, &manifest)?;
+        let dataset = artifacts::input_dataset(cx)?;
         let (evaluator, manifest) = artifacts::input(cx, "evaluator", ArtifactKind::Evaluator)?;
         let trained = TrainedEvaluator::read(&*blobs, &manifest, &cx.device())?;
         let (mut entries, mut taken) = (dataset.entries_of(split), split);

@@ -17,8 +17,7 @@ pub(crate) fn measured(
     sampler: &Sampler,
 ) -> Result<(Dataset, Box<dyn MotionGenerator>), StageError> {
     let blobs = cx.blobs();
-    let (_, manifest) = artifacts::input(cx, "dataset", ArtifactKind::Dataset)?;
-    let dataset = artifacts::dataset(&*blobs, &manifest)?;
+    let dataset = artifacts::input_dataset(cx)?;
     let (_, manifest) = artifacts::input(cx, "model", ArtifactKind::Model)?;
     let model = generator::open(&manifest, &*blobs, &cx.device())?;
     generator::check_sampler(&*model, sampler)?;

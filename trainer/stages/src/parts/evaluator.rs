@@ -63,7 +63,7 @@ pub fn publish(
     words: &Words,
 ) -> Result<Digest, StageError> {
     let mut draft = Draft::new(cx, ArtifactKind::Evaluator, to_meta(meta));
-    weights::add(&mut draft, entries, values)?;
+    weights::add(&mut draft, (entries, values))?;
     words.write(&mut draft)?;
     draft.finish(cx)
 }

@@ -28,11 +28,11 @@ use std::collections::BTreeMap;
 use burn::tensor::Device;
 use protocol::message::StageTask;
 use protocol::stage::Training;
+use protocol::{ArtifactKind, Digest};
+use serde_json::json;
 
 use crate::artifacts::Draft;
-use crate::context::{Adopted, ContextError, Exchange, GangContext, Rendezvous, StageError};
-use protocol::ArtifactKind;
-use serde_json::json;
+use crate::context::{Adopted, ContextError, Exchange, GangContext, Outcome, Rendezvous, StageError};
 
 use group::Gradients;
 
@@ -118,6 +118,22 @@ pub enum Trained {
         /// Number of steps applied.
         at: u64,
     },
+}
+
+impl Trained {
+    /// The outcome of the stage. `publish` uploads the artifact that is made of the last state.
+    ///
+    /// # Errors
+    /// The error of `publish`.
+    pub fn publish(
+        self,
+        publish: impl FnOnce(&TrainState) -> Result<Digest, StageError>,
+    ) -> Result<Outcome, StageError> {
+        match self {
+            Self::Yielded { at } => Ok(Outcome::Yielded { at }),
+            Self::Finished { state, metrics } => Ok(Outcome::Finished { output: publish(&state)?, metrics }),
+        }
+    }
 }
 
 /// Trains to the last step (of the schedule, or of a rung that stops earlier), or until a stop is requested.
@@ -433,7 +449,7 @@ fn keep(state: &mut TrainState, accelerator: Option<&Device>) {
 }
 
 /// What a checkpoint's manifest says. Workers of two builds may save one step, so it names none of them.
-fn meta(state: &TrainState, config: protocol::Digest, seed: protocol::Seed) -> serde_json::Value {
+fn meta(state: &TrainState, config: Digest, seed: protocol::Seed) -> serde_json::Value {
     json!({
         "step": state.step,
         "settings": config,
@@ -443,12 +459,7 @@ fn meta(state: &TrainState, config: protocol::Digest, seed: protocol::Seed) -> s
     })
 }
 
-fn save(
-    state: &mut TrainState,
-    config: protocol::Digest,
-    recent: &Recent,
-    cx: &mut dyn GangContext,
-) -> Result<(), StageError> {
+fn save(state: &mut TrainState, config: Digest, recent: &Recent, cx: &mut dyn GangContext) -> Result<(), StageError> {
     state.fetch();
     let meta = meta(state, config, cx.task().seed);
     let mut draft = Draft::new(cx, ArtifactKind::Checkpoint, meta);
@@ -503,7 +514,7 @@ mod tests {
     #[test]
     fn a_checkpoint_says_nothing_of_the_build_that_saved_it() {
         let state = TrainState::new(Vec::new(), Vec::new());
-        let meta = meta(&state, protocol::Digest::of(b"settings"), protocol::Seed(1));
+        let meta = meta(&state, Digest::of(b"settings"), protocol::Seed(1));
         let keys: Vec<&str> = meta.as_object().expect("an object").keys().map(String::as_str).collect();
         assert_eq!(keys, ["buffers", "groups", "seed", "settings", "step"]);
         assert!(!meta.to_string().contains(env!("CARGO_PKG_VERSION")), "{meta}");

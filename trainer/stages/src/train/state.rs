@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use burn::tensor::Device;
 use bytemuck::{cast_slice, cast_slice_mut};
 use checkpoint::{Blob, BlobError};
+use models::flat::Entry;
 use safetensors::Dtype;
 use safetensors::tensor::{Metadata, TensorInfo};
 
@@ -219,6 +220,16 @@ impl TrainState {
         debug_assert!(self.is_fetched());
         let group = &self.groups[index];
         group.average.as_ref().unwrap_or(&group.params)
+    }
+
+    /// Names and shapes of group `index`, and the result of its training.
+    pub fn trained(&self, index: usize) -> (&[Entry], &[f32]) {
+        (&self.groups[index].entries, self.result(index))
+    }
+
+    /// Like [`trained`](Self::trained), with the parameters although an average is kept.
+    pub fn online(&self, index: usize) -> (&[Entry], &[f32]) {
+        (&self.groups[index].entries, self.params(index))
     }
 }
 

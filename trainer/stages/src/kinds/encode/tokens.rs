@@ -30,8 +30,7 @@ impl Map for EncodeTokens {
         let blobs = cx.blobs();
         let (digest, manifest) = artifacts::input(cx, "tokenizer", ArtifactKind::Tokenizer)?;
         let tokenizer = TrainedTokenizer::read(&*blobs, &manifest, &cx.device())?;
-        let (_, dataset) = artifacts::input(cx, "dataset", ArtifactKind::Dataset)?;
-        let dataset = artifacts::dataset(&*blobs, &dataset)?;
+        let dataset = artifacts::input_dataset(cx)?;
         tokenizer.check_format(dataset.format)?;
         let (unit, width) = (tokenizer.unit(), dataset.mean.len());
         let range = shard_range(dataset.entries.len(), index, of);

@@ -118,9 +118,7 @@ fn usage(codes: &[Vec<u64>]) -> Vec<(String, f64)> {
 
 impl Map for EvaluateReconstruction {
     fn shard(&self, cx: &mut dyn AttemptContext, index: usize, of: usize) -> Result<Outcome, StageError> {
-        let blobs = cx.blobs();
-        let (_, dataset) = artifacts::input(cx, "dataset", ArtifactKind::Dataset)?;
-        let dataset = artifacts::dataset(&*blobs, &dataset)?;
+        let dataset = artifacts::input_dataset(cx)?;
         let measured = Reconstructor::read(cx, self.decoder_steps)?;
         measured.check_format(dataset.format)?;
         let entries = dataset.entries_of(self.split);

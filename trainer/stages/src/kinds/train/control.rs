@@ -46,7 +46,7 @@ use crate::parts::{self, model_error, weights};
 use crate::train::data::latents::{LatentData, LatentSlice};
 use crate::train::frequency::clean;
 use crate::train::network::{dropout_seed, group};
-use crate::train::{Clip, GroupPlan, Losses, Objective, Pick, SliceResult, TrainState, Trained, train};
+use crate::train::{Clip, GroupPlan, Losses, Objective, Pick, SliceResult, TrainState, train};
 
 /// Batches that are sorted by length together; a step's cost is mostly reading and decoding whole clips.
 const POOL: usize = 8;
@@ -382,8 +382,7 @@ fn base_meta(denoiser: &Manifest, model: &Model, data: &LatentData) -> Result<De
 
 /// The clips that the latents were encoded from.
 fn clips(cx: &dyn AttemptContext, data: &LatentData) -> Result<Dataset, StageError> {
-    let (_, manifest) = artifacts::input(cx, "dataset", ArtifactKind::Dataset)?;
-    let dataset = artifacts::dataset(&*cx.blobs(), &manifest)?;
+    let dataset = artifacts::input_dataset(cx)?;
     let meta = data.meta();
     let rows = meta.splits.len() * meta.crops;
     let fits = |row: usize| {
@@ -434,7 +433,7 @@ impl Gang for TrainControl {
         let trajectory = start.take(trajectory, TRAJECTORY_PREFIX)?;
         let feedback = meta.feedback(&base_meta, &mut init);
         let feedback = feedback.map(|network| start.take(network, FEEDBACK_PREFIX)).transpose()?;
-        start.finish(cx, &to_meta(&meta))?;
+        start.finish(cx, &meta)?;
         let decoder = if self.loss.control > 0.0 || feedback.is_some() {
             let part = parts::part(&*blobs, &model, &Role::VAE, ArtifactKind::Vae)?;
             let vae: VaeMeta = artifacts::meta(&part, "the VAE")?;
@@ -462,12 +461,6 @@ impl Gang for TrainControl {
             seed: dropout_seed(cx),
             device,
         };
-        match train(&mut objective, &self.training, cx)? {
-            Trained::Yielded { at } => Ok(Outcome::Yielded { at }),
-            Trained::Finished { state, metrics } => {
-                let output = objective.publish(cx, &manifest, &state)?;
-                Ok(Outcome::Finished { output, metrics })
-            }
-        }
+        train(&mut objective, &self.training, cx)?.publish(|state| objective.publish(cx, &manifest, state))
     }
 }

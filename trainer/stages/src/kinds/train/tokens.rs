@@ -35,7 +35,7 @@ use crate::parts::warm_start::WarmStart;
 use crate::parts::{self, weights};
 use crate::train::data::tokens::{TokenData, uniforms};
 use crate::train::network::{dropout_seed, group, no_clips, slice_gradient, slice_result};
-use crate::train::{GroupPlan, Losses, Objective, Order, Pick, SliceResult, TrainState, Trained, train};
+use crate::train::{GroupPlan, Losses, Objective, Order, Pick, SliceResult, TrainState, train};
 
 struct Autoregressive {
     settings: TrainTokens,
@@ -300,16 +300,12 @@ impl Gang for TrainTokens {
             }
             TokenGenerator::Mmm => Box::new(WithWords::new(self, data, &meta, cx, &mut init, &mut start)?),
         };
-        start.finish(cx, &to_meta(&meta))?;
-        match train(&mut *objective, &self.training, cx)? {
-            Trained::Yielded { at } => Ok(Outcome::Yielded { at }),
-            Trained::Finished { state, metrics } => {
-                let mut generator = Draft::new(cx, ArtifactKind::TokenGenerator, to_meta(&meta));
-                add_weights(&mut generator, &state)?;
-                parts.insert(Role::GENERATOR, generator.into_manifest());
-                let output = parts::publish_model(cx, TOKENS, format, &parts)?;
-                Ok(Outcome::Finished { output, metrics })
-            }
-        }
+        start.finish(cx, &meta)?;
+        train(&mut *objective, &self.training, cx)?.publish(|state| {
+            let mut generator = Draft::new(cx, ArtifactKind::TokenGenerator, to_meta(&meta));
+            add_weights(&mut generator, state)?;
+            parts.insert(Role::GENERATOR, generator.into_manifest());
+            parts::publish_model(cx, TOKENS, format, &parts)
+        })
     }
 }

@@ -87,8 +87,7 @@ impl FeatureData {
     /// Reads the inputs `dataset` and `text`.
     pub(crate) fn read(cx: &dyn AttemptContext, training: &Training, rules: Rules) -> Result<Self, StageError> {
         let blobs = cx.blobs();
-        let (_, manifest) = artifacts::input(cx, "dataset", ArtifactKind::Dataset)?;
-        let dataset = artifacts::dataset(&*blobs, &manifest)?;
+        let dataset = artifacts::input_dataset(cx)?;
         let (_, manifest) = artifacts::input(cx, "text", ArtifactKind::Embeddings)?;
         let text_meta: EmbeddingsMeta = artifacts::meta(&manifest, "the caption embeddings")?;
         if text_meta.captions != dataset.captions.len() {

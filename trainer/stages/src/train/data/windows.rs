@@ -3,7 +3,7 @@
 use motion::Stream;
 use motion::dataset::Dataset;
 use protocol::stage::{Split, WindowsOf};
-use protocol::{ArtifactKind, Seed};
+use protocol::Seed;
 
 use crate::artifacts;
 use crate::context::{AttemptContext, StageError};
@@ -27,8 +27,7 @@ pub(crate) struct TokenWindows {
 impl TokenWindows {
     /// Reads the input `dataset`.
     pub(crate) fn read(cx: &dyn AttemptContext, frames: usize, of: WindowsOf) -> Result<Self, StageError> {
-        let (_, manifest) = artifacts::input(cx, "dataset", ArtifactKind::Dataset)?;
-        let dataset = artifacts::dataset(&*cx.blobs(), &manifest)?;
+        let dataset = artifacts::input_dataset(cx)?;
         let all = dataset.entries_of(Split::Train);
         if all.is_empty() {
             return Err(no_clips());

@@ -69,8 +69,7 @@ impl<'a> Plan<'a> {
         if settings.repeats == 0 || settings.pools.is_empty() {
             return refuse("`repeats` and `pools` must be at least 1".into());
         }
-        let (_, manifest) = artifacts::input(cx, "dataset", ArtifactKind::Dataset)?;
-        let dataset = artifacts::dataset(&*blobs, &manifest)?;
+        let dataset = artifacts::input_dataset(cx)?;
         let (evaluator, manifest) = artifacts::input(cx, "evaluator", ArtifactKind::Evaluator)?;
         let trained = TrainedEvaluator::read(&*blobs, &manifest, &cx.device())?;
         let pool = settings.largest_pool();
