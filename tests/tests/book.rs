@@ -150,3 +150,24 @@ fn the_list_for_language_models_has_every_chapter() {
     let found = fs::read_to_string(&path).unwrap_or_default();
     assert_eq!(found, wanted, "write it with `UPDATE_DOCS=1 cargo test -p cluster-tests --test book`");
 }
+
+/// The troubleshooting page lists the exit codes of `--help`, with their meanings.
+#[test]
+fn the_book_explains_every_exit_code() {
+    let root = root();
+    let page = read(&book::source(&root).join("troubleshooting.md"));
+    let source = read(&root.join("trainer/src/report/problem.rs"));
+    let (_, help) = source.split_once("Exit codes:\n").expect("the help of exit codes");
+    let (help, _) = help.split_once('"').expect("its end");
+    let mut codes = 0;
+    for line in help.lines().map(|line| line.trim().trim_end_matches('\\')) {
+        let (code, meaning) = line.split_once("  ").expect("a code and its meaning");
+        let meaning = meaning.split(';').next().unwrap_or(meaning);
+        assert!(
+            page.contains(&format!("| {code} | {meaning}")),
+            "troubleshooting.md lacks exit code {code}: {meaning}"
+        );
+        codes += 1;
+    }
+    assert!(codes >= 10, "{codes} codes");
+}
