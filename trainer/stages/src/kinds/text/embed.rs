@@ -16,7 +16,7 @@ use crate::context::{AttemptContext, Outcome, StageError};
 use crate::external;
 use crate::kinds::shape::Map;
 use crate::parts::text::{Named, TextEncoderMeta};
-use crate::shards::shard_range;
+use crate::shards::{self, shard_range};
 
 /// Number of texts between progress reports.
 const BLOCK: usize = 16;
@@ -70,10 +70,9 @@ impl Map for TextEmbed {
             cx.progress((rows.len() / dim) as u64, range.len() as u64, "captions", &[]);
         }
         let meta = ShardMeta { encoder: fingerprint, first: range.start };
-        let bytes = Tensors::default().with("rows", [range.len(), dim], rows).to_bytes()?;
-        let output = artifacts::publish(cx, ArtifactKind::Shard, to_meta(&meta), EMBEDDINGS_FILE, bytes)?;
+        let tensors = Tensors::default().with("rows", [range.len(), dim], rows);
         let metrics = BTreeMap::from([("captions".to_owned(), range.len() as f64)]);
-        Ok(Outcome::Finished { output, metrics })
+        shards::publish(cx, &meta, EMBEDDINGS_FILE, &tensors, metrics)
     }
 
     fn merge(&self, cx: &mut dyn AttemptContext, shards: &[Digest]) -> Result<Outcome, StageError> {
@@ -82,17 +81,15 @@ impl Map for TextEmbed {
         let encoder = fingerprint(named.digest());
         let mut rows: Vec<f32> = Vec::new();
         let mut dim = 0;
-        for digest in shards {
-            let manifest = cx.manifest(*digest)?;
-            let meta: ShardMeta = artifacts::meta(&manifest, "a shard of the embeddings")?;
+        for shard in shards::read::<ShardMeta>(cx, shards, "embeddings", EMBEDDINGS_FILE) {
+            let (meta, mut part) = shard?;
             if meta.encoder != encoder {
                 return Err(StageError::Input(format!(
                     "the encoder in {} is not the one that other workers read, or it has changed; run it again with one and the same",
                     self.path
                 )));
             }
-            let bytes = artifacts::mapped(&*cx.blobs(), &manifest, EMBEDDINGS_FILE)?;
-            let part = Tensors::from_bytes(bytes, EMBEDDINGS_FILE)?.take("rows", 2, EMBEDDINGS_FILE)?;
+            let part = part.take("rows", 2, EMBEDDINGS_FILE)?;
             dim = part.row_len();
             if meta.first * dim != rows.len() {
                 let have = rows.len() / dim.max(1);

@@ -2,8 +2,8 @@
 
 use motion::Stream;
 use motion::dataset::Dataset;
-use protocol::stage::{Split, WindowsOf};
 use protocol::Seed;
+use protocol::stage::{Split, WindowsOf};
 
 use crate::artifacts;
 use crate::context::{AttemptContext, StageError};
