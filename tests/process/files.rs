@@ -39,7 +39,7 @@ fn at(cluster: &Cluster, name: &str) -> PathBuf {
 /// Submits a stage of features of recordings as a custom client may: `digests` are the client's claims about the files.
 fn submit(cluster: &Cluster, settings: &str, digests: &[(&str, Digest)]) -> String {
     let text = format!("name: p\nstages:\n  dataset: {{kind: data.features, mirror: false, shards: 1, {settings}}}\n");
-    let mut pipeline = protocol::pipeline::read("p.yaml", &text, &[]).unwrap_or_else(|mistakes| panic!("{mistakes}"));
+    let mut pipeline = pipeline::read("p.yaml", &text, &[]).unwrap_or_else(|mistakes| panic!("{mistakes}"));
     let digests = digests.iter().map(|(field, digest)| ((*field).to_owned(), *digest));
     pipeline.stages[0].external = digests.collect();
     let body = json!({"pipeline": pipeline, "source": text, "idempotency_key": null, "until": null});

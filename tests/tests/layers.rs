@@ -68,7 +68,9 @@ fn dependencies_point_one_way() {
         }
     };
     never("protocol", &["burn", "tokio", "sqlx", "axum", "reqwest", "registry", "stages", "models", "motion"]);
-    never("checkpoint", &["burn", "tokio", "sqlx", "axum", "registry", "stages"]);
+    never("protocol", &["pipeline", "saphyr"]);
+    never("pipeline", &["burn", "tokio", "sqlx", "axum", "reqwest", "registry", "stages", "models", "motion"]);
+    never("checkpoint", &["burn", "tokio", "sqlx", "axum", "registry", "stages", "pipeline"]);
     never("registry", &["burn", "coordinator", "stages", "models", "worker"]);
     never("coordinator", &["burn", "stages", "models", "worker"]);
     never("page", &["burn", "tokio", "sqlx", "axum", "hyper", "registry", "coordinator", "access"]);

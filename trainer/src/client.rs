@@ -14,7 +14,7 @@ use reqwest::{Method, RequestBuilder, Response, StatusCode};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
-use crate::problem::{Problem, Result, exit};
+use crate::report::problem::{Problem, Result, exit};
 
 /// Number of tries to reach a busy server.
 const BUSY_TRIES: usize = 20;

@@ -9,7 +9,7 @@ use registry::cli::{Answer, Command};
 use registry::{LogRow, Page, Point, Window};
 
 use crate::client::{Client, Target};
-use crate::problem::{Problem, Result, exit};
+use crate::report::problem::{Problem, Result, exit};
 
 /// Lines of a log per request.
 const LINES: u32 = 1000;

@@ -126,7 +126,7 @@ impl HttpContext {
                     "waiting for a generation after {} for {:.0} s; missing: {}",
                     mesh.config.generation,
                     begun.elapsed().as_secs_f64(),
-                    if lost.is_empty() { "nobody".to_owned() } else { lost.join("; ") },
+                    if lost.is_empty() { "no member".to_owned() } else { lost.join("; ") },
                 );
                 warned = Instant::now();
             }

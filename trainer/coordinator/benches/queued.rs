@@ -14,9 +14,9 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use coordinator::{Config, Connections, Coordinator, Handle, Policy};
+use pipeline::{Pipeline, PipelineStage, StageInput};
 use protocol::Seed;
 use protocol::message::Submit;
-use protocol::pipeline::{Pipeline, PipelineStage, StageInput};
 use protocol::stage::{Backend, DataSynthetic, EncodeLatents, Placement, StageSettings, TrainVae, WorkerRange};
 use registry::{Holder, Store};
 

@@ -2,10 +2,10 @@
 
 use std::collections::BTreeSet;
 
+use pipeline::PipelineStage;
 use protocol::message::{
     Assignment, DesiredAssignments, Prepare, Progress, Role, RunState, RunView, StageState, StageTask, StageView,
 };
-use protocol::pipeline::PipelineStage;
 use protocol::stage::{Backend, Shape};
 use protocol::units::grouped;
 use protocol::{Digest, Generation, Incarnation, StageName, TaskId, WorkerId, canonical};
@@ -168,7 +168,7 @@ impl State {
                         unit: "steps".into(),
                         ..Default::default()
                     };
-                    (view.progress, view.message) = (progress, Some(crate::sweep::in_words(&sweep)));
+                    (view.progress, view.message) = (progress, Some(crate::decide::sweep::in_words(&sweep)));
                 }
             }
             Status::Active { .. } => {

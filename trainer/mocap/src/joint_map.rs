@@ -22,7 +22,7 @@ use std::path::{Path, PathBuf};
 
 use motion::quaternion::{self as quat, Vec3};
 use motion::{DataPath, Skeleton};
-use protocol::pipeline::yaml_as_json;
+use pipeline::yaml_as_json;
 use protocol::stage::DataFormat;
 use protocol::{excerpt, excerpts, json_mistake};
 use serde::{Deserialize, Serialize};

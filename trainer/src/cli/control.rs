@@ -16,8 +16,8 @@ use stages::generate::{Generated, Generator};
 use stages::parts::hint::{Hint, metres};
 
 use super::model::{self, Found};
-use crate::problem::{Problem, Result};
 use crate::reader::Reader;
+use crate::report::problem::{Problem, Result};
 
 /// Distance in metres beyond which the papers count a waypoint as missed.
 const MISSED: f64 = 0.5;

@@ -12,8 +12,8 @@ use motion::DataPath;
 use protocol::Seed;
 use serde_json::json;
 
-use crate::print::{self, Output};
-use crate::problem::{Problem, Result};
+use crate::report::print::{self, Output};
+use crate::report::problem::{Problem, Result};
 
 #[derive(Debug, Subcommand)]
 pub(crate) enum DataVerb {

@@ -10,8 +10,8 @@ use registry::{OpenError, ReadStore};
 use serde::Serialize;
 
 use crate::client::{Client, Target, shown};
-use crate::print::{self, Output};
-use crate::problem::{Result, exit};
+use crate::report::print::{self, Output};
+use crate::report::problem::{Result, exit};
 
 /// Free space below which a training may fill the disk, and below which nothing can be stored.
 const LITTLE: u64 = 5 << 30;

@@ -10,8 +10,8 @@ use mocap::take::Reading;
 use serde_json::json;
 
 use super::out::{self, OutArgs};
-use crate::print::{self, Output};
-use crate::problem::{Problem, Result};
+use crate::report::print::{self, Output};
+use crate::report::problem::{Problem, Result};
 
 #[derive(Debug, Args)]
 pub(crate) struct ExportArgs {

@@ -16,9 +16,9 @@ use super::remote::check_parent;
 use super::sampler::SamplerArgs;
 use super::sentences::SentenceArgs;
 use crate::client::Target;
-use crate::print::{self, Output};
-use crate::problem::{Problem, Result};
 use crate::reader::Reader;
+use crate::report::print::{self, Output};
+use crate::report::problem::{Problem, Result};
 
 /// Default sentences: movements that every dataset has.
 const SENTENCES: [&str; 6] = [

@@ -24,9 +24,9 @@ use super::sentences::SentenceArgs;
 use super::stream::{self, Opening, StreamArgs};
 use super::words;
 use crate::client::Target;
-use crate::print::{self, Output};
-use crate::problem::{Problem, Result};
 use crate::reader::Reader;
+use crate::report::print::{self, Output};
+use crate::report::problem::{Problem, Result};
 
 #[derive(Debug, Args)]
 #[command(mut_arg("out", |out| out.required(false).required_unless_present("stream")))]
@@ -254,7 +254,7 @@ pub(super) fn is_known(generator: &Generator, label: &str, caption: &str) -> Res
         print::note(&format!("note: the sentence is empty: {label} draws without being told what"));
     } else if !known {
         print::note(&format!(
-            "note: the text encoder of {label} knows nothing of `{caption}`, which so gives the motion of an empty sentence"
+            "note: the text encoder of {label} has no word of `{caption}`; the motion is that of an empty sentence"
         ));
     }
     Ok(known)

@@ -6,10 +6,10 @@ use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
 
-use crate::pipeline_file;
-use crate::print::{self, Output};
-use crate::problem::{Problem, Result};
-use crate::run;
+use crate::local::pipeline_file;
+use crate::local::run;
+use crate::report::print::{self, Output};
+use crate::report::problem::{Problem, Result};
 
 /// Parts of a published model that become a version.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]

@@ -9,10 +9,10 @@ use protocol::RunId;
 use registry::{Axis, Page, Window};
 
 use crate::client::Target;
-use crate::figure::{self, Panel};
-use crate::print::{self, Output};
-use crate::problem::{Problem, Result, exit};
 use crate::reader::Reader;
+use crate::report::figure::{self, Panel};
+use crate::report::print::{self, Output};
+use crate::report::problem::{Problem, Result, exit};
 
 /// Buckets of a drawn curve: about one a pixel.
 const DRAWN: usize = 400;

@@ -16,8 +16,8 @@ use registry::cli::{Command, Data};
 use stages::context::StageError;
 use stages::evaluation::REPORT_FILE;
 
-use crate::problem::{Problem, Result, exit};
 use crate::reader::Reader;
+use crate::report::problem::{Problem, Result, exit};
 
 /// A model with its files.
 #[derive(Debug)]

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clap::Args;
 use mocap::requests::{self, Length, Request};
 
-use crate::problem::{Problem, Result};
+use crate::report::problem::{Problem, Result};
 
 /// Limit of the motions of one command.
 const MOST: usize = 1_000;

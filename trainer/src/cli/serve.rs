@@ -12,8 +12,9 @@ use tokio::signal::unix::{SignalKind, signal};
 
 use super::allowance_args::AllowanceArgs;
 use super::endpoint_args::EndpointArgs;
-use crate::problem::{Problem, Result};
-use crate::{client, print};
+use crate::client;
+use crate::report::print;
+use crate::report::problem::{Problem, Result};
 
 const TOKENS: &str = "\
 A token file has a line `NAME SCOPES TOKEN` for each caller, such as `alice submit,promote` and what `openssl rand -hex 32`

@@ -7,9 +7,9 @@ use protocol::message::{RunView, StageView};
 use serde_json::Value;
 
 use super::model;
-use crate::figure::{self, Panel};
-use crate::problem::{Problem, Result, exit};
 use crate::reader::Reader;
+use crate::report::figure::{self, Panel};
+use crate::report::problem::{Problem, Result, exit};
 
 /// Kind of the stages that are drawn.
 const KIND: &str = "evaluate.spectrum";

@@ -9,11 +9,12 @@ use protocol::sweep::in_evaluation;
 use serde_json::{Value, json};
 
 use crate::client::Target;
-use crate::print::{self, Output};
-use crate::problem::{Problem, Result, exit};
+use crate::local::pipeline_file;
 use crate::reader::Reader;
-use crate::sweep_plot::{self, By};
-use crate::{pipeline_file, summary};
+use crate::report::print::{self, Output};
+use crate::report::problem::{Problem, Result, exit};
+use crate::report::summary;
+use crate::report::sweep_plot::{self, By};
 
 #[derive(Debug, Subcommand)]
 pub(crate) enum SweepVerb {

@@ -12,9 +12,9 @@ use stages::generate::timing::{self, Times, WARM_UP};
 use super::model::{self, Found};
 use super::sampler::SamplerArgs;
 use crate::client::Target;
-use crate::print::{self, Output};
-use crate::problem::{Problem, Result};
 use crate::reader::Reader;
+use crate::report::print::{self, Output};
+use crate::report::problem::{Problem, Result};
 
 #[derive(Debug, Args)]
 pub(crate) struct TimeArgs {

@@ -7,9 +7,9 @@ use protocol::Digest;
 use registry::cli::{Command, Data};
 
 use super::model;
-use crate::print;
-use crate::problem::Result;
 use crate::reader::Reader;
+use crate::report::print;
+use crate::report::problem::Result;
 
 /// Kind of the artifacts with captions.
 const DATASET: &str = "dataset";

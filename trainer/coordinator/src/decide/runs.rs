@@ -3,8 +3,8 @@
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
+use pipeline::Pipeline;
 use protocol::message::RunState;
-use protocol::pipeline::Pipeline;
 use protocol::{Owner, RunId, StageName, limits};
 use registry::Write;
 

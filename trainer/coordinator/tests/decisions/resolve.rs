@@ -5,8 +5,8 @@ use std::collections::BTreeMap;
 
 use crate::common::{PureCoordinator, failed};
 use coordinator::{Control, Effect, Event, Policy};
+use pipeline::Pipeline;
 use protocol::message::{Assignment, FailureClass, ReportOutcome, Role, RunState, StageState, TaskOutcome};
-use protocol::pipeline::Pipeline;
 use protocol::{Digest, RunId};
 
 /// A pipeline with a dataset's folder.
@@ -17,7 +17,7 @@ stages:
 ";
 
 fn pipeline(digest: Option<&[u8]>) -> Pipeline {
-    let mut pipeline = protocol::pipeline::read("p.yaml", TEXT, &[]).unwrap_or_else(|mistakes| panic!("{mistakes}"));
+    let mut pipeline = pipeline::read("p.yaml", TEXT, &[]).unwrap_or_else(|mistakes| panic!("{mistakes}"));
     if let Some(content) = digest {
         pipeline.fill_external(|_, _| Ok::<_, ()>(Digest::of(content))).expect("one folder");
     }
@@ -131,7 +131,7 @@ dataset: {format: synthetic}
 stages:
   judge: {kind: train.evaluator, words: /data/glove}
 ";
-    let mut pipeline = protocol::pipeline::read("p.yaml", text, &[]).unwrap_or_else(|mistakes| panic!("{mistakes}"));
+    let mut pipeline = pipeline::read("p.yaml", text, &[]).unwrap_or_else(|mistakes| panic!("{mistakes}"));
     pipeline.fill_external(|_, _| Ok::<_, ()>(Digest::of(b"glove"))).expect("one folder");
     let mut coordinator = PureCoordinator::new(Policy::default());
     coordinator.quick = false;

@@ -6,11 +6,11 @@ use std::time::Duration;
 use axum::body::Body;
 use axum::http::{Request, StatusCode};
 use coordinator::{Config, Control, Coordinator, Handle, Policy};
+use pipeline::{Pipeline, PipelineStage, StageInput};
 use protocol::message::{
     ApiError, Assignment, CommitCheckpoint, DesiredAssignments, Doing, Grant, Join, Joined, LogBatch, MetricBatch,
     MetricRow, PROTOCOL_VERSION, Poll, Progress, ReportOutcome, RunState, StageState, Submit, TaskOutcome,
 };
-use protocol::pipeline::{Pipeline, PipelineStage, StageInput};
 use protocol::proof::{BlobStored, GRANT_HEADER, RECEIPT_HEADER, SECRET_HEADER, Vouched};
 use protocol::stage::{Backend, DataSynthetic, Placement, StageSettings, TrainVae};
 use protocol::{ArtifactKind, Digest, Manifest, RunId, Seed};

@@ -19,7 +19,7 @@ pub struct Placement {
 }
 
 impl Placement {
-    pub(crate) fn check(&self, p: &mut Problems) {
+    pub fn check(&self, p: &mut Problems) {
         let w = self.workers;
         p.positive("workers.min", w.min);
         if w.max != 0 && w.max < w.min {

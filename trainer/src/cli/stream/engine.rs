@@ -8,7 +8,7 @@ use stages::generate::stream::{Ask, MotionStream, Segment};
 use tokio::sync::{mpsc, oneshot};
 
 use super::opening::{Beginning, Opening};
-use crate::problem::{Problem, Result};
+use crate::report::problem::{Problem, Result};
 
 /// A segment with the time that it took, or the reason of the failure.
 type Drawn = std::result::Result<(Segment, Duration), String>;

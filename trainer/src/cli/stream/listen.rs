@@ -41,8 +41,8 @@ use super::line::{self, Line, MOST_BYTES};
 use super::opening::{Beginning, Opening, StreamArgs};
 use super::real;
 use super::report::Real;
-use crate::print;
-use crate::problem::{Problem, Result, exit};
+use crate::report::print;
+use crate::report::problem::{Problem, Result, exit};
 
 /// Limit of a connection's queued sentences.
 const WAITING: usize = 16;

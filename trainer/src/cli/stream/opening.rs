@@ -17,7 +17,7 @@ use super::super::sampler::SamplerArgs;
 use super::course::Course;
 use super::line::Form;
 use super::report::{Meter, Real};
-use crate::problem::{Problem, Result};
+use crate::report::problem::{Problem, Result};
 
 #[derive(Debug, Args)]
 pub(in crate::cli) struct StreamArgs {

@@ -15,8 +15,8 @@ use super::super::{model, out};
 use super::course::{Course, Pace};
 use super::line::{self, Form, Line, QUEUE};
 use super::opening::Beginning;
-use crate::print::{self, Output};
-use crate::problem::{Problem, Result};
+use crate::report::print::{self, Output};
+use crate::report::problem::{Problem, Result};
 
 /// Limit of frames kept for files: an hour of HumanML3D, 19 MB.
 const MOST_KEPT: usize = 72_000;

@@ -6,7 +6,7 @@ use motion::{DataPath, Skeleton, npy};
 use stages::metrics::junction::{Jump, jumps, usual};
 
 use super::report::Real;
-use crate::problem::{Problem, Result};
+use crate::report::problem::{Problem, Result};
 
 /// Limit of clips read from a folder, in the order of its list.
 const CLIPS: usize = 256;

@@ -17,8 +17,8 @@ use std::time::{Duration, Instant};
 
 use burn::tensor::Device;
 use checkpoint::Blobs;
+use pipeline::{Pipeline, PipelineStage};
 use protocol::message::StageTask;
-use protocol::pipeline::{Pipeline, PipelineStage};
 use protocol::stage::{
     CheckpointPolicy, DataFormat, EncodeLatents, EvaluateLatentFid, EvaluateT2m, ImportEvaluator, Sampler, Shape,
     Split, StageSettings, TextEmbed, TextEncoder,

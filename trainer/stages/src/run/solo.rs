@@ -136,7 +136,7 @@ impl GangContext for Solo {
     }
 
     fn hold(&mut self) -> Result<(), ContextError> {
-        Err(ContextError::Unavailable("one member alone has nobody to wait for".to_owned()))
+        Err(ContextError::Unavailable("a gang of one member has no peer to wait for".to_owned()))
     }
 
     fn leads(&self) -> bool {

@@ -2,8 +2,8 @@
 
 use std::collections::BTreeMap;
 
+use pipeline::Pipeline;
 use protocol::message::{RunState, RunView, StageState, Submit};
-use protocol::pipeline::Pipeline;
 use protocol::stage::{Register, WorkerRange};
 use protocol::{Digest, Manifest, RunId};
 use registry::Write;
