@@ -7,7 +7,7 @@ use std::collections::BTreeMap;
 
 use motion::Stream;
 use motion::dataset::{Split, crop};
-use protocol::stage::EncodeLatents;
+use protocol::stage::{self, EncodeLatents};
 use protocol::{ArtifactKind, Digest};
 use serde::{Deserialize, Serialize};
 
@@ -26,6 +26,10 @@ struct ShardMeta {
 }
 
 impl Map for EncodeLatents {
+    fn repetitions(&self, entries: &dyn Fn(stage::Split) -> f64) -> f64 {
+        entries(stage::Split::All) * self.crops as f64
+    }
+
     fn shard(&self, cx: &mut dyn AttemptContext, index: usize, of: usize) -> Result<Outcome, StageError> {
         let blobs = cx.blobs();
         let (vae_digest, vae) = artifacts::input(cx, "vae", ArtifactKind::Vae)?;

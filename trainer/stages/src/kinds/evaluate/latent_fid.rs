@@ -34,6 +34,7 @@ use crate::metrics::latent_fid::{
     Real, Reference, Target, mean_and_spread, relative_distance, same_captions, standard_deviation, top,
 };
 use crate::shards::{self, Units, in_turn};
+use crate::stand_in::CLIPS;
 
 /// Samples computed together. Measured with 5 blocks of width 128 on one core: with 32 each takes a tenth less time
 /// than with 64, which with guidance are 128 sequences and do not fit the cache.
@@ -210,6 +211,10 @@ fn fits(field: &str, generator: &dyn MotionGenerator, latents: &Latents) -> Resu
 }
 
 impl Map for EvaluateLatentFid {
+    fn repetitions(&self, entries: &dyn Fn(Wanted) -> f64) -> f64 {
+        (self.repeats * self.samples) as f64 * entries(self.split) / CLIPS as f64
+    }
+
     fn shard(&self, cx: &mut dyn AttemptContext, index: usize, of: usize) -> Result<Outcome, StageError> {
         let plan = Plan::read(cx, self)?;
         let mine = |maker| in_turn(plan.units().into_iter().filter(move |unit| unit.maker == maker), index, of);

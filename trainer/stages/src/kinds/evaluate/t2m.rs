@@ -22,7 +22,7 @@ mod plan;
 use std::collections::BTreeMap;
 
 use protocol::Digest;
-use protocol::stage::EvaluateT2m;
+use protocol::stage::{EvaluateT2m, Split};
 use serde_json::json;
 
 use self::maker::{Maker, Source, reconstruct};
@@ -35,8 +35,14 @@ use crate::evaluation::report::over_repeats;
 use crate::kinds::shape::Map;
 use crate::metrics::spread;
 use crate::shards::{self, Units, in_turn};
+use crate::stand_in::CLIPS;
 
 impl Map for EvaluateT2m {
+    fn repetitions(&self, entries: &dyn Fn(Split) -> f64) -> f64 {
+        let many = if self.generates() { self.multimodality.captions * self.multimodality.samples } else { 0 };
+        self.repeats as f64 * (entries(self.split) + many as f64) / CLIPS as f64
+    }
+
     fn shard(&self, cx: &mut dyn AttemptContext, index: usize, of: usize) -> Result<Outcome, StageError> {
         let plan = Plan::read(cx, self)?;
         let source = Source::open(cx, &plan)?;

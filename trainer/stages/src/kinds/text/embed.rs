@@ -7,7 +7,7 @@
 use std::collections::{BTreeMap, HashMap};
 
 use protocol::artifact::Role;
-use protocol::stage::TextEmbed;
+use protocol::stage::{StageSettings, TextEmbed, TextEncoder};
 use protocol::{ArtifactKind, Digest};
 use serde::{Deserialize, Serialize};
 
@@ -53,6 +53,12 @@ fn texts(cx: &dyn AttemptContext) -> Result<(Vec<String>, Vec<usize>), StageErro
 }
 
 impl Map for TextEmbed {
+    // Reading published encoders takes longer than the rest of an estimate.
+    fn cheaper(&self) -> Option<StageSettings> {
+        let hashed = Self { dataset: self.dataset.clone(), ..Self::default() };
+        (self.encoder != TextEncoder::Hashed).then(|| hashed.into())
+    }
+
     fn shard(&self, cx: &mut dyn AttemptContext, index: usize, of: usize) -> Result<Outcome, StageError> {
         let (texts, _) = texts(cx)?;
         let range = shard_range(texts.len(), index, of);
