@@ -61,5 +61,5 @@ pub(crate) fn expect_units<U: Ord>(
     if found == expected {
         return Ok(());
     }
-    Err(StageError::Fault(format!("the shards have {} blocks, expected {}", found.len(), expected.len())))
+    Err(StageError::Fault(format!("the shards have {} blocks; expected {}", found.len(), expected.len())))
 }

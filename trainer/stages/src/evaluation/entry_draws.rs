@@ -86,12 +86,14 @@ impl EntryDraws {
         }
         if entries.len() < pool {
             let instead = match taken {
-                Split::All => "there are no more in the dataset",
+                Split::All => "the dataset has no more",
                 Split::Test => "set `split: all`, or `all_if_small: true`",
-                Split::Train | Split::Val => "set `split: all`, `split: test` for a last look, or `all_if_small: true`",
+                Split::Train | Split::Val => {
+                    "set `split: all`, `split: test` (for final results only) or `all_if_small: true`"
+                }
             };
             return Err(StageError::Input(format!(
-                "the split `{}` has {} entries, R-precision ranks a motion among {pool}; {instead}{smaller}",
+                "the split `{}` has {} entries, but R-precision needs pools of {pool}; {instead}{smaller}",
                 word(&taken),
                 entries.len()
             )));
@@ -192,14 +194,14 @@ impl EntryDraws {
         let (entries, width) = (self.entries.len(), self.trained.width());
         let few = (samples < FEW * width).then(|| {
             format!(
-                "FID is taken of {samples} motions in {width} dimensions; it is then larger than of many, and compares only with FIDs of as \
-                 many motions in the same evaluator"
+                "FID is taken of {samples} motions in {width} dimensions; it is then larger than of many, and compares \
+                 only with FIDs of as many motions in the same evaluator"
             )
         });
         few.iter().for_each(|few| cx.log(few));
         if self.split != asked {
             cx.log(&format!(
-                "the split `{}` is too small for pools of {}: measured on all {entries} entries",
+                "the split `{}` is too small for pools of {}; all {entries} entries are measured",
                 word(&asked),
                 self.pool
             ));

@@ -34,7 +34,7 @@ pub(crate) fn model(
     let model = generator::open(&manifest, &*cx.blobs(), &cx.device())?;
     if model.format() != format {
         return Err(StageError::Input(format!(
-            "`model` draws motions of `{}`, the dataset has `{}`; measure it on the format that it was trained on",
+            "`model` generates motions in format `{}`, but the dataset has format `{}`; use a dataset in the model's format",
             model.format().name(),
             format.name()
         )));

@@ -16,7 +16,7 @@ pub const REPORT_FILE: &str = "report.json";
 
 /// The error for an evaluation on a split without entries.
 pub(crate) fn no_entries(split: Split) -> StageError {
-    StageError::Input(format!("the split `{}` has no entries; set `split` to one that has", word(&split)))
+    StageError::Input(format!("the split `{}` has no entries; set `split` to one that has entries", word(&split)))
 }
 
 /// The model and sampler of an evaluation, or null for real motion. Every report contains them, so that its reader
@@ -97,9 +97,9 @@ pub(crate) fn over_repeats(
 /// Refuses metrics that are not finite.
 pub(crate) fn finite(metrics: &BTreeMap<String, f64>) -> Result<(), StageError> {
     match metrics.iter().find(|(_, value)| !value.is_finite()) {
-        Some((name, value)) => {
-            Err(StageError::Input(format!("`{name}` is {value}: embeddings are not finite; train the evaluator anew")))
-        }
+        Some((name, value)) => Err(StageError::Input(format!(
+            "`{name}` is {value}: the embeddings are not finite; train the evaluator again"
+        ))),
         None => Ok(()),
     }
 }

@@ -127,8 +127,9 @@ impl WarmStart {
         let there = there.map_err(artifacts::blob_error)?.map_err(corrupt)?;
         if matrices == 0 {
             return Err(StageError::Input(format!(
-                "nothing of `{INIT}` fits: none of its {} tensors, biases and the like aside, has a name and a shape of what is trained here; \
-                 expected such as {}, and it has such as {}; name what was trained by this kind, in this form",
+                "`{INIT}` does not match this network: of its {} tensors, no weight matrix has the name and shape of \
+                 one here; expected for example {}, found for example {}; use the output of a stage of this kind with \
+                 the same `network`",
                 there.len(),
                 fresh.first().map_or("none", String::as_str),
                 there.first().map_or_else(|| "none".into(), |entry| format!("{} {:?}", entry.name, entry.shape)),
@@ -138,7 +139,7 @@ impl WarmStart {
             return Ok(());
         }
         let (kind, all) = (part.kind.noun(), taken + fresh.len());
-        cx.log(&format!("begins with {taken} of {all} tensors of `{INIT}`, {kind}, {}", digest.short()));
+        cx.log(&format!("starts with {taken} of {all} tensors from `{INIT}`, {kind}, {}", digest.short()));
         list(cx, "fresh", &fresh);
         let unused: Vec<String> = there
             .iter()
@@ -148,7 +149,10 @@ impl WarmStart {
         list(cx, "not used", &unused);
         let differs = differing(&part.meta, &to_meta(meta));
         if !differs.is_empty() {
-            cx.log(&format!("`{INIT}` differs in {}; what it learned under those is gone on from", differs.join(", ")));
+            cx.log(&format!(
+                "`{INIT}` was trained with another {}; training continues from its weights",
+                differs.join(", ")
+            ));
         }
         Ok(())
     }

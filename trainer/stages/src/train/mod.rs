@@ -243,7 +243,7 @@ pub fn train(
             match saved {
                 Ok(()) => (saved_at, save_is_due) = (Some(state.step), false),
                 Err(StageError::Context(ContextError::Unavailable(why))) if !cx.can_save() => {
-                    cx.log(&format!("the checkpoint after step {} is put off: {why}", state.step));
+                    cx.log(&format!("the checkpoint after step {} is delayed: {why}", state.step));
                 }
                 Err(error) => return Err(error),
             }
@@ -259,7 +259,7 @@ fn check_size(bytes: u64, most: u64) -> Result<(), StageError> {
     }
     let gib = |bytes: u64| bytes as f64 / f64::from(1 << 30);
     Err(StageError::Input(format!(
-        "the state of this training is one file of {:.1} GiB, expected at most {:.1} GiB; use a smaller `network`, or no `ema`",
+        "the training state is a file of {:.1} GiB; expected at most {:.1} GiB; use a smaller `network`, or no `ema`",
         gib(file),
         gib(most)
     )))
@@ -280,12 +280,12 @@ fn begin(
             if let Some(manifest) = checkpoint {
                 restore(state, &manifest, cx)?;
                 (applied, saved_at) = (Some(state.step), Some(state.step));
-                cx.log(&format!("goes on from the checkpoint after step {}", state.step));
+                cx.log(&format!("continues from the checkpoint after step {}", state.step));
             } else if continues {
                 let (_, manifest) = crate::artifacts::input(cx, STATE_INPUT, ArtifactKind::Checkpoint)?;
                 restore(state, &manifest, cx)?;
                 applied = Some(state.step);
-                cx.log(&format!("goes on from the rung that ended after step {}", state.step));
+                cx.log(&format!("continues from the rung that ended after step {}", state.step));
             }
         }
         let met = meet(state, applied, cx)?;
@@ -372,7 +372,8 @@ impl Layout {
         if found != (wanted, self.terms, self.sums.clone()) {
             let (gradients, terms, sums) = found;
             return Err(StageError::Fault(format!(
-                "a slice gave gradients of {gradients:?} values, {terms} terms and sums of {sums:?}; the plan has {:?}, {} and {:?}",
+                "a slice has gradients of {gradients:?} values, {terms} terms and sums of {sums:?}; the plan has {:?}, \
+                 {} and {:?}",
                 self.gradients, self.terms, self.sums
             )));
         }

@@ -86,7 +86,7 @@ impl Gang for DistillDiscord {
         let blobs = cx.blobs();
         let teacher = FlowDecoder::read(&*blobs, &manifest, (&role, digest), &cx.device())?;
         let Some(solver) = teacher.meta().solver.followed() else {
-            return Err(StageError::Input("`teacher` is a student itself; name a `train.discord` stage".into()));
+            return Err(StageError::Input("`teacher` is a student; expected a `train.discord` stage".into()));
         };
         let data = FlowData::read(cx, encoder, (self.window, self.windows_of), &self.training)?;
         let meta = FlowMeta { solver: FlowPath::Jumps, steps: self.solver_steps, ..teacher.meta().clone() };

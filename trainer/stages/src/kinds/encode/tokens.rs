@@ -75,7 +75,7 @@ impl Map for EncodeTokens {
             let have = whole.as_ref().map_or(0, |whole| whole.splits.len());
             if first != have {
                 return Err(StageError::Fault(format!(
-                    "a shard begins at entry {first}, the one before it ended at {have}"
+                    "a shard begins at entry {first}, but the previous shard ended at entry {have}"
                 )));
             }
             ids.extend_from_slice(&part.take_integers("ids", 2, TOKENS_FILE)?.values);
@@ -88,7 +88,7 @@ impl Map for EncodeTokens {
                 }
             }
         }
-        let meta = whole.ok_or_else(|| StageError::Fault("tokens without shards".into()))?;
+        let meta = whole.ok_or_else(|| StageError::Fault("no shard of the tokens was given".into()))?;
         let used: BTreeSet<i64> = ids.iter().step_by(meta.quantizers).copied().collect();
         let metrics = BTreeMap::from([
             ("entries".to_owned(), meta.splits.len() as f64),

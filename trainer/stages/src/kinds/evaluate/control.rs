@@ -80,7 +80,7 @@ struct Plan<'a> {
 impl<'a> Plan<'a> {
     fn read(cx: &dyn AttemptContext, settings: &'a EvaluateControl) -> Result<Self, StageError> {
         if settings.repeats == 0 {
-            return Err(StageError::Input("`repeats` is 0, expected at least 1".into()));
+            return Err(StageError::Input("`repeats` is 0; expected at least 1".into()));
         }
         let of = EntryDraws::read(cx, settings.split, settings.all_if_small, (POOL, ""))?;
         let cases = cases(settings, of.dataset.format)?;
@@ -190,7 +190,7 @@ impl Map for EvaluateControl {
         let plan = Plan::read(cx, self)?;
         let (_, generator) = measured::model(cx, plan.of.dataset.format, &self.sampler)?;
         if generator.control().is_none() {
-            return Err(StageError::Input("`model` has no control part; name a `train.control` stage".into()));
+            return Err(StageError::Input("`model` has no control part; expected a `train.control` stage".into()));
         }
         let maker = Maker { generator: &*generator, texts: Texts::new(&*generator) };
         let units: Vec<Unit> = in_turn(plan.units(), index, of).collect();

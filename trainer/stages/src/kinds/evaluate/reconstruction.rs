@@ -134,7 +134,7 @@ impl Map for EvaluateReconstruction {
             evaluator.check(&dataset, &entries)?;
             if entries.len() < 2 {
                 return Err(StageError::Input(
-                    "FID needs at least 2 clips, the split has 1; leave `evaluator` out".into(),
+                    "FID needs at least 2 clips, but the split has 1; leave `evaluator` out".into(),
                 ));
             }
         }
@@ -203,7 +203,7 @@ impl Map for EvaluateReconstruction {
             }
         }
         let Rows { format, rows, codes } =
-            whole.ok_or_else(|| StageError::Fault("an evaluation without shards".into()))?;
+            whole.ok_or_else(|| StageError::Fault("no shard of the evaluation was given".into()))?;
         let skeleton = Skeleton::of(format);
         let column = |of: fn(&Row) -> ClipErrors| rows.iter().map(of).collect::<Vec<_>>();
         let mut metrics = summary(&column(|r| r.sample), skeleton, "");
@@ -224,14 +224,15 @@ impl Map for EvaluateReconstruction {
             meta["words"] = to_meta(&evaluator.meta().words);
             if rows.len() < FEW * width {
                 cx.log(&format!(
-                    "FID is taken of {} clips in {width} dimensions; it compares only with FIDs of as many in the same evaluator",
+                    "FID uses {} clips in {width} dimensions; compare it only with FIDs of as many clips in the same \
+                     evaluator",
                     rows.len()
                 ));
             }
         }
         if metrics.values().any(|v| !v.is_finite()) {
             return Err(StageError::Input(
-                "the reconstructions are not finite; what made them has not been trained well".into(),
+                "the reconstructions are not finite; their model is not trained well enough".into(),
             ));
         }
         meta["metrics"] = json!(metrics);

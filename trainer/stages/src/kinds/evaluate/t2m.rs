@@ -120,7 +120,7 @@ impl Map for EvaluateT2m {
         let (samples, entries, pool) = (plan.kept(), plan.of.entries.len(), self.first_pool());
         if samples < entries {
             cx.log(&format!(
-                "{} of {entries} entries fill no pool of {pool}; each repeat leaves out others",
+                "{} of {entries} entries do not fill a pool of {pool}; each repeat leaves out different ones",
                 entries - samples
             ));
         }

@@ -365,17 +365,17 @@ fn taken<M: Module>(network: &M, gradients: &mut Gradients) -> Vec<f32> {
 fn base_meta(denoiser: &Manifest, model: &Model, data: &LatentData) -> Result<DenoiserMeta, StageError> {
     let refuse = |text: &str| Err(StageError::Input(text.to_owned()));
     if model.parts.contains_key(&Role::CONTROL) {
-        return refuse("`model` has a control part already; name the model that it controls");
+        return refuse("`model` already has a control part; use the model without it");
     }
     if model.generator != crate::generate::generator::LATENT_DIFFUSION {
-        return refuse("`model` is no latent diffusion, and only such a model has a ControlNet");
+        return refuse("`model` is not a latent diffusion model; a ControlNet needs one");
     }
     let meta: DenoiserMeta = artifacts::meta(denoiser, "the denoiser of `model`")?;
     if meta.fits.get(&Role::VAE) != Some(&data.vae()) {
-        return refuse("`latents` were made by another VAE than `model` was trained on; name its latents");
+        return refuse("`latents` were encoded with another VAE than that of `model`; use the model's latents");
     }
     if meta.fits.get(&Role::TEXT) != Some(&data.text_meta().text) {
-        return refuse("`text` was embedded with another encoder than `model` was trained with; name its `text`");
+        return refuse("`text` was embedded with another encoder than that of `model`; use the model's `text`");
     }
     Ok(meta)
 }
@@ -391,7 +391,7 @@ fn clips(cx: &dyn AttemptContext, data: &LatentData) -> Result<Dataset, StageErr
     };
     if dataset.entries.len() != meta.splits.len() || !(0..rows).all(fits) {
         return Err(StageError::Input(
-            "`latents` were encoded from other clips than `dataset` has; name the dataset that they were encoded from"
+            "`latents` were not encoded from the clips of `dataset`; use the dataset that they were encoded from"
                 .into(),
         ));
     }

@@ -277,7 +277,8 @@ impl Gang for TrainEvaluator {
         }
         if turn == 0 || turn >= steps {
             return Err(StageError::Input(format!(
-                "`movement.until` gives {turn} of {steps} steps to the movements; both phases need some"
+                "`movement.until` assigns {turn} of {steps} steps to the movement phase; each of the two phases needs \
+                 at least one"
             )));
         }
         let words = external::read(cx, |_, given| Words::open(given.get("words")))?;

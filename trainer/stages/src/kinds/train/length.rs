@@ -96,7 +96,7 @@ impl Gang for TrainLength {
         let embeddings = Embeddings::read(&*blobs, &manifest)?;
         if dataset.captions.len() != embeddings.meta.captions {
             return Err(StageError::Input(format!(
-                "`dataset` has {} captions, `text` embeds {}; both must come from one dataset",
+                "`dataset` has {} captions, but `text` embeds {}; use embeddings of the same dataset",
                 dataset.captions.len(),
                 embeddings.meta.captions
             )));

@@ -145,7 +145,8 @@ impl Gang for TrainMld {
         let text_part = data.text_encoder(cx)?;
         if data.vae() != vae_digest || data.meta().latent != vae.latent {
             return Err(StageError::Input(format!(
-                "`latents` were made by another VAE ({} x {} latents) than `vae` ({} x {}); name the VAE that encoded them",
+                "`latents` were encoded with another VAE ({} x {} latents) than `vae` ({} x {}); use the VAE that \
+                 encoded them",
                 data.meta().latent.tokens,
                 data.meta().latent.dim,
                 vae.latent.tokens,

@@ -92,7 +92,7 @@ impl FeatureData {
         let text_meta: EmbeddingsMeta = artifacts::meta(&manifest, "the caption embeddings")?;
         if text_meta.captions != dataset.captions.len() {
             return Err(StageError::Input(format!(
-                "`text` embeds {} captions, `dataset` has {}; both must come from one dataset",
+                "`text` embeds {} captions, but `dataset` has {}; use embeddings of the same dataset",
                 text_meta.captions,
                 dataset.captions.len()
             )));
@@ -224,7 +224,10 @@ impl FeatureData {
             Words::Vectors(embeddings) => Ok(embeddings.captions.row(number).to_vec()),
             Words::Tokens(encoder) => {
                 let tokens = encoder.tokens(&[&self.dataset.captions[number].text])?;
-                tokens.into_iter().next().ok_or_else(|| StageError::Fault("the encoder gave no caption".into()))
+                tokens
+                    .into_iter()
+                    .next()
+                    .ok_or_else(|| StageError::Fault("the text encoder returned no embedding".into()))
             }
         }
     }

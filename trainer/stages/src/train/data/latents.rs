@@ -62,7 +62,7 @@ impl LatentData {
         let stage = cx.task().name.clone();
         if captions > embeddings.meta.captions {
             return Err(StageError::Input(format!(
-                "`latents` refers to {captions} captions, `text` embeds {}; both must come from one dataset",
+                "`latents` refers to {captions} captions, but `text` embeds {}; use both of the same dataset",
                 embeddings.meta.captions
             )));
         }

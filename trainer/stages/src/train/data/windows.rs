@@ -36,7 +36,8 @@ impl TokenWindows {
         if train.is_empty() {
             let longest = all.iter().map(|e| dataset.entries[*e].len).max().unwrap_or(0);
             return Err(StageError::Input(format!(
-                "`window` is {frames} frames, the longest clip of the training split has {longest}; set a shorter window"
+                "`window` is {frames} frames, but the longest clip of the training split has {longest}; set a shorter \
+                 window"
             )));
         }
         let mut firsts = vec![0];

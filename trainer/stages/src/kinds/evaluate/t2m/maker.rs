@@ -59,14 +59,14 @@ fn lengths(cx: &dyn AttemptContext, model: &Model) -> Result<Option<Lengths>, St
     let meta = lengths.meta();
     if meta.format != model.format {
         return Err(StageError::Input(format!(
-            "`length` knows motions of `{}`, `model` draws `{}`",
+            "`length` was trained on motions in format `{}`, but `model` generates `{}`",
             meta.format.name(),
             model.format.name()
         )));
     }
     if meta.fits.get(&Role::TEXT) != model.parts.get(&Role::TEXT) {
         let text =
-            "`length` reads captions of another text encoder than `model`; train it on the same `text.embed` stage";
+            "`length` and `model` have different text encoders; train `length` with the model's `text.embed` stage";
         return Err(StageError::Input(text.into()));
     }
     Ok(Some(lengths))
@@ -122,7 +122,7 @@ pub(super) fn reconstruct(
     let mut made = reconstructor.sample(&rows, draw.len, &mut plan.of.stream("posterior", draw.repeat, draw.number));
     reconstructor.denormalise(&mut made);
     if !made.iter().all(|v| v.is_finite()) {
-        let text = "a reconstruction is not finite; what made it has not been trained well";
+        let text = "a reconstruction is not finite; its model is not trained well enough";
         return Err(StageError::Input(text.into()));
     }
     Ok(made)

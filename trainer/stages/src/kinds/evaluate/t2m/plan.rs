@@ -40,9 +40,9 @@ pub(super) struct Plan<'a> {
 impl<'a> Plan<'a> {
     pub(super) fn read(cx: &dyn AttemptContext, settings: &'a EvaluateT2m) -> Result<Self, StageError> {
         if settings.repeats == 0 || settings.pools.is_empty() {
-            return Err(StageError::Input("`repeats` and `pools` must say at least 1".into()));
+            return Err(StageError::Input("`repeats` and `pools` must be at least 1".into()));
         }
-        let pool = (settings.largest_pool(), ", or take smaller `pools`");
+        let pool = (settings.largest_pool(), ", or smaller `pools`");
         let of = EntryDraws::read(cx, settings.split, settings.all_if_small, pool)?;
         let tell = |(i, caption): (usize, &Caption)| {
             let mut stream = Stream::new(of.seed, "evaluate.t2m/perturbed", 0, i as u64);
