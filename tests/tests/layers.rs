@@ -92,6 +92,7 @@ fn sources(folder: &Path) -> Vec<(PathBuf, String)> {
     let entries = std::fs::read_dir(folder).expect("a folder").map(|entry| entry.expect("an entry").path());
     let found = entries.flat_map(|path| match path.is_dir() {
         true => sources(&path),
+        false if path.extension().is_none_or(|end| end != "rs") => Vec::new(),
         false => {
             let text = std::fs::read_to_string(&path).expect("a source file");
             let code = text.split("#[cfg(test)]").next().unwrap_or_default().to_owned();
@@ -161,4 +162,67 @@ fn no_folders_import_each_other_in_a_loop() {
     let held = roots().into_iter().filter(|root| !but.iter().any(|but| root.ends_with(but)));
     let loops: Vec<String> = held.flat_map(|root| imports::folder_loops(&root)).collect();
     assert!(loops.is_empty(), "move what both folders need into one below both:\n{}", loops.join("\n"));
+}
+
+/// Settings types that are also data for other code: datasets, encoders by their folders, parts of an import. Each with
+/// the places that read them.
+const ALSO_IN: [(&str, &[&str]); 5] = [
+    (
+        "DataSynthetic",
+        &[
+            "mocap/src/sample.rs",
+            "motion/src/synthetic.rs",
+            "pipeline/src/read.rs",
+            "pipeline/src/reference.rs",
+            "local/cost.rs",
+            "stages/src/generate/timing.rs",
+        ],
+    ),
+    ("DataOpen", &["pipeline/src/read.rs", "pipeline/src/reference.rs", "local/cost.rs"]),
+    ("DataFeatures", &["local/cost.rs"]),
+    (
+        "TextEmbed",
+        &[
+            "pipeline/src/read.rs",
+            "pipeline/src/reference.rs",
+            "local/hub_names.rs",
+            "local/plan.rs",
+            "parts/text/mod.rs",
+            "parts/text/published.rs",
+        ],
+    ),
+    ("ImportModel", &["pipeline/src/reference.rs"]),
+];
+
+/// A new kind is two files, and its lines in the lists of their folders.
+#[test]
+fn a_stage_kind_is_named_in_no_third_place() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
+    let (described, run) = ("trainer/protocol/src/stage/kinds", "trainer/stages/src/kinds");
+    let list = std::fs::read_to_string(root.join(described).join("mod.rs")).expect("the list of kinds");
+    let list = list.split("stage_kinds! {").nth(1).expect("the list of kinds");
+    // The coordinator runs `register`.
+    let names = list.lines().filter_map(|line| line.trim().strip_suffix(',')?.split_once(": ")).map(|(_, name)| name);
+    let names: BTreeSet<&str> = names.filter(|name| *name != "Register").collect();
+    assert!(names.len() > 20, "{names:?}");
+    let mut named = BTreeMap::new();
+    let crates = ["trainer", "registry", "worker"].map(|folder| root.join(folder));
+    for (path, code) in crates.iter().flat_map(|folder| sources(folder)) {
+        let path = path.strip_prefix(&root).expect("a file of the tree").to_owned();
+        let inside = path.starts_with(described) || path.starts_with(run);
+        let shipped = path.iter().any(|part| part == "src");
+        if inside || !shipped || path.to_string_lossy().ends_with("tests.rs") {
+            continue;
+        }
+        let code: Vec<&str> = code.lines().filter(|line| !line.trim_start().starts_with("//")).collect();
+        let words = code.iter().flat_map(|line| line.split(|c: char| !c.is_alphanumeric()));
+        for name in words.filter(|word| names.contains(word)) {
+            named.insert((name.to_owned(), path.clone()), ());
+        }
+    }
+    let known = |name: &str, path: &Path| {
+        ALSO_IN.iter().any(|(also, places)| *also == name && places.iter().any(|place| path.ends_with(place)))
+    };
+    let third: Vec<_> = named.into_keys().filter(|(name, path)| !known(name, path)).collect();
+    assert!(third.is_empty(), "give the kind a method that says what is needed here: {third:?}");
 }

@@ -15,11 +15,11 @@
 
 use std::io::{self, Write};
 
+use data_encoding::BASE64;
 use motion::waypoints::Waypoint;
 use protocol::{Digest, printable};
 use serde_json::{Value, json};
 
-use crate::base64;
 use crate::body::{Body, Side};
 
 const SCRIPT: &str = include_str!("html/viewer.js");
@@ -150,7 +150,7 @@ impl Page<'_> {
     }
 
     fn head(&self, out: &mut impl Write) -> io::Result<()> {
-        let digest = |text: &str| base64::encode(Digest::of(text.as_bytes()).as_bytes());
+        let digest = |text: &str| BASE64.encode(Digest::of(text.as_bytes()).as_bytes());
         let title = text(&self.title);
         write!(
             out,
@@ -253,7 +253,7 @@ fn motion(number: usize, panel: &Panel<'_>, body: usize) -> Result<Value, PageEr
         "frames": joints.len() / width,
         "step": step,
         "origin": origin,
-        "joints": base64::encode(&bytes),
+        "joints": BASE64.encode(&bytes),
         "waypoints": told.collect::<Vec<_>>(),
     }))
 }

@@ -1,7 +1,6 @@
 //! Exchange of motion with other programs: recordings in, animations out. No tensors, no stages.
 
 pub mod arrays;
-mod base64;
 pub mod body;
 pub mod bvh;
 pub mod captions;

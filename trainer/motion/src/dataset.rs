@@ -127,19 +127,29 @@ impl Dataset {
 
     /// Computes `(x - mean) / std` on rows of D values, in place.
     pub fn normalise(&self, rows: &mut [f32]) {
-        for row in rows.chunks_exact_mut(self.mean.len()) {
-            for ((value, mean), std) in row.iter_mut().zip(&self.mean).zip(&self.std) {
-                *value = (*value - mean) / std;
-            }
-        }
+        normalise(rows, &self.mean, &self.std);
     }
 
     /// The inverse of [`Dataset::normalise`].
     pub fn denormalise(&self, rows: &mut [f32]) {
-        for row in rows.chunks_exact_mut(self.mean.len()) {
-            for ((value, mean), std) in row.iter_mut().zip(&self.mean).zip(&self.std) {
-                *value = *value * std + mean;
-            }
+        denormalise(rows, &self.mean, &self.std);
+    }
+}
+
+/// Computes `(x - mean) / std` on rows of as many values as `mean` has, in place.
+pub fn normalise(rows: &mut [f32], mean: &[f32], std: &[f32]) {
+    for row in rows.chunks_exact_mut(mean.len()) {
+        for ((value, mean), std) in row.iter_mut().zip(mean).zip(std) {
+            *value = (*value - mean) / std;
+        }
+    }
+}
+
+/// The inverse of [`normalise`].
+pub fn denormalise(rows: &mut [f32], mean: &[f32], std: &[f32]) {
+    for row in rows.chunks_exact_mut(mean.len()) {
+        for ((value, mean), std) in row.iter_mut().zip(mean).zip(std) {
+            *value = *value * std + mean;
         }
     }
 }

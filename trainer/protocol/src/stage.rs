@@ -42,16 +42,7 @@ pub use evaluation::{Mode, Split};
 pub use flow::FlowSolver;
 pub use frequency::{FrequencyLosses, LowFrequency, Norm, Over, Semantic};
 pub use identity::{Backend, StageIdentity};
-pub use kinds::{
-    Activity, ClipIds, ClipOutput, ControlDistance, ControlFeedback, ControlLoss, ControlMean, DataFeatures, DataOpen,
-    DataSynthetic, DistillDiscord, DistillLcm, DistillPcm, EncodeLatents, EncodeTokens, EvaluateControl,
-    EvaluateLatentFid, EvaluateRecognition, EvaluateReconstruction, EvaluateSpectrum, EvaluateT2m, EvaluatorNetwork,
-    FlowBackbone, FlowNetwork, FlowPrediction, FlowProjection, ImportEvaluator, ImportModel, ImportedPart, MdmNetwork,
-    ModelDecoder, MovementPhase, MultiModality, Promote, Register, Resets, Splits, StableMoFusionNetwork,
-    StageSettings, TextActivation, TextEmbed, TextEncoder, TokenGenerator, TokenNetwork, TokenizerLoss,
-    TokenizerNetwork, TrainControl, TrainDiscord, TrainEvaluator, TrainLength, TrainMdm, TrainMld, TrainStableMoFusion,
-    TrainTokenizer, TrainTokens, TrainVae, UpAxis, VaeLoss, Windows, WindowsOf,
-};
+pub use kinds::*;
 pub use neighbours::{Neighbour, Neighbours};
 pub use network::{LatentShape, Network, Positions};
 pub use placement::{CheckpointPolicy, Keep, Placement, WorkerRange};

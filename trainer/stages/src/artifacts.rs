@@ -382,6 +382,12 @@ impl Tensors {
         self
     }
 
+    /// Adds an f32 tensor of rows of `width` values.
+    #[must_use]
+    pub fn with_rows(self, name: &str, width: usize, values: Vec<f32>) -> Self {
+        self.with(name, [values.len() / width, width], values)
+    }
+
     /// Adds an i64 tensor.
     #[must_use]
     pub fn with_integers(mut self, name: &str, shape: impl Into<Vec<usize>>, values: Vec<i64>) -> Self {

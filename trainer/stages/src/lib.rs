@@ -17,4 +17,5 @@ pub mod parts;
 pub mod published;
 pub mod run;
 mod shards;
+mod stand_in;
 pub mod train;

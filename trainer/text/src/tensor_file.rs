@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use half::{bf16, f16};
 use protocol::json_mistake;
 use safetensors::tensor::{Dtype, Metadata, TensorInfo};
 
@@ -59,25 +60,10 @@ pub fn widen(element: Element, bytes: &[u8], out: &mut [f32]) {
         Element::F32 => {
             out.iter_mut().zip(bytes.as_chunks::<4>().0).for_each(|(out, b)| *out = f32::from_le_bytes(*b));
         }
-        Element::F16 => out.iter_mut().zip(halves()).for_each(|(out, half)| *out = from_half(half)),
+        Element::F16 => out.iter_mut().zip(halves()).for_each(|(out, half)| *out = f16::from_bits(half).to_f32()),
         Element::Bf16 => {
-            out.iter_mut().zip(halves()).for_each(|(out, half)| *out = f32::from_bits(u32::from(half) << 16));
+            out.iter_mut().zip(halves()).for_each(|(out, half)| *out = bf16::from_bits(half).to_f32());
         }
-    }
-}
-
-/// Converts IEEE's 16 bits to 32, exactly.
-fn from_half(bits: u16) -> f32 {
-    let sign = u32::from(bits >> 15) << 31;
-    let (exponent, fraction) = (u32::from(bits >> 10 & 0x1f), u32::from(bits & 0x3ff));
-    match exponent {
-        // A subnormal number, a multiple of 2^-24.
-        0 => {
-            let size = fraction as f32 * f32::from_bits(103 << 23);
-            f32::from_bits(size.to_bits() | sign)
-        }
-        31 => f32::from_bits(sign | 0xff << 23 | fraction << 13),
-        _ => f32::from_bits(sign | (exponent + 112) << 23 | fraction << 13),
     }
 }
 
@@ -219,10 +205,13 @@ pub(crate) mod tests {
             (0x83ff, -1023.0 * 2.0_f32.powi(-24)),
             (0x7c00, f32::INFINITY),
         ] {
-            assert_eq!(from_half(bits).to_bits(), value.to_bits(), "{bits:#x}");
+            let mut out = [1.0];
+            widen(Element::F16, &bits.to_le_bytes(), &mut out);
+            assert_eq!(out[0].to_bits(), value.to_bits(), "{bits:#x}");
         }
-        assert!(from_half(0x7e01).is_nan());
         let mut out = [0.0; 2];
+        widen(Element::F16, &[0x01, 0x7e, 0, 0], &mut out);
+        assert!(out[0].is_nan());
         widen(Element::Bf16, &[0x80, 0x3f, 0x49, 0xc0], &mut out);
         assert_eq!(out, [1.0, -3.140_625]);
     }

@@ -6,6 +6,7 @@
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
+use data_encoding::BASE64_NOPAD;
 use protocol::{excerpt, json_mistake, limits};
 use serde::de::{MapAccess, SeqAccess, Visitor};
 use serde::{Deserialize, Deserializer};
@@ -285,7 +286,7 @@ fn check_normalizer(step: &Value, met: &mut (usize, usize)) -> Result<(), String
 /// Checks SentencePiece's table in base64: the bytes of a trie of 32-bit units, the trie, and zero-terminated texts.
 fn check_character_map(text: &str) -> Result<(), String> {
     let broken = || "`precompiled_charsmap` of `normalizer` is damaged".to_owned();
-    let bytes = from_base64(text).ok_or_else(broken)?;
+    let bytes = BASE64_NOPAD.decode(text.trim_end_matches('=').as_bytes()).map_err(|_| broken())?;
     let (head, rest) = bytes.split_first_chunk::<4>().ok_or_else(broken)?;
     let trie = u32::from_le_bytes(*head) as usize;
     if !trie.is_multiple_of(4) || trie > rest.len() {
@@ -298,30 +299,6 @@ fn check_character_map(text: &str) -> Result<(), String> {
         ));
     }
     Ok(())
-}
-
-fn from_base64(text: &str) -> Option<Vec<u8>> {
-    let text = text.trim_end_matches('=');
-    let mut out = Vec::with_capacity(text.len() / 4 * 3 + 3);
-    let (mut bits, mut held) = (0_u32, 0);
-    for c in text.bytes() {
-        let value = match c {
-            b'A'..=b'Z' => c - b'A',
-            b'a'..=b'z' => c - b'a' + 26,
-            b'0'..=b'9' => c - b'0' + 52,
-            b'+' => 62,
-            b'/' => 63,
-            _ => return None,
-        };
-        bits = bits << 6 | u32::from(value);
-        held += 6;
-        if held >= 8 {
-            held -= 8;
-            out.push((bits >> held) as u8);
-            bits &= (1 << held) - 1;
-        }
-    }
-    Some(out)
 }
 
 /// Makes CLIP's `tokenizer.json` from its `vocab.json` and `merges.txt`, for folders without one.

@@ -326,7 +326,9 @@ impl<S: StageSpec> AnySpec for S {
 
 /// Generates [`StageSettings`] from the list of kinds. The kind's own file holds everything else.
 macro_rules! stage_kinds {
-    ($($name:ident,)*) => {
+    ($($file:ident: $name:ident,)*) => {
+        $(pub use $file::*;)*
+
         /// Settings of a stage of any kind. The kind's name is beside them as `kind`, in YAML as in JSON.
         #[derive(Debug, Clone, PartialEq)]
         pub enum StageSettings {

@@ -11,13 +11,13 @@ use motion::dataset::{Dataset, crop};
 use motion::features::recover_joints;
 use motion::random::permutation;
 use motion::{Skeleton, Stream};
-use protocol::stage::{Sampler, Split};
+use protocol::stage::Split;
 use protocol::{ArtifactKind, Digest, Seed};
+use serde_json::{Value, json};
 
-use super::report::no_entries;
+use super::report::{Repeats, joined, no_entries, publish_illustrated};
 use crate::artifacts::{self, word};
-use crate::context::{AttemptContext, StageError};
-use crate::generate::generator::{self, MotionGenerator};
+use crate::context::{AttemptContext, Outcome, StageError};
 use crate::metrics::frechet::Gaussian;
 use crate::metrics::retrieval::in_groups;
 use crate::metrics::{skating, spread};
@@ -25,8 +25,6 @@ use crate::parts::evaluator::TrainedEvaluator;
 
 /// Number of motions computed together.
 pub(crate) const BLOCK: usize = 32;
-/// Size of the pool in which a caption's own motion is ranked.
-pub(crate) const POOL: usize = 32;
 /// Motions per dimension below which FID's covariances are unreliable.
 const FEW: usize = 5;
 
@@ -36,7 +34,21 @@ pub(crate) struct Draw {
     pub(crate) entry: usize,
     pub(crate) caption: usize,
     pub(crate) start: usize,
+    /// Number of frames of the crop.
     pub(crate) len: usize,
+    /// Number of the entry in its split, and the repeat: they key the other draws of this motion.
+    pub(crate) number: usize,
+    pub(crate) repeat: usize,
+}
+
+/// Rules for ranking a motion among those of other captions.
+pub(crate) struct Ranking<'a> {
+    /// Sizes of the pools.
+    pub(crate) pools: &'a [usize],
+    /// Number of entries that a repeat measures.
+    pub(crate) kept: usize,
+    /// True if the captions are assigned at random.
+    pub(crate) shuffled: bool,
 }
 
 /// The entries of a split, and their evaluator.
@@ -48,29 +60,31 @@ pub(crate) struct EntryDraws {
     pub(crate) evaluator: Digest,
     /// The split of the entries.
     pub(crate) split: Split,
+    /// Size of the largest pool.
+    pool: usize,
 }
 
 impl EntryDraws {
-    /// Reads the inputs `dataset` and `evaluator`.
+    /// Reads the inputs `dataset` and `evaluator`. The split needs as many entries as a pool; `smaller` says in the
+    /// error how pools become smaller.
     pub(crate) fn read(
         cx: &dyn AttemptContext,
         split: Split,
         all_if_small: bool,
-        repeats: usize,
+        (pool, smaller): (usize, &str),
     ) -> Result<Self, StageError> {
         let blobs = cx.blobs();
-        let refuse = |text: String| Err(StageError::Input(text));
         let dataset = artifacts::input_dataset(cx)?;
         let (evaluator, manifest) = artifacts::input(cx, "evaluator", ArtifactKind::Evaluator)?;
         let trained = TrainedEvaluator::read(&*blobs, &manifest, &cx.device())?;
         let (mut entries, mut taken) = (dataset.entries_of(split), split);
-        if all_if_small && entries.len() < POOL {
+        if all_if_small && entries.len() < pool {
             (entries, taken) = (dataset.entries_of(Split::All), Split::All);
         }
         if entries.is_empty() {
             return Err(no_entries(taken));
         }
-        if entries.len() < POOL {
+        if entries.len() < pool {
             let instead = match taken {
                 Split::All => "the dataset has no more",
                 Split::Test => "set `split: all`, or `all_if_small: true`",
@@ -78,17 +92,14 @@ impl EntryDraws {
                     "set `split: all`, `split: test` (for final results only) or `all_if_small: true`"
                 }
             };
-            return refuse(format!(
-                "the split `{}` has {} entries, but R-precision needs pools of {POOL}; {instead}",
+            return Err(StageError::Input(format!(
+                "the split `{}` has {} entries, but R-precision needs pools of {pool}; {instead}{smaller}",
                 word(&taken),
                 entries.len()
-            ));
+            )));
         }
         trained.check(&dataset, &entries)?;
-        if repeats == 0 {
-            return refuse("`repeats` is 0; expected at least 1".into());
-        }
-        Ok(Self { seed: cx.task().seed, dataset, entries, split: taken, trained, evaluator })
+        Ok(Self { seed: cx.task().seed, dataset, entries, split: taken, trained, evaluator, pool })
     }
 
     pub(crate) fn stream(&self, what: &str, repeat: usize, index: usize) -> Stream {
@@ -107,7 +118,7 @@ impl EntryDraws {
         let mut stream = self.stream(if main { "entry" } else { "other" }, repeat, i);
         let caption = entry.captions[stream.below(entry.captions.len())];
         let (start, len) = crop(&mut stream, entry.len, self.dataset.skeleton());
-        Draw { entry: self.entries[i], caption, start, len }
+        Draw { entry: self.entries[i], caption, start, len, number: i, repeat }
     }
 
     pub(crate) fn blocks(&self) -> usize {
@@ -125,76 +136,90 @@ impl EntryDraws {
         rows[draw.start * width..(draw.start + draw.len) * width].to_vec()
     }
 
-    /// Opens the model to be measured, and checks its format and sampler.
-    pub(crate) fn open(
-        &self,
-        cx: &dyn AttemptContext,
-        sampler: &Sampler,
-    ) -> Result<Box<dyn MotionGenerator>, StageError> {
-        let (_, manifest) = artifacts::input(cx, "model", ArtifactKind::Model)?;
-        let generator = generator::open(&manifest, &*cx.blobs(), &cx.device())?;
-        let (ours, theirs) = (generator.format(), self.dataset.format);
-        if ours != theirs {
-            return Err(StageError::Input(format!(
-                "`model` generates motions in format `{}`, but the dataset has format `{}`; use a dataset in the \
-                 model's format",
-                ours.name(),
-                theirs.name()
-            )));
-        }
-        generator::check_sampler(&*generator, sampler)?;
-        Ok(generator)
-    }
-
     /// FID, R-precision, MM-Dist and diversity of one repeat from embeddings of captions, motions and real crops, one
-    /// row per entry. `shuffled` assigns the captions at random.
+    /// row per entry.
     pub(crate) fn in_space(
         &self,
         repeat: usize,
         (text, made, real): (&[f64], &[f64], &[f64]),
-        shuffled: bool,
-    ) -> BTreeMap<&'static str, f64> {
+        ranking: &Ranking<'_>,
+    ) -> BTreeMap<String, f64> {
         let (width, n) = (self.trained.width(), self.entries.len());
+        // Entries that do not fill a pool are at the end of its permutation.
         let pools = self.order("pools", repeat, n);
-        let dealt = if shuffled { self.order("shuffled", repeat, n) } else { pools.clone() };
-        let found = in_groups(&reorder(text, &dealt, width), &reorder(made, &pools, width), width, POOL);
-        let pairs = spread::DIVERSITY_PAIRS.min(n);
-        let drawn = |what: &str| -> Vec<usize> {
-            self.order(what, repeat, n).into_iter().take(pairs).map(|i| i as usize).collect()
-        };
-        BTreeMap::from([
-            ("fid", Gaussian::fit(real, width).distance(&Gaussian::fit(made, width)).max(0.0)),
-            ("r_precision_top1", found.top[0]),
-            ("r_precision_top2", found.top[1]),
-            ("r_precision_top3", found.top[2]),
-            ("mm_dist", found.matching_score),
-            ("diversity", spread::diversity(made, width, &drawn("diversity 1"), &drawn("diversity 2"))),
-        ])
+        let dealt = if ranking.shuffled { self.order("shuffled", repeat, n) } else { pools.clone() };
+        let text = reorder(text, &dealt[..ranking.kept], width);
+        let ranked = reorder(made, &pools[..ranking.kept], width);
+        let mut metrics = BTreeMap::new();
+        for (i, pool) in ranking.pools.iter().enumerate() {
+            let suffix = if i == 0 { String::new() } else { format!("_pool{pool}") };
+            let found = in_groups(&text, &ranked, width, *pool);
+            for (k, top) in found.top.into_iter().enumerate() {
+                metrics.insert(format!("r_precision_top{}{suffix}", k + 1), top);
+            }
+            metrics.insert(format!("mm_dist{suffix}"), found.matching_score);
+        }
+        let rows = self.kept(repeat, ranking.kept);
+        let (made, real) = (reorder(made, &rows, width), reorder(real, &rows, width));
+        let pairs = spread::DIVERSITY_PAIRS.min(rows.len());
+        let [first, second] = ["diversity 1", "diversity 2"].map(|what| self.some(what, repeat, rows.len(), pairs));
+        metrics.insert("fid".to_owned(), Gaussian::fit(&real, width).distance(&Gaussian::fit(&made, width)).max(0.0));
+        metrics.insert("diversity".to_owned(), spread::diversity(&made, width, &first, &second));
+        metrics
     }
 
-    /// A warning if FID is unreliable with so few motions.
-    pub(crate) fn few(&self) -> Option<String> {
-        let (samples, width) = (self.entries.len(), self.trained.width());
-        (samples < FEW * width).then(|| {
+    /// Numbers of the `count` entries that a repeat measures, in their order in the split.
+    pub(crate) fn kept(&self, repeat: usize, count: usize) -> Vec<u32> {
+        let mut rows = self.order("pools", repeat, self.entries.len());
+        rows.truncate(count);
+        rows.sort_unstable();
+        rows
+    }
+
+    /// The first `count` items of a permutation of `n`.
+    pub(crate) fn some(&self, what: &str, repeat: usize, n: usize, count: usize) -> Vec<usize> {
+        self.order(what, repeat, n).into_iter().take(count).map(|i| i as usize).collect()
+    }
+
+    /// Uploads the report of `samples` motions a repeat, and ends the stage; `asked` is the split of the settings, and
+    /// `meta` and `details` are the kind's own.
+    pub(crate) fn publish(
+        &self,
+        cx: &mut dyn AttemptContext,
+        asked: Split,
+        samples: usize,
+        (mut metrics, repeats): (BTreeMap<String, f64>, Repeats),
+        (meta, details): (Value, Value),
+    ) -> Result<Outcome, StageError> {
+        let (entries, width) = (self.entries.len(), self.trained.width());
+        let few = (samples < FEW * width).then(|| {
             format!(
                 "FID is taken of {samples} motions in {width} dimensions; it is then larger than of many, and compares \
                  only with FIDs of as many motions in the same evaluator"
             )
-        })
-    }
-
-    /// Logs what a reader of the metrics needs: the split, and warnings about it.
-    pub(crate) fn log(&self, cx: &mut dyn AttemptContext, asked: Split) {
-        if let Some(few) = self.few() {
-            cx.log(&few);
-        }
+        });
+        few.iter().for_each(|few| cx.log(few));
         if self.split != asked {
             cx.log(&format!(
-                "the split `{}` is too small for pools of {POOL}; all {} entries are measured",
+                "the split `{}` is too small for pools of {}; all {entries} entries are measured",
                 word(&asked),
-                self.entries.len()
+                self.pool
             ));
         }
+        metrics.insert("samples".to_owned(), samples as f64);
+        let common = json!({
+            "split": self.split,
+            "evaluator": self.evaluator,
+            "words": self.trained.meta().words,
+        });
+        let common_details = json!({
+            "split": self.split,
+            "seed": self.seed,
+            "samples_per_repeat": samples,
+            "note": few,
+            "repeats": repeats,
+        });
+        publish_illustrated(cx, metrics, joined(common, meta), joined(common_details, details), vec![])
     }
 }
 
@@ -205,17 +230,7 @@ pub(crate) fn skates(features: &[f32], skeleton: &Skeleton) -> f32 {
     skating::ratio(&metres, skeleton.joints, skating::feet(skeleton.format), skeleton.fps) as f32
 }
 
-/// Refuses metrics that are not finite.
-pub(crate) fn finite(metrics: &BTreeMap<String, f64>) -> Result<(), StageError> {
-    match metrics.iter().find(|(_, value)| !value.is_finite()) {
-        Some((name, value)) => Err(StageError::Input(format!(
-            "`{name}` is {value}: the embeddings are not finite; train the evaluator again"
-        ))),
-        None => Ok(()),
-    }
-}
-
 /// Reorders the rows of `values` by `rows`.
-fn reorder(values: &[f64], rows: &[u32], width: usize) -> Vec<f64> {
+pub(crate) fn reorder(values: &[f64], rows: &[u32], width: usize) -> Vec<f64> {
     rows.iter().flat_map(|row| values[*row as usize * width..(*row as usize + 1) * width].iter().copied()).collect()
 }

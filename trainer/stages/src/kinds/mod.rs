@@ -3,7 +3,8 @@
 //!
 //! Not its job: helpers of several kinds. `train`, `evaluation` and `shards` have those.
 
-use protocol::stage::StageSettings;
+use protocol::Digest;
+use protocol::stage::{Split, StageSettings};
 
 use crate::context::{AttemptContext, GangContext, Outcome, Part, StageError};
 
@@ -77,6 +78,31 @@ pub fn run_gang(cx: &mut dyn GangContext) -> Result<Outcome, StageError> {
     }
 }
 
+/// Makes a placeholder of the stage's output for an estimate, if its kind has one.
+pub(crate) fn stand_in(settings: &StageSettings, cx: &mut dyn AttemptContext) -> Option<Result<Digest, StageError>> {
+    match runner(settings)? {
+        Stage::Plain(stage) => stage.stand_in(cx),
+        Stage::Map(stage) => stage.stand_in(cx),
+        Stage::Gang(_) => None,
+    }
+}
+
+/// The settings that an estimate runs untimed in place of these, if there are any.
+pub(crate) fn cheaper(settings: &StageSettings) -> Option<StageSettings> {
+    match runner(settings)? {
+        Stage::Map(stage) => stage.cheaper(),
+        Stage::Plain(_) | Stage::Gang(_) => None,
+    }
+}
+
+/// The number of times that the stage repeats the work which an estimate times.
+pub(crate) fn repetitions(settings: &StageSettings, entries: &dyn Fn(Split) -> f64) -> f64 {
+    match runner(settings) {
+        Some(Stage::Map(stage)) => stage.repetitions(entries),
+        _ => entries(Split::All),
+    }
+}
+
 fn misplaced(settings: &StageSettings, how: &str) -> StageError {
     StageError::Fault(format!("stage kind `{}` does not run {how}", settings.kind()))
 }
@@ -86,6 +112,17 @@ mod tests {
     use protocol::stage::Shape;
 
     use super::*;
+
+    #[test]
+    fn every_kind_is_in_the_file_of_its_name() {
+        let folder = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("src/kinds");
+        for settings in StageSettings::all().iter().filter(|settings| settings.shape() != Shape::Registry) {
+            let file = folder.join(format!("{}.rs", settings.kind().replace('.', "/")));
+            let text = std::fs::read_to_string(&file).unwrap_or_default();
+            let begin = format!("//! `{}`", settings.kind());
+            assert!(text.starts_with(&begin), "{} does not begin with {begin}", file.display());
+        }
+    }
 
     #[test]
     fn every_kind_has_a_runner_of_its_shape() {

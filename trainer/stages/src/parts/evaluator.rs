@@ -11,6 +11,7 @@ use models::flat::Entry;
 use models::names::save;
 use models::networks::{Evaluator, EvaluatorConfig, Init};
 use motion::Skeleton;
+use motion::dataset::normalise;
 use motion::dataset::{Caption, Dataset, statistics};
 use protocol::stage::{DataFormat, EvaluatorNetwork, Positions};
 use protocol::{ArtifactKind, Digest, Manifest, Seed};
@@ -66,15 +67,6 @@ pub fn publish(
     weights::add(&mut draft, (entries, values))?;
     words.write(&mut draft)?;
     draft.finish(cx)
-}
-
-/// Computes `(x - mean) / std` on rows in place.
-pub fn normalise(rows: &mut [f32], mean: &[f32], std: &[f32]) {
-    for row in rows.chunks_exact_mut(mean.len()) {
-        for ((value, mean), std) in row.iter_mut().zip(mean).zip(std) {
-            *value = (*value - mean) / std;
-        }
-    }
 }
 
 /// A trained evaluator.

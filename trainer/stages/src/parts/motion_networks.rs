@@ -17,6 +17,7 @@ use models::diffusion::{
 use models::kernels::Dropout;
 use models::names::load;
 use models::networks::{Init, Mdm, MdmConfig, StableMoFusion, StableMoFusionConfig, TokenCondition};
+use motion::dataset::denormalise;
 use protocol::stage::{DataFormat, Diffusion, Family, MdmNetwork, Positions, Sampler, Solver, StableMoFusionNetwork};
 use protocol::{Manifest, Seed};
 use serde::{Deserialize, Serialize};
@@ -287,7 +288,7 @@ impl MotionDenoiser {
         let values = drawn.into_data().try_into_vec::<f32>().expect("networks compute in f32");
         let mut motions: Vec<Vec<f32>> =
             values.chunks_exact(whole * width).map(|motion| motion[..frames * width].to_vec()).collect();
-        motions.iter_mut().for_each(|motion| self.denormalise(motion));
+        motions.iter_mut().for_each(|motion| denormalise(motion, &self.meta.mean, &self.meta.std));
         motions
     }
 
@@ -333,13 +334,5 @@ impl MotionDenoiser {
                 return Err(StageError::Input(format!("this model has no solver `{}`", drawing.sampler.solver.name())));
             }
         })
-    }
-
-    fn denormalise(&self, rows: &mut [f32]) {
-        for row in rows.chunks_exact_mut(self.meta.mean.len()) {
-            for ((value, mean), std) in row.iter_mut().zip(&self.meta.mean).zip(&self.meta.std) {
-                *value = *value * std + mean;
-            }
-        }
     }
 }

@@ -13,6 +13,7 @@ use models::diffusion::{
 use models::kernels::Dropout;
 use models::networks::{self, Control, DenoiserConfig, Init, POSITIONS, Vae, VaeConfig, guidance_embedding};
 use motion::Stream;
+use motion::dataset::{denormalise, normalise};
 use protocol::stage::{DataFormat, Family, Positions, Sampler, Solver};
 use protocol::{Manifest, Seed};
 
@@ -138,20 +139,12 @@ impl Autoencoder {
 
     /// Computes `(x - mean) / std` with the statistics of the training data, in place.
     pub fn normalise(&self, rows: &mut [f32]) {
-        for row in rows.chunks_exact_mut(self.meta.features) {
-            for ((value, mean), std) in row.iter_mut().zip(&self.meta.mean).zip(&self.meta.std) {
-                *value = (*value - mean) / std;
-            }
-        }
+        normalise(rows, &self.meta.mean, &self.meta.std);
     }
 
     /// The inverse of [`normalise`](Self::normalise).
     pub fn denormalise(&self, rows: &mut [f32]) {
-        for row in rows.chunks_exact_mut(self.meta.features) {
-            for ((value, mean), std) in row.iter_mut().zip(&self.meta.mean).zip(&self.meta.std) {
-                *value = *value * std + mean;
-            }
-        }
+        denormalise(rows, &self.meta.mean, &self.meta.std);
     }
 
     /// Encodes clips of one length as posteriors: `rows` are `[batch, frames, D]`, normalised.

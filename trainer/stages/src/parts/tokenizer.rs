@@ -10,6 +10,7 @@ use models::kernels::Dropout;
 use models::names::from_bytes;
 use models::networks::{Init, Tokenizer, TokenizerConfig};
 use models::quantizer::{Pass, look_up};
+use motion::dataset::{denormalise, normalise};
 use protocol::stage::{DataFormat, Positions, TokenizerNetwork};
 use protocol::{ArtifactKind, Digest, Manifest, Seed};
 use serde::{Deserialize, Serialize};
@@ -134,20 +135,12 @@ impl TrainedTokenizer {
 
     /// Computes `(x - mean) / std` with the statistics of the training data, in place.
     pub fn normalise(&self, rows: &mut [f32]) {
-        for row in rows.chunks_exact_mut(self.meta.features) {
-            for ((value, mean), std) in row.iter_mut().zip(&self.meta.mean).zip(&self.meta.std) {
-                *value = (*value - mean) / std;
-            }
-        }
+        normalise(rows, &self.meta.mean, &self.meta.std);
     }
 
     /// The inverse of [`normalise`](Self::normalise).
     pub fn denormalise(&self, rows: &mut [f32]) {
-        for row in rows.chunks_exact_mut(self.meta.features) {
-            for ((value, mean), std) in row.iter_mut().zip(&self.meta.mean).zip(&self.meta.std) {
-                *value = *value * std + mean;
-            }
-        }
+        denormalise(rows, &self.meta.mean, &self.meta.std);
     }
 
     /// Encodes one motion of at least 4 normalised rows `[frames, features]` as ids `[frames / 4, Q]`.

@@ -45,6 +45,23 @@ pub struct Checkpoint {
     weights: Weights,
 }
 
+/// A published network in files.
+#[derive(Debug, Clone, Copy)]
+pub struct Place {
+    /// Its name in errors.
+    pub what: &'static str,
+    /// Prefixes that its names may have, in the order of preference.
+    pub prefixes: &'static [&'static str],
+    /// A name that all variants have.
+    pub marker: &'static str,
+}
+
+impl Place {
+    const fn new(what: &'static str, prefixes: &'static [&'static str], marker: &'static str) -> Self {
+        Self { what, prefixes, marker }
+    }
+}
+
 /// A network's tensors in a file.
 #[derive(Debug, Clone)]
 pub struct Found<'a> {
@@ -79,26 +96,32 @@ impl Checkpoint {
         Ok(found)
     }
 
-    /// Finds the network `what` by its tensor `marker`, with one of the prefixes `places`.
+    /// Finds a network.
     ///
     /// # Errors
     /// If there is none; the message lists the networks in the file.
-    pub fn network(&self, what: &str, places: &[&str], marker: &str) -> Result<Found<'_>, StageError> {
-        self.find(places, marker).ok_or_else(|| {
+    pub fn network(&self, place: &Place) -> Result<Found<'_>, StageError> {
+        self.find(place.prefixes, place.marker).ok_or_else(|| {
             let groups = self.groups(|_| true);
             let has = match groups.is_empty() {
                 true => "no weights".to_owned(),
                 false => format!("`{}`", excerpts(groups.keys().map(String::as_str), SHOWN)),
             };
+            let Place { what, marker, .. } = place;
             self.refuse(format!("it has no {what}: the tensor `{marker}` is missing; it has {has}"))
         })
     }
 
-    /// Like [`network`](Self::network), or `None` if the file has no such network.
-    pub fn find(&self, places: &[&str], marker: &str) -> Option<Found<'_>> {
-        let is_there = |place: &&&str| self.weights.tensors().contains_key(&format!("{place}{marker}"));
-        let place = places.iter().find(is_there)?;
-        Some(Found { checkpoint: self, prefix: (*place).to_owned() })
+    /// Finds a network beside others in one file; `None` if there is none. Only the first two prefixes count, because
+    /// other networks have the same names without a prefix of their own.
+    pub fn beside(&self, place: &Place) -> Option<Found<'_>> {
+        self.find(&place.prefixes[..2], place.marker)
+    }
+
+    fn find(&self, prefixes: &[&str], marker: &str) -> Option<Found<'_>> {
+        let is_there = |prefix: &&&str| self.weights.tensors().contains_key(&format!("{prefix}{marker}"));
+        let prefix = prefixes.iter().find(is_there)?;
+        Some(Found { checkpoint: self, prefix: (*prefix).to_owned() })
     }
 
     /// Summarises the names that are not in `read`, such as `t2m_textencoder (19)`; `None` if all were read.

@@ -10,7 +10,7 @@ use models::networks::{
 use protocol::limits;
 use protocol::stage::{Network, Positions};
 
-use super::{Checkpoint, Found};
+use super::{Found, Place};
 use crate::context::StageError;
 
 /// Added to variances in layer norms.
@@ -25,82 +25,40 @@ const DEPTH: usize = 16;
 
 type Result<T> = std::result::Result<T, StageError>;
 
-/// Finds MLD's or MotionLCM's VAE.
-pub fn vae(file: &Checkpoint) -> Result<Found<'_>> {
-    file.network("VAE", &VAE, VAE_MARKER)
-}
-
-/// Like [`vae`], or `None` if the file has none.
-pub fn find_vae(file: &Checkpoint) -> Option<Found<'_>> {
-    // Without a prefix other networks have these names too.
-    file.find(&VAE[..2], VAE_MARKER)
-}
-
-const VAE: [&str; 4] = ["state_dict.vae.", "vae.", "state_dict.", ""];
-const VAE_MARKER: &str = "query_pos_decoder.pe";
-
-/// Finds MLD's or MotionLCM's denoiser.
-pub fn denoiser(file: &Checkpoint) -> Result<Found<'_>> {
-    file.network("denoiser", &DENOISER, DENOISER_MARKER)
-}
-
-/// Like [`denoiser`], or `None` if the file has none.
-pub fn find_denoiser(file: &Checkpoint) -> Option<Found<'_>> {
-    file.find(&DENOISER[..2], DENOISER_MARKER)
-}
-
-const DENOISER: [&str; 4] = ["state_dict.denoiser.", "denoiser.", "state_dict.", ""];
-const DENOISER_MARKER: &str = "time_embedding.linear_1.weight";
-
-/// Finds MotionLCM's ControlNet.
-pub fn controlnet(file: &Checkpoint) -> Result<Found<'_>> {
-    file.network("ControlNet", &["state_dict.controlnet.", "controlnet."], "controlnet_cond_embedding.0.weight")
-}
-
-/// Finds MotionLCM's trajectory encoder.
-pub fn trajectory_encoder(file: &Checkpoint) -> Result<Found<'_>> {
-    file.network("trajectory encoder", &["state_dict.traj_encoder.", "traj_encoder."], "skel_embedding.weight")
-}
-
-/// Finds the tokenizer of T2M-GPT, MMM or MoMask.
-pub fn tokenizer(file: &Checkpoint) -> Result<Found<'_>> {
-    let places = ["vq_model.", "net.vqvae.", "net.", "vqvae.", "tokenizer.", ""];
-    file.network("tokenizer", &places, "encoder.model.0.weight")
-}
-
-/// Finds MoMask's masked transformer.
-pub fn masked(file: &Checkpoint) -> Result<Found<'_>> {
-    file.network(
-        "masked transformer",
-        &["t2m_transformer.", "trans.", "mask.", "generator.mask.", ""],
-        "token_emb.weight",
-    )
-}
-
-/// Finds MoMask's residual transformer.
-pub fn residual(file: &Checkpoint) -> Result<Found<'_>> {
-    file.network("residual transformer", &["res_transformer.", "res.", "generator.res.", ""], "quant_emb.weight")
-}
-
-/// Finds T2M-GPT's transformer.
-pub fn gpt(file: &Checkpoint) -> Result<Found<'_>> {
-    file.network("transformer of T2M-GPT", &["trans.", "generator.", ""], "trans_base.tok_emb.weight")
-}
-
-/// Finds MMM's transformer.
-pub fn mmm(file: &Checkpoint) -> Result<Found<'_>> {
-    file.network("transformer of MMM", &["trans.", "generator.", ""], "trans_base.learn_tok_emb.weight")
-}
-
-/// Finds MDM, preferring the average of its weights.
-pub fn mdm(file: &Checkpoint) -> Result<Found<'_>> {
-    file.network("MDM", &["model_avg.", "model.", "state_dict.", "denoiser.", ""], "embed_timestep.time_embed.0.weight")
-}
-
-/// Finds DisCoRD's U-Net.
-pub fn unet(file: &Checkpoint) -> Result<Found<'_>> {
-    file.network("U-Net of DisCoRD", &["", "state_dict.", "model.", "decoder."], "net.init_proj.weight")
-}
+/// MLD's or MotionLCM's VAE.
+pub const VAE: Place = Place::new("VAE", &["state_dict.vae.", "vae.", "state_dict.", ""], "query_pos_decoder.pe");
+/// MLD's or MotionLCM's denoiser.
+pub const DENOISER: Place =
+    Place::new("denoiser", &["state_dict.denoiser.", "denoiser.", "state_dict.", ""], "time_embedding.linear_1.weight");
+/// MotionLCM's ControlNet.
+pub const CONTROLNET: Place =
+    Place::new("ControlNet", &["state_dict.controlnet.", "controlnet."], "controlnet_cond_embedding.0.weight");
+/// MotionLCM's trajectory encoder.
+pub const TRAJECTORY_ENCODER: Place =
+    Place::new("trajectory encoder", &["state_dict.traj_encoder.", "traj_encoder."], "skel_embedding.weight");
+/// The tokenizer of T2M-GPT, MMM or MoMask.
+pub const TOKENIZER: Place =
+    Place::new("tokenizer", &["vq_model.", "net.vqvae.", "net.", "vqvae.", "tokenizer.", ""], "encoder.model.0.weight");
+/// MoMask's masked transformer.
+pub const MASKED: Place = Place::new(
+    "masked transformer",
+    &["t2m_transformer.", "trans.", "mask.", "generator.mask.", ""],
+    "token_emb.weight",
+);
+/// MoMask's residual transformer.
+pub const RESIDUAL: Place =
+    Place::new("residual transformer", &["res_transformer.", "res.", "generator.res.", ""], "quant_emb.weight");
+/// T2M-GPT's transformer.
+pub const GPT: Place = Place::new("transformer of T2M-GPT", &["trans.", "generator.", ""], "trans_base.tok_emb.weight");
+/// MMM's transformer.
+pub const MMM: Place =
+    Place::new("transformer of MMM", &["trans.", "generator.", ""], "trans_base.learn_tok_emb.weight");
+/// MDM, of which the average of the weights is preferred.
+pub const MDM: Place =
+    Place::new("MDM", &["model_avg.", "model.", "state_dict.", "denoiser.", ""], "embed_timestep.time_embed.0.weight");
+/// DisCoRD's U-Net.
+pub const UNET: Place =
+    Place::new("U-Net of DisCoRD", &["", "state_dict.", "model.", "decoder."], "net.init_proj.weight");
 
 /// Number of entries in a list of blocks. Refuses more than any network has.
 fn listed(found: &Found<'_>, stem: &str) -> Result<usize> {
@@ -177,7 +135,7 @@ pub fn of_denoiser(found: &Found<'_>, tokens: usize, heads: usize) -> Result<Den
     let projection = found.has("latent_pre.weight");
     let guided = "time_embedding.cond_proj.weight";
     let guidance_dim = if found.has(guided) { Some(found.dim(guided, 1)?) } else { None };
-    let time_dim = found.dim(DENOISER_MARKER, 1)?;
+    let time_dim = found.dim(DENOISER.marker, 1)?;
     // Pairs of a sine and a cosine; the guidance has at least two pairs, since its frequencies divide by their number
     // less one.
     for (what, dim, least) in [("time", time_dim, 2), ("guidance", guidance_dim.unwrap_or(4), 4)] {

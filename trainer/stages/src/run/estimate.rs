@@ -9,8 +9,6 @@
 //!
 //! Not a stage: it reads the clock.
 
-mod stand_in;
-
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -19,14 +17,10 @@ use burn::tensor::Device;
 use checkpoint::Blobs;
 use pipeline::{Pipeline, PipelineStage};
 use protocol::message::StageTask;
-use protocol::stage::{
-    CheckpointPolicy, DataFormat, EncodeLatents, EvaluateLatentFid, EvaluateT2m, ImportEvaluator, Sampler, Shape,
-    Split, StageSettings, TextEmbed, TextEncoder,
-};
+use protocol::stage::{CheckpointPolicy, Sampler, Shape, Split, StageSettings};
 use protocol::{ArtifactKind, Digest, Manifest, RunId, StageName, Steps};
 use serde_json::{Value, json};
 
-use self::stand_in::CLIPS;
 use super::solo::{Overlay, Solo};
 use crate::artifacts::MODEL_FILE;
 use crate::context::{AttemptContext, Outcome, Part, StageError};
@@ -106,24 +100,18 @@ struct Tries<'a> {
 impl Tries<'_> {
     fn stage(&mut self, stage: &PipelineStage) -> Result<Estimate, StageError> {
         let settings = &stage.settings;
-        match settings {
-            StageSettings::Register(_) => return Ok(Estimate::default()),
-            StageSettings::DataOpen(data) => return self.stand_in(stage, |cx| stand_in::dataset(cx, data.format)),
-            StageSettings::DataFeatures(data) => return self.stand_in(stage, |cx| stand_in::dataset(cx, data.format)),
-            StageSettings::DataSynthetic(_) => {
-                return self.stand_in(stage, |cx| stand_in::dataset(cx, DataFormat::Humanml3d));
-            }
-            StageSettings::ImportEvaluator(ImportEvaluator { format, .. }) => {
-                return self.stand_in(stage, |cx| stand_in::evaluator(cx, *format));
-            }
-            // Reading published encoders takes longer than everything else here.
-            StageSettings::TextEmbed(text) if text.encoder != TextEncoder::Hashed => {
-                let hashed = TextEmbed { dataset: text.dataset.clone(), ..TextEmbed::default() };
-                let tried = self.run(stage, hashed.into(), self.inputs(stage)?)?;
-                self.outputs.insert(stage.name.clone(), tried.output);
-                return Ok(Estimate::default());
-            }
-            _ => {}
+        if settings.shape() == Shape::Registry {
+            return Ok(Estimate::default());
+        }
+        let made = kinds::stand_in(settings, &mut self.solo(stage, settings.clone(), BTreeMap::new()));
+        if let Some(output) = made {
+            self.outputs.insert(stage.name.clone(), output?);
+            return Ok(Estimate::default());
+        }
+        if let Some(cheaper) = kinds::cheaper(settings) {
+            let tried = self.run(stage, cheaper, self.inputs(stage)?)?;
+            self.outputs.insert(stage.name.clone(), tried.output);
+            return Ok(Estimate::default());
         }
         let inputs = self.inputs(stage)?;
         let tried = |settings: StageSettings| self.run(stage, settings, inputs.clone());
@@ -165,17 +153,6 @@ impl Tries<'_> {
             Ok((input.field.clone(), *self.outputs.get(&input.stage).ok_or_else(untried)?))
         });
         known.collect()
-    }
-
-    fn stand_in(
-        &mut self,
-        stage: &PipelineStage,
-        make: impl FnOnce(&mut dyn AttemptContext) -> Result<Digest, StageError>,
-    ) -> Result<Estimate, StageError> {
-        let mut cx = self.solo(stage, stage.settings.clone(), BTreeMap::new());
-        let output = make(&mut cx)?;
-        self.outputs.insert(stage.name.clone(), output);
-        Ok(Estimate::default())
     }
 
     fn solo(&self, stage: &PipelineStage, settings: StageSettings, inputs: BTreeMap<String, Digest>) -> Solo {
@@ -220,7 +197,7 @@ impl Tries<'_> {
         Ok(Tried { output, pace })
     }
 
-    /// The number of times a map stage repeats the timed work.
+    /// The number of times that the stage repeats the timed work.
     fn units(&self, settings: &StageSettings) -> f64 {
         let settings_json = serde_json::to_value(settings).unwrap_or_default();
         let of = |split: Split| -> f64 {
@@ -228,19 +205,7 @@ impl Tries<'_> {
             let entries = dataset.and_then(|dataset| self.entries.get(&dataset).copied());
             entries.map_or(0, |entries| entries.of(split)) as f64
         };
-        match settings {
-            StageSettings::EncodeLatents(EncodeLatents { crops, .. }) => of(Split::All) * *crops as f64,
-            StageSettings::EvaluateT2m(t2m) => {
-                let EvaluateT2m { repeats, multimodality, split, .. } = t2m;
-                let many = if t2m.generates() { multimodality.captions * multimodality.samples } else { 0 };
-                *repeats as f64 * (of(*split) + many as f64) / CLIPS as f64
-            }
-            StageSettings::EvaluateLatentFid(EvaluateLatentFid { repeats, samples, split, .. }) => {
-                (*repeats * *samples) as f64 * of(*split) / CLIPS as f64
-            }
-            StageSettings::EvaluateReconstruction(reconstruction) => of(reconstruction.split),
-            _ => of(Split::All),
-        }
+        kinds::repetitions(settings, &of)
     }
 
     /// Number of values in the weight files of `output` that are not files of its inputs.

@@ -22,7 +22,7 @@ fn mdm_gives_what_it_was_published_with() {
         let (file, heads) = (folder.join("weights.ckpt"), size(constructor, "num_heads"));
         let features = size(constructor, "njoints");
         let opened = Checkpoint::open(&DataPath::local(&file)).expect("a checkpoint");
-        let found = sizes::mdm(&opened).expect("an MDM");
+        let found = opened.network(&sizes::MDM).expect("an MDM");
         let sizes = sizes::of_mdm(&found, heads).expect("its sizes");
         let text = world.text(size(constructor, "clip_dim"));
         let settings = ImportModel {

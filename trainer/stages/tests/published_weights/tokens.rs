@@ -97,7 +97,7 @@ fn token_generators_give_what_they_were_published_with() {
         assert_eq!(generator.meta["longest"], size(&config, "block_size") - 2);
         world.expect_bits(&generator, &folder.join("weights.safetensors"), &str::to_owned);
         let opened = Checkpoint::open(&DataPath::local(&file)).expect("a checkpoint");
-        let sizes = sizes::of_gpt(&sizes::gpt(&opened).expect("it"), 1, heads).expect("its sizes");
+        let sizes = sizes::of_gpt(&opened.network(&sizes::GPT).expect("it"), 1, heads).expect("its sizes");
         let network = world.load(Gpt::new(&sizes, &mut blank(&device)), &generator, "");
         for case in ["full", "short"] {
             let wanted = io.get(&format!("{case}/logits"));
@@ -132,7 +132,7 @@ fn token_generators_give_what_they_were_published_with() {
         assert!(alone.contains("set `residual`"), "{alone}");
 
         let opened = Checkpoint::open(&DataPath::local(&residual)).expect("a checkpoint");
-        let sizes = sizes::of_residual(&sizes::residual(&opened).expect("it"), heads).expect("its sizes");
+        let sizes = sizes::of_residual(&opened.network(&sizes::RESIDUAL).expect("it"), heads).expect("its sizes");
         let first = world.load(MaskedTransformer::new(&sizes, &mut blank(&device)), &generator, "mask.");
         let above = world.load(ResidualTransformer::new(&sizes, true, &mut blank(&device)), &generator, "res.");
         let (text, lengths) = (io.get("cond").tensor::<2>(&device), io.get("m_lens").usizes());
@@ -152,7 +152,7 @@ fn mmm_is_read_without_the_tokenizer_in_its_file() {
         let mut world = World::new();
         let file = folder.join("weights.safetensors");
         let opened = Checkpoint::open(&DataPath::local(&file)).expect("a checkpoint");
-        let found = sizes::mmm(&opened).expect("it");
+        let found = opened.network(&sizes::MMM).expect("it");
         let sizes = sizes::of_mmm(&found, 1, 1).expect("its sizes");
         let inputs = [("tokenizer", stand_in(&world, sizes.codes, 1, sizes.dim)), ("text", world.text(sizes.text_dim))];
         let ran = world.imported("MMM", &ImportModel { heads: 1, ..part(ImportedPart::Mmm, &file) }, &inputs);
@@ -183,7 +183,7 @@ fn discord_gives_what_it_was_published_with() {
         let decoder = world.manifest(decoder);
         world.expect_bits(&decoder, &folder.join("weights.safetensors"), &str::to_owned);
         let opened = Checkpoint::open(&DataPath::local(&file)).expect("a checkpoint");
-        let sizes = sizes::of_unet(&sizes::unet(&opened).expect("it"), (heads, 32)).expect("its sizes");
+        let sizes = sizes::of_unet(&opened.network(&sizes::UNET).expect("it"), (heads, 32)).expect("its sizes");
         let network = world.load(FlowUnet::new(&sizes, &mut blank(&device)), &decoder, "");
         for case in io.cases() {
             let stored = |part: &str| io.get(&format!("{case}/{part}"));

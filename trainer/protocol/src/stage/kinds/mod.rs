@@ -1,5 +1,5 @@
-//! The list of stage kinds. A kind is its file here, its file in `stages::kinds` that runs it, and a line in each of
-//! the two lists.
+//! The list of stage kinds. A kind is its file here, its file in `stages::kinds` that runs it, and its lines in the two
+//! lists.
 
 mod data_features;
 mod data_open;
@@ -31,66 +31,36 @@ mod train_tokenizer;
 mod train_tokens;
 mod train_vae;
 
-pub use data_features::{DataFeatures, Splits, UpAxis};
-pub use data_open::DataOpen;
-pub use data_synthetic::DataSynthetic;
-pub use distill_discord::DistillDiscord;
-pub use distill_lcm::DistillLcm;
-pub use distill_pcm::DistillPcm;
-pub use encode_latents::EncodeLatents;
-pub use encode_tokens::EncodeTokens;
-pub use evaluate_control::EvaluateControl;
-pub use evaluate_latent_fid::EvaluateLatentFid;
-pub use evaluate_recognition::{Activity, EvaluateRecognition};
-pub use evaluate_reconstruction::EvaluateReconstruction;
-pub use evaluate_spectrum::EvaluateSpectrum;
-pub use evaluate_t2m::{EvaluateT2m, MultiModality};
-pub use import_evaluator::ImportEvaluator;
-pub use import_model::{ImportModel, ImportedPart, TextActivation};
-pub use model_decoder::ModelDecoder;
-pub use register::{Promote, Register};
-pub use text_embed::{ClipIds, ClipOutput, TextEmbed, TextEncoder};
-pub use train_control::{ControlDistance, ControlFeedback, ControlLoss, ControlMean, TrainControl};
-pub use train_discord::{FlowBackbone, FlowNetwork, FlowPrediction, FlowProjection, TrainDiscord};
-pub use train_evaluator::{EvaluatorNetwork, MovementPhase, TrainEvaluator};
-pub use train_length::TrainLength;
-pub use train_mdm::{MdmNetwork, TrainMdm};
-pub use train_mld::TrainMld;
-pub use train_stablemofusion::{StableMoFusionNetwork, TrainStableMoFusion};
-pub use train_tokenizer::{Resets, TokenizerLoss, TokenizerNetwork, TrainTokenizer, WindowsOf};
-pub use train_tokens::{TokenGenerator, TokenNetwork, TrainTokens};
-pub use train_vae::{TrainVae, VaeLoss, Windows};
-
 use super::StageSpec;
 
 super::spec::stage_kinds! {
-    DataOpen,
-    DataSynthetic,
-    DataFeatures,
-    TextEmbed,
-    TrainVae,
-    EncodeLatents,
-    TrainMld,
-    DistillLcm,
-    DistillPcm,
-    EvaluateReconstruction,
-    EvaluateLatentFid,
-    TrainEvaluator,
-    TrainLength,
-    TrainTokenizer,
-    EncodeTokens,
-    TrainTokens,
-    TrainDiscord,
-    DistillDiscord,
-    ModelDecoder,
-    TrainMdm,
-    TrainStableMoFusion,
-    TrainControl,
-    EvaluateControl,
-    EvaluateSpectrum,
-    EvaluateRecognition,
-    ImportEvaluator,
-    ImportModel,
-    EvaluateT2m,
-    Register,
+    data_open: DataOpen,
+    data_synthetic: DataSynthetic,
+    data_features: DataFeatures,
+    text_embed: TextEmbed,
+    train_vae: TrainVae,
+    encode_latents: EncodeLatents,
+    train_mld: TrainMld,
+    distill_lcm: DistillLcm,
+    distill_pcm: DistillPcm,
+    evaluate_reconstruction: EvaluateReconstruction,
+    evaluate_latent_fid: EvaluateLatentFid,
+    train_evaluator: TrainEvaluator,
+    train_length: TrainLength,
+    train_tokenizer: TrainTokenizer,
+    encode_tokens: EncodeTokens,
+    train_tokens: TrainTokens,
+    train_discord: TrainDiscord,
+    distill_discord: DistillDiscord,
+    model_decoder: ModelDecoder,
+    train_mdm: TrainMdm,
+    train_stablemofusion: TrainStableMoFusion,
+    train_control: TrainControl,
+    evaluate_control: EvaluateControl,
+    evaluate_spectrum: EvaluateSpectrum,
+    evaluate_recognition: EvaluateRecognition,
+    import_evaluator: ImportEvaluator,
+    import_model: ImportModel,
+    evaluate_t2m: EvaluateT2m,
+    register: Register,
 }

@@ -27,6 +27,7 @@ use crate::dataset::{Extra, pack};
 use crate::external::{self, Given};
 use crate::kinds::shape::Map;
 use crate::shards::shard_range;
+use crate::stand_in;
 
 /// File of a shard's features, all clips one after the other.
 const FEATURES_FILE: &str = "features.safetensors";
@@ -56,6 +57,10 @@ struct File {
 }
 
 impl Map for DataFeatures {
+    fn stand_in(&self, cx: &mut dyn AttemptContext) -> Option<Result<Digest, StageError>> {
+        Some(stand_in::dataset(cx, self.format))
+    }
+
     fn shard(&self, cx: &mut dyn AttemptContext, index: usize, of: usize) -> Result<Outcome, StageError> {
         external::read(cx, |cx, given| read_shard(self, cx, given, (index, of)))
     }

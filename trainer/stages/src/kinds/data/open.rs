@@ -2,14 +2,20 @@
 
 use motion::Dataset;
 use motion::dataset::OpenReport;
+use protocol::Digest;
 use protocol::stage::DataOpen;
 
 use crate::context::{AttemptContext, Outcome, StageError};
 use crate::dataset::pack;
 use crate::external;
 use crate::kinds::shape::Plain;
+use crate::stand_in;
 
 impl Plain for DataOpen {
+    fn stand_in(&self, cx: &mut dyn AttemptContext) -> Option<Result<Digest, StageError>> {
+        Some(stand_in::dataset(cx, self.format))
+    }
+
     fn run(&self, cx: &mut dyn AttemptContext) -> Result<Outcome, StageError> {
         let opened = external::read(cx, |cx, given| {
             let opened = Dataset::open_while(given.path("path")?, self.format, &|_| !cx.interrupted());

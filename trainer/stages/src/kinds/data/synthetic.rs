@@ -2,13 +2,19 @@
 
 use std::cell::RefCell;
 
-use protocol::stage::DataSynthetic;
+use protocol::Digest;
+use protocol::stage::{DataFormat, DataSynthetic};
 
 use crate::context::{AttemptContext, Outcome, StageError};
 use crate::dataset::pack;
 use crate::kinds::shape::Plain;
+use crate::stand_in;
 
 impl Plain for DataSynthetic {
+    fn stand_in(&self, cx: &mut dyn AttemptContext) -> Option<Result<Digest, StageError>> {
+        Some(stand_in::dataset(cx, DataFormat::Humanml3d))
+    }
+
     fn run(&self, cx: &mut dyn AttemptContext) -> Result<Outcome, StageError> {
         if self.clips == 0 {
             return Err(StageError::Input("`clips` is 0; expected at least 1".into()));

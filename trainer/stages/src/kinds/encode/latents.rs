@@ -7,7 +7,7 @@ use std::collections::BTreeMap;
 
 use motion::Stream;
 use motion::dataset::{Split, crop};
-use protocol::stage::EncodeLatents;
+use protocol::stage::{self, EncodeLatents};
 use protocol::{ArtifactKind, Digest};
 use serde::{Deserialize, Serialize};
 
@@ -16,7 +16,7 @@ use crate::context::{AttemptContext, Outcome, StageError};
 use crate::kinds::shape::Map;
 use crate::metrics::latent_fid::standard_deviation;
 use crate::parts::networks::Autoencoder;
-use crate::shards::shard_range;
+use crate::shards::{self, shard_range};
 
 /// Meta of one shard, its entries' part of [`LatentsMeta`].
 #[derive(Debug, Serialize, Deserialize)]
@@ -26,6 +26,10 @@ struct ShardMeta {
 }
 
 impl Map for EncodeLatents {
+    fn repetitions(&self, entries: &dyn Fn(stage::Split) -> f64) -> f64 {
+        entries(stage::Split::All) * self.crops as f64
+    }
+
     fn shard(&self, cx: &mut dyn AttemptContext, index: usize, of: usize) -> Result<Outcome, StageError> {
         let blobs = cx.blobs();
         let (vae_digest, vae) = artifacts::input(cx, "vae", ArtifactKind::Vae)?;
@@ -91,26 +95,22 @@ impl Map for EncodeLatents {
             cx.progress(done as u64 + 1, range.len() as u64, "clips", &[]);
         }
         let meta = ShardMeta { latents: meta, first: range.start };
-        let bytes = tensors(&meta.latents, meta.first, mu, sigma).to_bytes()?;
-        let output = artifacts::publish(cx, ArtifactKind::Shard, to_meta(&meta), LATENTS_FILE, bytes)?;
+        let tensors = tensors(&meta.latents, meta.first, mu, sigma);
         let metrics = BTreeMap::from([("entries".to_owned(), range.len() as f64)]);
-        Ok(Outcome::Finished { output, metrics })
+        shards::publish(cx, &meta, LATENTS_FILE, &tensors, metrics)
     }
 
     fn merge(&self, cx: &mut dyn AttemptContext, shards: &[Digest]) -> Result<Outcome, StageError> {
-        let blobs = cx.blobs();
         let mut whole: Option<LatentsMeta> = None;
         let (mut mu, mut sigma) = (Vec::new(), Vec::new());
-        for digest in shards {
-            let manifest = cx.manifest(*digest)?;
-            let ShardMeta { latents, first } = artifacts::meta(&manifest, "a shard of the latents")?;
+        for shard in shards::read(cx, shards, "latents", LATENTS_FILE) {
+            let (ShardMeta { latents, first }, mut part) = shard?;
             let have = whole.as_ref().map_or(0, |w| w.splits.len());
             if first != have {
                 return Err(StageError::Fault(format!(
                     "a shard begins at entry {first}, but the previous shard ended at entry {have}"
                 )));
             }
-            let mut part = Tensors::from_bytes(artifacts::mapped(&*blobs, &manifest, LATENTS_FILE)?, LATENTS_FILE)?;
             mu.extend_from_slice(&part.take("mu", 3, LATENTS_FILE)?.values);
             sigma.extend_from_slice(&part.take("sigma", 3, LATENTS_FILE)?.values);
             match &mut whole {

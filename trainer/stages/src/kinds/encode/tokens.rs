@@ -12,7 +12,7 @@ use crate::artifacts::{self, Tensors, to_meta};
 use crate::context::{AttemptContext, Outcome, StageError};
 use crate::kinds::shape::Map;
 use crate::parts::tokenizer::{TOKENS_FILE, TokensMeta, TrainedTokenizer};
-use crate::shards::shard_range;
+use crate::shards::{self, shard_range};
 
 /// Meta of one shard, its entries' part of [`TokensMeta`].
 #[derive(Debug, Serialize, Deserialize)]
@@ -21,8 +21,8 @@ struct ShardMeta {
     first: usize,
 }
 
-fn bytes(ids: Vec<i64>, quantizers: usize) -> Result<Vec<u8>, StageError> {
-    Tensors::default().with_integers("ids", [ids.len() / quantizers, quantizers], ids).to_bytes()
+fn tensors(ids: Vec<i64>, quantizers: usize) -> Tensors {
+    Tensors::default().with_integers("ids", [ids.len() / quantizers, quantizers], ids)
 }
 
 impl Map for EncodeTokens {
@@ -62,27 +62,22 @@ impl Map for EncodeTokens {
             meta.lengths.push(tokens);
             cx.progress(done as u64 + 1, range.len() as u64, "clips", &[]);
         }
-        let bytes = bytes(ids, meta.quantizers)?;
-        let meta = ShardMeta { tokens: meta, first: range.start };
-        let output = artifacts::publish(cx, ArtifactKind::Shard, to_meta(&meta), TOKENS_FILE, bytes)?;
+        let tensors = tensors(ids, meta.quantizers);
         let metrics = BTreeMap::from([("entries".to_owned(), range.len() as f64)]);
-        Ok(Outcome::Finished { output, metrics })
+        shards::publish(cx, &ShardMeta { tokens: meta, first: range.start }, TOKENS_FILE, &tensors, metrics)
     }
 
     fn merge(&self, cx: &mut dyn AttemptContext, shards: &[Digest]) -> Result<Outcome, StageError> {
-        let blobs = cx.blobs();
         let mut whole: Option<TokensMeta> = None;
         let mut ids = Vec::new();
-        for digest in shards {
-            let manifest = cx.manifest(*digest)?;
-            let ShardMeta { tokens, first } = artifacts::meta(&manifest, "a shard of the tokens")?;
+        for shard in shards::read(cx, shards, "tokens", TOKENS_FILE) {
+            let (ShardMeta { tokens, first }, mut part) = shard?;
             let have = whole.as_ref().map_or(0, |whole| whole.splits.len());
             if first != have {
                 return Err(StageError::Fault(format!(
                     "a shard begins at entry {first}, but the previous shard ended at entry {have}"
                 )));
             }
-            let mut part = Tensors::from_bytes(artifacts::mapped(&*blobs, &manifest, TOKENS_FILE)?, TOKENS_FILE)?;
             ids.extend_from_slice(&part.take_integers("ids", 2, TOKENS_FILE)?.values);
             match &mut whole {
                 None => whole = Some(tokens),
@@ -100,7 +95,7 @@ impl Map for EncodeTokens {
             ("tokens".to_owned(), (ids.len() / meta.quantizers) as f64),
             ("used".to_owned(), used.len() as f64 / meta.codes as f64),
         ]);
-        let bytes = bytes(ids, meta.quantizers)?;
+        let bytes = tensors(ids, meta.quantizers).to_bytes()?;
         let output = artifacts::publish(cx, ArtifactKind::Tokens, to_meta(&meta), TOKENS_FILE, bytes)?;
         Ok(Outcome::Finished { output, metrics })
     }

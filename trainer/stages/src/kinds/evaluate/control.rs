@@ -9,25 +9,28 @@
 //! Departs: upstream measures 1,024 random entries in its spatial setting; here it is the whole split, as in its
 //! temporal setting. A motion without targets has no error.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 
 use motion::Stream;
+use protocol::Digest;
 use protocol::stage::{DataFormat, EvaluateControl};
-use protocol::{ArtifactKind, Digest};
 use serde::{Deserialize, Serialize};
 use serde_json::json;
 
-use crate::artifacts::{self, Tensors};
+use crate::artifacts::Tensors;
 use crate::context::{AttemptContext, Outcome, StageError};
-use crate::evaluation::entry_draws::{Draw, EntryDraws, finite, skates};
-use crate::evaluation::report::{REPORT_FILE, drawn};
+use crate::evaluation::entry_draws::{Draw, EntryDraws, Ranking, skates};
+use crate::evaluation::measured;
+use crate::evaluation::report::over_repeats;
 use crate::generate::generator::{self, Batch, ControlRequest, MotionGenerator, Texts};
 use crate::kinds::shape::Map;
 use crate::metrics::frechet::to_f64;
-use crate::metrics::interval::Interval;
 use crate::parts::control::ControlOptions;
 use crate::parts::hint::{Hint, metres, share, told_frames};
+use crate::shards::{self, Units, in_turn};
 
+/// Size of the pool in which a caption's own motion is ranked.
+const POOL: usize = 32;
 /// File of a shard's values.
 const VALUES_FILE: &str = "values.safetensors";
 /// Errors of one motion against its targets.
@@ -76,7 +79,10 @@ struct Plan<'a> {
 
 impl<'a> Plan<'a> {
     fn read(cx: &dyn AttemptContext, settings: &'a EvaluateControl) -> Result<Self, StageError> {
-        let of = EntryDraws::read(cx, settings.split, settings.all_if_small, settings.repeats)?;
+        if settings.repeats == 0 {
+            return Err(StageError::Input("`repeats` is 0; expected at least 1".into()));
+        }
+        let of = EntryDraws::read(cx, settings.split, settings.all_if_small, (POOL, ""))?;
         let cases = cases(settings, of.dataset.format)?;
         Ok(Self { settings, of, cases })
     }
@@ -182,12 +188,12 @@ impl Values {
 impl Map for EvaluateControl {
     fn shard(&self, cx: &mut dyn AttemptContext, index: usize, of: usize) -> Result<Outcome, StageError> {
         let plan = Plan::read(cx, self)?;
-        let generator = plan.of.open(cx, &self.sampler)?;
+        let (_, generator) = measured::model(cx, plan.of.dataset.format, &self.sampler)?;
         if generator.control().is_none() {
             return Err(StageError::Input("`model` has no control part; expected a `train.control` stage".into()));
         }
         let maker = Maker { generator: &*generator, texts: Texts::new(&*generator) };
-        let units: Vec<Unit> = plan.units().enumerate().filter(|(i, _)| i % of == index).map(|(_, u)| u).collect();
+        let units: Vec<Unit> = in_turn(plan.units(), index, of).collect();
         let mut values = Values::default();
         for (done, unit) in units.iter().enumerate() {
             if cx.interrupted() {
@@ -197,72 +203,30 @@ impl Map for EvaluateControl {
             cx.progress(done as u64 + 1, units.len() as u64, "blocks", &[]);
         }
         let width = plan.of.trained.width();
-        let rows = |values: &[f32]| [values.len() / width, width];
-        let (skated, compared) = (values.skating.len(), values.errors.len());
-        let bytes = Tensors::default()
-            .with("text", rows(&values.text), values.text)
-            .with("real", rows(&values.real), values.real)
-            .with("made", rows(&values.made), values.made)
-            .with("skating", [skated], values.skating)
-            .with("errors", [compared / ERRORS.len(), ERRORS.len()], values.errors)
-            .to_bytes()?;
-        let output = artifacts::publish(cx, ArtifactKind::Shard, json!({"units": units}), VALUES_FILE, bytes)?;
-        Ok(Outcome::Finished { output, metrics: BTreeMap::new() })
+        let tensors = Tensors::default()
+            .with_rows("text", width, values.text)
+            .with_rows("real", width, values.real)
+            .with_rows("made", width, values.made)
+            .with("skating", [values.skating.len()], values.skating)
+            .with_rows("errors", ERRORS.len(), values.errors);
+        shards::publish(cx, &Units { units }, VALUES_FILE, &tensors, BTreeMap::new())
     }
 
     fn merge(&self, cx: &mut dyn AttemptContext, shards: &[Digest]) -> Result<Outcome, StageError> {
         let plan = Plan::read(cx, self)?;
         let all = gather(cx, &plan, shards)?;
-        let mut values: BTreeMap<String, Vec<f64>> = BTreeMap::new();
-        for repeat in 0..self.repeats {
-            for (name, value) in measure(&plan, &all, repeat) {
-                values.entry(name).or_default().push(value);
-            }
-        }
-        let mut metrics = BTreeMap::new();
-        for (name, values) in &values {
-            let interval = Interval::of(values);
-            metrics.insert(name.clone(), interval.mean);
-            // The mean of a case is enough here; the report has every repeat.
-            if !name.contains('/') {
-                metrics.insert(format!("{name}.lower"), interval.lower());
-                metrics.insert(format!("{name}.upper"), interval.upper());
-            }
-        }
-        finite(&metrics)?;
-        plan.of.log(cx, self.split);
-        let samples = plan.of.entries.len();
-        metrics.insert("samples".to_owned(), samples as f64);
-        let drawn = drawn(cx)?;
+        // The mean of a case is enough here; the report has every repeat.
+        let bounded = |name: &str| !name.contains('/');
+        let measured = over_repeats(self.repeats, bounded, |repeat| measure(&plan, &all, repeat))?;
         let meta = json!({
-            "kind": cx.task().settings.kind(),
-            "metrics": metrics,
-            "drawn": drawn,
-            "split": plan.of.split,
-            "evaluator": plan.of.evaluator,
-            "words": plan.of.trained.meta().words,
             "scale": self.scale,
             "feedback": self.feedback,
             "refine": self.refine,
             "threshold": self.threshold,
         });
         let names: Vec<&str> = plan.cases.iter().map(|case| case.name.as_str()).collect();
-        let report = json!({
-            "metrics": metrics,
-            "details": {
-                "split": plan.of.split,
-                "seed": plan.of.seed,
-                "sampler": self.sampler,
-                "setting": self.setting,
-                "cases": names,
-                "samples_per_repeat": samples,
-                "note": plan.of.few(),
-                "repeats": values,
-            },
-        });
-        let bytes = protocol::canonical::to_bytes(&report);
-        let output = artifacts::publish(cx, ArtifactKind::Report, meta, REPORT_FILE, bytes)?;
-        Ok(Outcome::Finished { output, metrics })
+        let details = json!({"sampler": self.sampler, "setting": self.setting, "cases": names});
+        plan.of.publish(cx, self.split, plan.of.entries.len(), measured, (meta, details))
     }
 }
 
@@ -278,17 +242,11 @@ struct Gathered {
     errors: Vec<[Vec<f64>; 2]>,
 }
 
-fn gather(cx: &dyn AttemptContext, plan: &Plan<'_>, shards: &[Digest]) -> Result<Vec<Gathered>, StageError> {
-    #[derive(Deserialize)]
-    struct ShardMeta {
-        units: Vec<Unit>,
-    }
-    let (blobs, width, ways) = (cx.blobs(), plan.of.trained.width(), plan.cases.len() + 1);
+fn gather(cx: &dyn AttemptContext, plan: &Plan<'_>, digests: &[Digest]) -> Result<Vec<Gathered>, StageError> {
+    let (width, ways) = (plan.of.trained.width(), plan.cases.len() + 1);
     let mut parts: BTreeMap<Unit, Gathered> = BTreeMap::new();
-    for digest in shards {
-        let manifest = cx.manifest(*digest)?;
-        let ShardMeta { units } = artifacts::meta(&manifest, "a shard of the evaluation")?;
-        let mut tensors = Tensors::from_bytes(artifacts::mapped(&*blobs, &manifest, VALUES_FILE)?, VALUES_FILE)?;
+    for shard in shards::read::<Units<Unit>>(cx, digests, "evaluation", VALUES_FILE) {
+        let (Units { units }, mut tensors) = shard?;
         let mut take = |name: &str, rank| Ok::<_, StageError>(to_f64(&tensors.take(name, rank, VALUES_FILE)?.values));
         let (text, real, made) = (take("text", 2)?, take("real", 2)?, take("made", 2)?);
         let (skating, errors) = (take("skating", 1)?, take("errors", 2)?);
@@ -311,14 +269,7 @@ fn gather(cx: &dyn AttemptContext, plan: &Plan<'_>, shards: &[Digest]) -> Result
             row += n;
         }
     }
-    let (found, expected): (BTreeSet<Unit>, BTreeSet<Unit>) = (parts.keys().copied().collect(), plan.units().collect());
-    if found != expected {
-        return Err(StageError::Fault(format!(
-            "the shards have {} blocks of motions; expected {}",
-            found.len(),
-            expected.len()
-        )));
-    }
+    shards::expect_units(parts.keys().copied(), plan.units())?;
     let empty = Gathered {
         made: vec![Vec::new(); ways],
         skating: vec![Vec::new(); ways],
@@ -344,9 +295,10 @@ fn gather(cx: &dyn AttemptContext, plan: &Plan<'_>, shards: &[Digest]) -> Result
 fn measure(plan: &Plan<'_>, all: &[Gathered], repeat: usize) -> BTreeMap<String, f64> {
     let all = &all[repeat];
     let n = plan.of.entries.len() as f64;
-    let space = |way: usize| -> BTreeMap<&'static str, f64> {
-        let mut metrics = plan.of.in_space(repeat, (&all.text, &all.made[way], &all.real), false);
-        metrics.insert("skating_ratio", all.skating[way].iter().sum::<f64>() / n);
+    let ranking = Ranking { pools: &[POOL], kept: plan.of.entries.len(), shuffled: false };
+    let space = |way: usize| -> BTreeMap<String, f64> {
+        let mut metrics = plan.of.in_space(repeat, (&all.text, &all.made[way], &all.real), &ranking);
+        metrics.insert("skating_ratio".to_owned(), all.skating[way].iter().sum::<f64>() / n);
         metrics
     };
     let errors = |case: usize, with: usize| -> Vec<(&'static str, f64)> {
@@ -357,8 +309,7 @@ fn measure(plan: &Plan<'_>, all: &[Gathered], repeat: usize) -> BTreeMap<String,
     };
     let mut each: Vec<BTreeMap<String, f64>> = Vec::new();
     for case in 0..plan.cases.len() {
-        let mut metrics: BTreeMap<String, f64> =
-            space(case + 1).into_iter().map(|(name, value)| (name.to_owned(), value)).collect();
+        let mut metrics = space(case + 1);
         metrics.extend(errors(case, 1).into_iter().map(|(name, value)| (name.to_owned(), value)));
         metrics.extend(errors(case, 0).into_iter().map(|(name, value)| (format!("uncontrolled_{name}"), value)));
         each.push(metrics);

@@ -15,7 +15,7 @@
 //! components are those of the train latents in either case. Definitions:
 //! [`evaluation::latent_fid`](crate::metrics::latent_fid).
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 
 use motion::Stream;
 use motion::dataset::{Caption, Split};
@@ -33,6 +33,8 @@ use crate::kinds::shape::Map;
 use crate::metrics::latent_fid::{
     Real, Reference, Target, mean_and_spread, relative_distance, same_captions, standard_deviation, top,
 };
+use crate::shards::{self, Units, in_turn};
+use crate::stand_in::CLIPS;
 
 /// Samples computed together. Measured with 5 blocks of width 128 on one core: with 32 each takes a tenth less time
 /// than with 64, which with guidance are 128 sequences and do not fit the cache.
@@ -215,13 +217,14 @@ fn fits(field: &str, generator: &dyn MotionGenerator, latents: &Latents) -> Resu
 }
 
 impl Map for EvaluateLatentFid {
+    fn repetitions(&self, entries: &dyn Fn(Wanted) -> f64) -> f64 {
+        (self.repeats * self.samples) as f64 * entries(self.split) / CLIPS as f64
+    }
+
     fn shard(&self, cx: &mut dyn AttemptContext, index: usize, of: usize) -> Result<Outcome, StageError> {
         let plan = Plan::read(cx, self)?;
-        let mine = |maker: Maker| -> Vec<Unit> {
-            let all = plan.units().into_iter().filter(|u| u.maker == maker);
-            all.enumerate().filter(|(i, _)| i % of == index).map(|(_, unit)| unit).collect()
-        };
-        let units: Vec<Unit> = mine(Maker::Model).into_iter().chain(mine(Maker::Teacher)).collect();
+        let mine = |maker| in_turn(plan.units().into_iter().filter(move |unit| unit.maker == maker), index, of);
+        let units: Vec<Unit> = mine(Maker::Model).chain(mine(Maker::Teacher)).collect();
         let (texts, teacher_sampler) = (Texts::new(&*plan.model), plan.teacher_sampler());
         let teacher = plan.teacher.as_deref().map(|teacher| (teacher, Texts::new(teacher)));
 
@@ -244,25 +247,16 @@ impl Map for EvaluateLatentFid {
             done += cost(unit);
             cx.progress(done, total, "evaluations", &[]);
         }
-        let rows = values.len() / plan.width();
-        let bytes = Tensors::default().with("z", [rows, plan.width()], values).to_bytes()?;
-        let output = artifacts::publish(cx, ArtifactKind::Shard, json!({"units": units}), SAMPLES_FILE, bytes)?;
-        Ok(Outcome::Finished { output, metrics: BTreeMap::new() })
+        let tensors = Tensors::default().with_rows("z", plan.width(), values);
+        shards::publish(cx, &Units { units }, SAMPLES_FILE, &tensors, BTreeMap::new())
     }
 
     fn merge(&self, cx: &mut dyn AttemptContext, shards: &[Digest]) -> Result<Outcome, StageError> {
-        #[derive(Deserialize)]
-        struct ShardMeta {
-            units: Vec<Unit>,
-        }
         let plan = Plan::read(cx, self)?;
-        let blobs = cx.blobs();
         let mut blocks: BTreeMap<Unit, Vec<f32>> = BTreeMap::new();
-        for digest in shards {
-            let manifest = cx.manifest(*digest)?;
-            let ShardMeta { units } = artifacts::meta(&manifest, "a shard of the samples")?;
-            let bytes = artifacts::mapped(&*blobs, &manifest, SAMPLES_FILE)?;
-            let rows = Tensors::from_bytes(bytes, SAMPLES_FILE)?.take("z", 2, SAMPLES_FILE)?;
+        for shard in shards::read::<Units<Unit>>(cx, shards, "samples", SAMPLES_FILE) {
+            let (Units { units }, mut tensors) = shard?;
+            let rows = tensors.take("z", 2, SAMPLES_FILE)?;
             let mut at = 0;
             for unit in units {
                 let end = at + plan.block(unit.block).len() * plan.width();
@@ -270,14 +264,7 @@ impl Map for EvaluateLatentFid {
                 at = end;
             }
         }
-        let expected: BTreeSet<Unit> = plan.units().into_iter().collect();
-        if !blocks.keys().eq(&expected) {
-            return Err(StageError::Fault(format!(
-                "the shards have {} blocks of samples; expected {}",
-                blocks.len(),
-                expected.len()
-            )));
-        }
+        shards::expect_units(blocks.keys().copied(), plan.units())?;
         if !blocks.values().flatten().all(|v| v.is_finite()) {
             return Err(StageError::Input("samples are not finite; the denoiser is not trained well enough".into()));
         }

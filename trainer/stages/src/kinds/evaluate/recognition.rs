@@ -24,9 +24,9 @@ use serde_json::json;
 
 use crate::artifacts::word;
 use crate::context::{AttemptContext, Outcome, StageError};
-use crate::evaluation::entry_draws::{finite, skates};
+use crate::evaluation::entry_draws::skates;
 use crate::evaluation::measured::measured;
-use crate::evaluation::report::{no_entries, publish_illustrated};
+use crate::evaluation::report::{finite, no_entries, publish_illustrated};
 use crate::generate::generator::{self, Batch};
 use crate::kinds::shape::Plain;
 use crate::metrics::recognition::{Classifier, describe};
@@ -199,7 +199,13 @@ impl Plain for EvaluateRecognition {
             "split": self.split,
             "sampler": self.sampler,
         });
-        publish_illustrated(cx, metrics, details, sheet.map(|bytes| ("contact-sheet.png", bytes)).into_iter().collect())
+        publish_illustrated(
+            cx,
+            metrics,
+            json!({}),
+            details,
+            sheet.map(|bytes| ("contact-sheet.png", bytes)).into_iter().collect(),
+        )
     }
 }
 

@@ -13,7 +13,7 @@
 use std::collections::BTreeMap;
 
 use motion::{Skeleton, Stream};
-use protocol::stage::{DataFormat, EvaluateReconstruction};
+use protocol::stage::{DataFormat, EvaluateReconstruction, Split};
 use protocol::{ArtifactKind, Digest};
 use serde::{Deserialize, Serialize};
 use serde_json::json;
@@ -117,6 +117,10 @@ fn usage(codes: &[Vec<u64>]) -> Vec<(String, f64)> {
 }
 
 impl Map for EvaluateReconstruction {
+    fn repetitions(&self, entries: &dyn Fn(Split) -> f64) -> f64 {
+        entries(self.split)
+    }
+
     fn shard(&self, cx: &mut dyn AttemptContext, index: usize, of: usize) -> Result<Outcome, StageError> {
         let dataset = artifacts::input_dataset(cx)?;
         let measured = Reconstructor::read(cx, self.decoder_steps)?;

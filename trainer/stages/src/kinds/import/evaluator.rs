@@ -16,7 +16,7 @@ use models::names::from_bytes;
 use models::networks::{Evaluator, EvaluatorConfig, Init};
 use motion::{DataPath, Skeleton, npy};
 use protocol::stage::{ImportEvaluator, Positions};
-use protocol::{Seed, excerpt, limits};
+use protocol::{Digest, Seed, excerpt, limits};
 use pytorch_reader::{DType, PytorchReader};
 use safetensors::SafeTensors;
 
@@ -26,6 +26,7 @@ use crate::external::{self, Given};
 use crate::kinds::shape::Plain;
 use crate::parts::evaluator::{self, EvaluatorMeta};
 use crate::parts::words::{CLASSES, WORD_WIDTH, Words};
+use crate::stand_in;
 
 /// The state dicts of the pickle.
 const PARTS: [&str; 3] = ["text_encoder", "motion_encoder", "movement_encoder"];
@@ -36,6 +37,10 @@ const MAX_TENSORS: usize = 1_000;
 const MAX_HEADER: u64 = 1 << 20;
 
 impl Plain for ImportEvaluator {
+    fn stand_in(&self, cx: &mut dyn AttemptContext) -> Option<Result<Digest, StageError>> {
+        Some(stand_in::evaluator(cx, self.format))
+    }
+
     fn run(&self, cx: &mut dyn AttemptContext) -> Result<Outcome, StageError> {
         external::read(cx, |cx, given| import(self, cx, given))
     }

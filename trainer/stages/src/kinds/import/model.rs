@@ -23,6 +23,7 @@ use protocol::stage::{
     TokenizerNetwork,
 };
 use protocol::{ArtifactKind, Digest, Manifest};
+use serde::Serialize;
 
 use crate::artifacts::{self, DenoiserMeta, Draft, EmbeddingsMeta, MODEL_FILE, VaeMeta, to_meta, word};
 use crate::context::{AttemptContext, ContextError, Outcome, StageError};
@@ -105,15 +106,21 @@ impl Network {
     }
 }
 
-/// Uploads networks as the files of an artifact.
-fn add(draft: &mut Draft, networks: &[Network]) -> Result<(), StageError> {
-    weights::add_all(draft, &networks.iter().map(Network::pair).collect::<Vec<_>>())?;
+/// Uploads networks as the files of an artifact, and returns its manifest.
+fn part(
+    cx: &dyn AttemptContext,
+    kind: ArtifactKind,
+    meta: &impl Serialize,
+    networks: &[Network],
+) -> Result<Manifest, StageError> {
+    let mut draft = Draft::new(cx, kind, to_meta(meta));
+    weights::add_all(&mut draft, &networks.iter().map(Network::pair).collect::<Vec<_>>())?;
     let constants = networks.iter().flat_map(|network| &network.taken.constants);
     let constants: Vec<_> = constants.map(|(entry, values)| (std::slice::from_ref(entry), &values[..])).collect();
-    if constants.is_empty() {
-        return Ok(());
+    if !constants.is_empty() {
+        draft.add_pieces(weights::CONSTANTS_FILE, &Weights::of(&constants).pieces())?;
     }
-    draft.add_pieces(weights::CONSTANTS_FILE, &Weights::of(&constants).pieces())
+    Ok(draft.into_manifest())
 }
 
 /// The setting's value if it departs from the rule, else `None`.
@@ -252,7 +259,7 @@ impl Import<'_> {
     }
 
     fn vae(&mut self, cx: &mut dyn AttemptContext) -> Result<Digest, StageError> {
-        let found = sizes::vae(self.file)?;
+        let found = self.file.network(&sizes::VAE)?;
         let config = sizes::of_vae(&found, self.heads)?;
         let (format, mean, std) = self.statistics(cx, config.features, &found)?;
         let meta = VaeMeta {
@@ -265,15 +272,13 @@ impl Import<'_> {
             projection: departing(config.projection, config.dim != config.width),
         };
         let network = self.network(&found, |init| Vae::new(&meta.config(), init))?;
-        let mut draft = Draft::new(cx, ArtifactKind::Vae, to_meta(&meta));
-        add(&mut draft, &[network])?;
-        draft.finish(cx)
+        Ok(cx.put_manifest(&part(cx, ArtifactKind::Vae, &meta, &[network])?)?)
     }
 
     fn denoiser(&mut self, cx: &mut dyn AttemptContext) -> Result<Digest, StageError> {
         let (vae_digest, vae_part) = artifacts::input(cx, "vae", ArtifactKind::Vae)?;
         let vae: VaeMeta = artifacts::meta(&vae_part, "the VAE")?;
-        let found = sizes::denoiser(self.file)?;
+        let found = self.file.network(&sizes::DENOISER)?;
         let config = sizes::of_denoiser(&found, vae.latent.tokens, self.heads)?;
         let family = self.settings.family().ok_or_else(|| StageError::Fault("the denoiser has no family".into()))?;
         match (config.guidance_dim, family.is_student()) {
@@ -295,7 +300,7 @@ impl Import<'_> {
         }
         let text = self.text(cx, &found, config.text_dim)?;
         let vae_entries = layout(&Vae::new(&vae.config(), &mut Init::shapes(&self.device)));
-        self.expect_same(cx, sizes::find_vae(self.file), (&vae_entries, &vae_part), ("VAE", "vae"))?;
+        self.expect_same(cx, self.file.beside(&sizes::VAE), (&vae_entries, &vae_part), ("VAE", "vae"))?;
         let meta = DenoiserMeta {
             family,
             latent: vae.latent,
@@ -331,14 +336,15 @@ impl Import<'_> {
         let base: DenoiserMeta = artifacts::meta(&part, "the denoiser of `model`")?;
         let entries = layout(&Denoiser::new(&base.config(), &mut Init::shapes(&self.device)));
         let same = ("denoiser", "model");
-        self.expect_same(cx, sizes::find_denoiser(self.file), (&entries, &part), same)?;
-        if let Some(vae) = sizes::find_vae(self.file) {
+        self.expect_same(cx, self.file.beside(&sizes::DENOISER), (&entries, &part), same)?;
+        if let Some(vae) = self.file.beside(&sizes::VAE) {
             let part = parts::part(&*cx.blobs(), &model, &Role::VAE, ArtifactKind::Vae)?;
             let meta: VaeMeta = artifacts::meta(&part, "the VAE of `model`")?;
             let entries = layout(&Vae::new(&meta.config(), &mut Init::shapes(&self.device)));
             self.expect_same(cx, Some(vae), (&entries, &part), ("VAE", "model"))?;
         }
-        let (control, trajectory) = (sizes::controlnet(self.file)?, sizes::trajectory_encoder(self.file)?);
+        let (control, trajectory) =
+            (self.file.network(&sizes::CONTROLNET)?, self.file.network(&sizes::TRAJECTORY_ENCODER)?);
         let config = sizes::of_trajectory(&trajectory, self.heads)?;
         let joints = Skeleton::of(model.format).joints;
         if config.joints != joints {
@@ -365,16 +371,14 @@ impl Import<'_> {
         };
         let control = self.network(&control, |init| meta.controlnet(&base, init))?.under(CONTROLNET_PREFIX);
         let trajectory = self.network(&trajectory, |init| meta.trajectory(&base, init))?.under(TRAJECTORY_PREFIX);
-        let mut draft = Draft::new(cx, ArtifactKind::Control, to_meta(&meta));
-        add(&mut draft, &[control, trajectory])?;
-        let part = draft.into_manifest();
+        let part = self::part(cx, ArtifactKind::Control, &meta, &[control, trajectory])?;
         cx.put_manifest(&part)?;
         let model = model::extend(&manifest, None, &BTreeMap::from([(Role::CONTROL, part)])).map_err(model_error)?;
         Ok(cx.put_manifest(&model)?)
     }
 
     fn tokenizer(&mut self, cx: &mut dyn AttemptContext) -> Result<Digest, StageError> {
-        let found = sizes::tokenizer(self.file)?;
+        let found = self.file.network(&sizes::TOKENIZER)?;
         let found_sizes = sizes::of_tokenizer(&found)?;
         let (format, mean, std) = self.statistics(cx, found_sizes.features, &found)?;
         let (depth, growth) = (found_sizes.depth, self.settings.growth);
@@ -403,9 +407,7 @@ impl Import<'_> {
         };
         let taken = found.take(&entries, &alias)?;
         let network = self.taken(entries, taken);
-        let mut draft = Draft::new(cx, ArtifactKind::Tokenizer, to_meta(&meta));
-        add(&mut draft, &[network])?;
-        draft.finish(cx)
+        Ok(cx.put_manifest(&part(cx, ArtifactKind::Tokenizer, &meta, &[network])?)?)
     }
 
     /// Uploads a model of tokens with its parts.
@@ -427,9 +429,8 @@ impl Import<'_> {
             text_dim,
             fits: Parts::from([(Role::TOKENIZER, digest), (Role::TEXT, text.digest())]),
         };
-        let mut draft = Draft::new(cx, ArtifactKind::TokenGenerator, to_meta(&meta));
-        add(&mut draft, networks)?;
-        let parts = [(Role::GENERATOR, draft.into_manifest()), (Role::TOKENIZER, part), (Role::TEXT, text)];
+        let own = self::part(cx, ArtifactKind::TokenGenerator, &meta, networks)?;
+        let parts = [(Role::GENERATOR, own), (Role::TOKENIZER, part), (Role::TEXT, text)];
         parts::publish_model(cx, TOKENS, tokenizer.format, &parts.into())
     }
 
@@ -449,7 +450,7 @@ impl Import<'_> {
 
     fn gpt(&mut self, cx: &mut dyn AttemptContext) -> Result<Digest, StageError> {
         let tokenizer = self.tokenizer_input(cx)?;
-        let found = sizes::gpt(self.file)?;
+        let found = self.file.network(&sizes::GPT)?;
         let config = sizes::of_gpt(&found, self.settings.longest, self.heads)?;
         Self::expect_codes(&found, config.codes, &tokenizer.2, true)?;
         let text = self.text(cx, &found, config.text_dim)?;
@@ -467,7 +468,7 @@ impl Import<'_> {
 
     fn mmm(&mut self, cx: &mut dyn AttemptContext) -> Result<Digest, StageError> {
         let tokenizer = self.tokenizer_input(cx)?;
-        let found = sizes::mmm(self.file)?;
+        let found = self.file.network(&sizes::MMM)?;
         let config = sizes::of_mmm(&found, self.settings.longest, self.heads)?;
         Self::expect_codes(&found, config.codes, &tokenizer.2, true)?;
         if config.dim != tokenizer.2.code_dim {
@@ -494,7 +495,7 @@ impl Import<'_> {
     fn momask(&mut self, cx: &mut dyn AttemptContext) -> Result<Digest, StageError> {
         let tokenizer = self.tokenizer_input(cx)?;
         let quantizers = tokenizer.2.quantizers;
-        let found = sizes::masked(self.file)?;
+        let found = self.file.network(&sizes::MASKED)?;
         let config = sizes::of_masked(&found, quantizers, self.heads)?;
         Self::expect_codes(&found, config.codes, &tokenizer.2, false)?;
         let text = self.text(cx, &found, config.text_dim)?;
@@ -520,7 +521,7 @@ impl Import<'_> {
     fn above(&mut self, cx: &mut dyn AttemptContext, first: &MomaskConfig) -> Result<Network, StageError> {
         let path = self.given.path("residual")?;
         let file = Checkpoint::open(path)?;
-        let found = sizes::residual(&file)?;
+        let found = file.network(&sizes::RESIDUAL)?;
         let config = sizes::of_residual(&found, self.heads)?;
         if config != *first {
             return Err(found.refuse(format!(
@@ -538,7 +539,7 @@ impl Import<'_> {
     }
 
     fn mdm(&mut self, cx: &mut dyn AttemptContext) -> Result<Digest, StageError> {
-        let found = sizes::mdm(self.file)?;
+        let found = self.file.network(&sizes::MDM)?;
         let config = sizes::of_mdm(&found, self.heads)?;
         let (format, mean, std) = self.statistics(cx, config.features, &found)?;
         let text = self.text(cx, &found, config.text_dim)?;
@@ -566,15 +567,14 @@ impl Import<'_> {
             fits: Parts::from([(Role::TEXT, text.digest())]),
         };
         let network = self.network(&found, |init| meta.mdm(&size, init))?;
-        let mut draft = Draft::new(cx, ArtifactKind::Denoiser, to_meta(&meta));
-        add(&mut draft, &[network])?;
-        let parts = BTreeMap::from([(Role::DENOISER, draft.into_manifest()), (Role::TEXT, text)]);
+        let denoiser = part(cx, ArtifactKind::Denoiser, &meta, &[network])?;
+        let parts = BTreeMap::from([(Role::DENOISER, denoiser), (Role::TEXT, text)]);
         parts::publish_model(cx, FEATURE_DIFFUSION, meta.format, &parts)
     }
 
     fn discord(&mut self, cx: &mut dyn AttemptContext) -> Result<Digest, StageError> {
         let (digest, _, tokenizer) = self.tokenizer_input(cx)?;
-        let found = sizes::unet(self.file)?;
+        let found = self.file.network(&sizes::UNET)?;
         let config = sizes::of_unet(&found, (self.heads, HEAD))?;
         if (config.features, config.token_dim) != (tokenizer.features, tokenizer.code_dim) {
             return Err(found.refuse(format!(
@@ -616,8 +616,6 @@ impl Import<'_> {
         let entries = layout(&network);
         let taken = found.take(&entries, &str::to_owned)?;
         let network = self.taken(entries, taken);
-        let mut draft = Draft::new(cx, ArtifactKind::FlowDecoder, to_meta(&meta));
-        add(&mut draft, &[network])?;
-        draft.finish(cx)
+        Ok(cx.put_manifest(&part(cx, ArtifactKind::FlowDecoder, &meta, &[network])?)?)
     }
 }

@@ -4,6 +4,7 @@ use std::cell::RefCell;
 
 use burn::tensor::{Device, Tensor, TensorData};
 use motion::Stream;
+use motion::dataset::normalise;
 use motion::dataset::{Dataset, crop};
 use protocol::stage::{Split, Training};
 use protocol::{ArtifactKind, Manifest, Seed, StageName};
@@ -11,7 +12,6 @@ use protocol::{ArtifactKind, Manifest, Seed, StageName};
 use crate::artifacts::{self, Embeddings, EmbeddingsMeta};
 use crate::context::{AttemptContext, StageError};
 use crate::parts;
-use crate::parts::evaluator::normalise;
 use crate::parts::motion_networks::CaptionRows;
 use crate::parts::text::{self, TextEncoder};
 use crate::train::network::no_clips;

@@ -1,15 +1,15 @@
 //! Source of the measured motions: a model, or reconstructions of real ones.
 
-use burn::tensor::Device;
-use checkpoint::Blobs;
 use checkpoint::model::Model;
 use motion::Stream;
 use protocol::ArtifactKind;
 use protocol::artifact::Role;
 
-use super::plan::{Draw, Plan};
+use super::plan::Plan;
 use crate::artifacts;
 use crate::context::{AttemptContext, StageError};
+use crate::evaluation::entry_draws::Draw;
+use crate::evaluation::measured;
 use crate::evaluation::reconstructor::Reconstructor;
 use crate::generate::generator::{self, Batch, MotionGenerator, Texts};
 use crate::parts::length::Lengths;
@@ -39,40 +39,23 @@ impl Source {
         }
         if plan.settings.reconstructs() {
             let reconstructor = Reconstructor::read(cx, 0)?;
-            reconstructor.check_format(plan.dataset.format)?;
+            reconstructor.check_format(plan.of.dataset.format)?;
             return Ok(Self::Reconstructed(reconstructor));
         }
-        let (_, manifest) = artifacts::input(cx, "model", ArtifactKind::Model)?;
-        let (blobs, device) = (cx.blobs(), cx.device());
-        let model = generator::open(&manifest, &*blobs, &device)?;
-        let (ours, theirs) = (model.format(), plan.dataset.format);
-        if ours != theirs {
-            return Err(StageError::Input(format!(
-                "`model` generates motions in format `{}`, but the dataset has format `{}`; use a dataset in the \
-                 model's format",
-                ours.name(),
-                theirs.name()
-            )));
-        }
-        generator::check_sampler(&*model, &plan.settings.sampler)?;
+        let (manifest, model) = measured::model(cx, plan.of.dataset.format, &plan.settings.sampler)?;
         let parts = Model::read(&manifest).map_err(model_error)?;
-        let lengths = lengths(cx, &parts, &*blobs, &device)?;
+        let lengths = lengths(cx, &parts)?;
         Ok(Self::Generated(Generated { model, lengths }))
     }
 }
 
 /// Opens the estimator of the input `length`, and checks that it reads the embeddings of the model's captions.
-fn lengths(
-    cx: &dyn AttemptContext,
-    model: &Model,
-    blobs: &dyn Blobs,
-    device: &Device,
-) -> Result<Option<Lengths>, StageError> {
+fn lengths(cx: &dyn AttemptContext, model: &Model) -> Result<Option<Lengths>, StageError> {
     if !cx.task().inputs.contains_key("length") {
         return Ok(None);
     }
     let (_, manifest) = artifacts::input(cx, "length", ArtifactKind::Length)?;
-    let lengths = Lengths::read(blobs, &manifest, device)?;
+    let lengths = Lengths::read(&*cx.blobs(), &manifest, &cx.device())?;
     let meta = lengths.meta();
     if meta.format != model.format {
         return Err(StageError::Input(format!(
@@ -121,7 +104,7 @@ impl<'a> Maker<'a> {
         let Some(lengths) = &self.generated.lengths else { return Ok(draw.len) };
         let model = &*self.generated.model;
         let pooled = model.text().pooled(&[plan.told(draw.caption)])?;
-        let drawn = lengths.draw(&pooled, &mut plan.stream("length", draw.repeat, draw.number));
+        let drawn = lengths.draw(&pooled, &mut plan.of.stream("length", draw.repeat, draw.number));
         Ok(drawn.min(model.longest()))
     }
 }
@@ -133,10 +116,10 @@ pub(super) fn reconstruct(
     draw: Draw,
     crop: &[f32],
 ) -> Result<Vec<f32>, StageError> {
-    reconstructor.check_frames(&plan.dataset.entries[draw.entry].id, draw.len)?;
+    reconstructor.check_frames(&plan.of.dataset.entries[draw.entry].id, draw.len)?;
     let mut rows = crop.to_vec();
     reconstructor.normalise(&mut rows);
-    let mut made = reconstructor.sample(&rows, draw.len, &mut plan.stream("posterior", draw.repeat, draw.number));
+    let mut made = reconstructor.sample(&rows, draw.len, &mut plan.of.stream("posterior", draw.repeat, draw.number));
     reconstructor.denormalise(&mut made);
     if !made.iter().all(|v| v.is_finite()) {
         let text = "a reconstruction is not finite; its model is not trained well enough";

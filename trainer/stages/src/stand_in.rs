@@ -1,4 +1,4 @@
-//! Placeholder clips and an untrained evaluator: noise of the right shape.
+//! Placeholders for the outputs of stages in an estimate: clips and an untrained evaluator, noise of the right shape.
 
 use models::flat;
 use models::networks::{Evaluator, Init};
@@ -15,10 +15,10 @@ use crate::parts::words::Words;
 /// Frames of each clip: 142 on average, as in HumanML3D.
 const FRAMES: [usize; 6] = [196, 160, 144, 144, 120, 88];
 /// Number of clips.
-pub(super) const CLIPS: usize = FRAMES.len();
+pub(crate) const CLIPS: usize = FRAMES.len();
 
 /// Makes clips of noise; the last two are not for training.
-pub(super) fn dataset(cx: &mut dyn AttemptContext, format: DataFormat) -> Result<Digest, StageError> {
+pub(crate) fn dataset(cx: &mut dyn AttemptContext, format: DataFormat) -> Result<Digest, StageError> {
     let width = Skeleton::of(format).features;
     let clip = |(i, frames): (usize, &usize)| {
         let mut noise = Stream::new(cx.task().seed, "estimate/clip", i as u64, 0);
@@ -47,7 +47,7 @@ pub(super) fn dataset(cx: &mut dyn AttemptContext, format: DataFormat) -> Result
 }
 
 /// An untrained evaluator of the published size.
-pub(super) fn evaluator(cx: &mut dyn AttemptContext, format: DataFormat) -> Result<Digest, StageError> {
+pub(crate) fn evaluator(cx: &mut dyn AttemptContext, format: DataFormat) -> Result<Digest, StageError> {
     let skeleton = Skeleton::of(format);
     let words = Words::Hashed;
     let meta = EvaluatorMeta {
