@@ -189,8 +189,13 @@ pub fn render(data: &Data) -> String {
             let verb = if *dry_run { "would remove" } else { "removed" };
             let fresh =
                 if plan.fresh == 0 { String::new() } else { format!(", {} within their grace period", plan.fresh) };
+            let uploads = match plan.uploads {
+                0 => String::new(),
+                1 => ", the parts of 1 unfinished upload".to_owned(),
+                uploads => format!(", the parts of {uploads} unfinished uploads"),
+            };
             text + &format!(
-                "{verb} {} blobs ({}); {} are needed{fresh}\n",
+                "{verb} {} blobs ({}){uploads}; {} are needed{fresh}\n",
                 plan.remove.len(),
                 size(plan.bytes),
                 plan.kept
