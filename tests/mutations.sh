@@ -69,7 +69,7 @@ mutation pipe-as-token-file trainer/access/src/file.rs 's/if file\.metadata\(\)\
 mutation lock-follows-links registry/src/blob/disk.rs 's/OFlag::O_NOFOLLOW \| //' registry:lib:lock
 mutation gang-in-the-clear worker/src/gang/seal.rs 's/Ok\(stream\.local_addr\(\)\?\.ip\(\)\.to_canonical\(\) != .*\)$/Ok(stream.local_addr().is_err())/m' worker:lib:gang
 mutation nonce-that-repeats worker/src/gang/seal.rs 's/bytes\[4\.\.\]\.copy_from_slice\(&number\.to_le_bytes\(\)\);/let _ = number; bytes[4] = 1;/' worker:lib:gang
-mutation every-queued-run-is-visited trainer/coordinator/src/schedule.rs 's/(let prepared = )(prepared_gangs)/cx.state.visits += cx.state.runs.size() as u64;\n    $1$2/' coordinator:decisions:queued
+mutation every-queued-run-is-visited trainer/coordinator/src/decide/schedule.rs 's/(let prepared = )(prepared_gangs)/cx.state.visits += cx.state.runs.size() as u64;\n    $1$2/' coordinator:decisions:queued
 mutation a-rank-is-not-brought-up-to-date trainer/coordinator/src/state/apply.rs 's/(concerned\.append\(&mut self\.concerned\(fact\)\);)/$1\n        concerned.clear();/' coordinator:decisions
 mutation parts-of-a-given-up-snapshot-count registry/src/sqlite/apply.rs 's/run\(conn, sqlx::query\(given_up\)\.bind\(int\(seq\)\)\.bind\(int\(seq\)\)\)\.await\?;/let _ = given_up;/' registry:catalog_conformance
 mutation readers-take-all-connections trainer/coordinator/src/shell/listener.rs 's/own >= limits\.of_token/own > limits.most/' coordinator:server:limits
@@ -119,7 +119,7 @@ mutation word-outlives-membership trainer/coordinator/src/state/apply.rs 's/drop
 mutation old-report-is-believed trainer/coordinator/src/state/evidence.rs 's/ && word\.grant\.fence == self\.task\.fence && !any_holds =>/ \&\& (any_holds || !any_holds) =>/' coordinator:lib:evidence
 mutation suspicion-never-fades trainer/coordinator/src/decide/gangs.rs 's/saturating_sub\(u32::try_from\(faded\)[^)]*\)\)/saturating_sub(u32::try_from(faded * 0).unwrap_or(0))/' coordinator:decisions:gangs
 mutation too-few-lose-their-state trainer/coordinator/src/decide/attempts.rs 's/!left\.is_empty\(\) && self\.may_hold/left.is_empty() \&\& self.may_hold/' coordinator:decisions:gangs
-mutation failing-lead-ends-the-try trainer/coordinator/src/outcome.rs 's/&& self\.goes_on_without/\&\& !self.goes_on_without/' coordinator:decisions:gangs
+mutation failing-lead-ends-the-try trainer/coordinator/src/decide/outcome.rs 's/&& self\.goes_on_without/\&\& !self.goes_on_without/' coordinator:decisions:gangs
 mutation joins-without-reaching worker/src/prepare.rs 's/for Member \{ worker, peer_address, \.\. \} in &task\.peers \{/for Member { worker, peer_address, .. } in task.peers.iter().take(0) {/' worker:lib:prepare
 mutation only-whole-frames-count worker/src/gang/link.rs 's/if count > 0 \{/if count > 1 << 20 {/' worker:lib:relay
 mutation signs-behind-frames worker/src/gang/link.rs 's/writer\.sign\(sign, patience, abort\)\?;/let _ = sign;/' worker:lib:relay
@@ -132,5 +132,5 @@ mutation parts-of-a-killed-process-stay registry/src/retention.rs 's/place\.ask\
 mutation upload-without-a-record registry/src/blob/objects/multipart.rs 's/store\.put\(&record, text\.into\(\)\)\.await\.map\(\|_\| \(\)\)/Ok(drop(text))/' registry:conformance:parts_that
 mutation held-until-the-restart registry/src/store.rs 's/self\.order\(Order::Hold \{ task: task\.clone\(\), digest \}\)\.await\?;//' registry:retention:upload
 mutation digesting-goes-on trainer/motion/src/files.rs 's/if !go_on\(\) \{/if false \&\& !go_on() {/' motion:lib:data_access
-mutation ended-states-stay trainer/coordinator/src/outcome.rs 's/(keep, )at_end: true/$1at_end: false/' coordinator:decisions:ended
+mutation ended-states-stay trainer/coordinator/src/decide/outcome.rs 's/(keep, )at_end: true/$1at_end: false/' coordinator:decisions:ended
 exit $missed

@@ -1,4 +1,4 @@
 #![no_main]
 libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
-    stages::testing::hostile::run("vocabulary", bytes);
+    stage_lab::hostile::run("vocabulary", bytes);
 });

@@ -312,7 +312,10 @@ fn a_shell_and_a_manual_get_what_they_read() {
 fn a_doctor_says_what_is_missing_and_what_to_do() {
     let bench = Bench::new(TRAINER);
     let said = bench.run(&["doctor"]).expect_code(0).stdout;
-    assert!(said.contains("warn  store    there is none in `.stride`; `trainer run PIPELINE` makes one"), "{said}");
+    assert!(
+        said.contains("warn  store    there is no store in `.stride`; `trainer run PIPELINE` creates one"),
+        "{said}"
+    );
     assert!(said.contains("ok    device   `flex`") && said.contains("  disk  "), "{said}");
     bench.run(&["run", &Bench::config("smoke.yaml"), "--until", "dataset", "--workers", "1"]).expect_code(0);
     let said = bench.run(&["doctor", "-o", "json"]).expect_code(0).json();

@@ -4,6 +4,8 @@
 //! followed through `use` declarations to the file that defines its item. A re-export (`pub use`) does not count as a
 //! use, and neither does code behind `#[cfg(test)]`. Not seen: methods, names from a glob, inline modules, and code
 //! from macros.
+//!
+//! Folders are held to the same rule: [`folder_loops`].
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -30,6 +32,35 @@ struct Module {
 ///
 /// If a file of the crate cannot be read.
 pub fn loops(root: &Path) -> Vec<String> {
+    closing(&needs(root))
+}
+
+/// The imports that close loops between the folders of the crate with the root file `root`, each as
+/// `FOLDER -> FOLDER: NAME`. A folder stands for all files in it, beside the other files and folders of its parent; the
+/// file of a folder's own module (`mod.rs`) is one file of that folder.
+///
+/// # Panics
+///
+/// If a file of the crate cannot be read.
+pub fn folder_loops(root: &Path) -> Vec<String> {
+    let mut levels: BTreeMap<PathBuf, Needs> = BTreeMap::new();
+    for (from, all) in needs(root) {
+        for (to, name) in all {
+            let common: PathBuf =
+                from.iter().zip(to.iter()).take_while(|(a, b)| a == b).map(|(same, _)| same).collect();
+            let child = |file: &Path| common.join(file.iter().nth(common.iter().count()).expect("two files differ"));
+            // `stream.rs` and the folder `stream` are one module.
+            let (from, to) = (child(&from).with_extension(""), child(&to).with_extension(""));
+            if from != to {
+                levels.entry(common).or_default().entry(from).or_default().insert(to, name);
+            }
+        }
+    }
+    levels.values().flat_map(closing).collect()
+}
+
+/// The files that each file of a crate needs.
+fn needs(root: &Path) -> Needs {
     let mut modules = BTreeMap::new();
     read(&mut modules, root, &[], &root.with_file_name(""));
     let mut needs = Needs::new();
@@ -39,8 +70,13 @@ pub fn loops(root: &Path) -> Vec<String> {
             needs.entry(module.file.clone()).or_default().insert(file, name);
         }
     }
+    needs
+}
+
+/// The imports that are part of a loop.
+fn closing(needs: &Needs) -> Vec<String> {
     let imports = needs.iter().flat_map(|(from, all)| all.iter().map(move |(to, name)| (from, to, name)));
-    let closing = imports.filter(|(from, to, _)| reached(&needs, to).contains(from));
+    let closing = imports.filter(|(from, to, _)| reached(needs, to).contains(from));
     closing.map(|(from, to, name)| format!("{} -> {}: {name}", from.display(), to.display())).collect()
 }
 
@@ -171,5 +207,27 @@ mod tests {
             found.len() == 2 && found[0].ends_with("nested.rs: Deep") && found[1].ends_with("a.rs: Apple"),
             "{found:?}"
         );
+    }
+
+    #[test]
+    fn folders_that_import_each_other_are_found_without_a_loop_of_files() {
+        let dir = tempfile::tempdir().expect("a folder");
+        let file = |name: &str, text: &str| {
+            let path = dir.path().join(name);
+            fs::create_dir_all(path.parent().expect("a folder")).expect("a folder");
+            fs::write(path, text).expect("a file");
+        };
+        file("lib.rs", "mod high;\nmod low;\n");
+        file("high/mod.rs", "mod user;\npub mod word;\n");
+        file("high/user.rs", "use crate::low::net::Net;\n");
+        file("high/word.rs", "pub struct Word;\n");
+        file("low/mod.rs", "pub mod net;\n");
+        file("low/net.rs", "pub struct Net;\n");
+        let root = dir.path().join("lib.rs");
+        assert!(folder_loops(&root).is_empty(), "{:?}", folder_loops(&root));
+        file("low/net.rs", "use crate::high::word::Word;\npub struct Net;\n");
+        assert!(loops(&root).is_empty());
+        let found = folder_loops(&root);
+        assert!(found.len() == 2 && found[0].ends_with("low: Net") && found[1].ends_with("high: Word"), "{found:?}");
     }
 }

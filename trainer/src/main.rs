@@ -3,26 +3,11 @@
 //! No logic of its own: it reads arguments and files, starts a coordinator and worker processes, and prints their
 //! results.
 
-mod advice;
 mod cli;
 mod client;
-mod cost;
-mod figure;
-mod fleet;
-mod hub_names;
-mod missing;
-mod out_of_memory;
-mod pictures;
-mod pipeline_file;
-mod plan;
-mod print;
-mod problem;
-mod progress;
+mod local;
 mod reader;
-mod run;
-mod summary;
-mod sweep_plot;
-mod verify;
+mod report;
 
 use std::process::ExitCode;
 

@@ -8,12 +8,12 @@
 mod args;
 mod bundles;
 mod client;
+mod command;
 mod export;
 mod print;
 
 use std::collections::BTreeMap;
 
-use access::Scope;
 use checkpoint::model::{self, Model as ModelMeta, Parts};
 use protocol::artifact::Role;
 use protocol::message::ApiError;
@@ -23,6 +23,7 @@ use serde::{Deserialize, Serialize};
 pub use args::{Output, OutputArg, Verb};
 pub use bundles::import;
 pub use client::{ask, execute};
+pub use command::Command;
 pub use print::{render, show_error};
 
 use crate::audit::{self, AuditEntry};
@@ -45,172 +46,6 @@ Exit codes:
     7  there is no such model, version, run or artifact
     9  stored data is damaged
    10  a gate does not hold; nothing was changed";
-
-/// A request to a registry.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(tag = "command", rename_all = "kebab-case")]
-pub enum Command {
-    /// Lists all models.
-    List,
-    /// Shows a model with its versions, or one version.
-    Show {
-        /// A reference: `MODEL`, `MODEL@ALIAS`, `MODEL:VERSION`.
-        reference: String,
-    },
-    /// Shows the moves of a model's aliases.
-    History {
-        model: String,
-        /// Shows only this alias.
-        alias: Option<String>,
-    },
-    /// Moves an alias to a version.
-    Promote {
-        /// A reference: `MODEL@ALIAS`, `MODEL@best`, `MODEL:VERSION`.
-        reference: String,
-        /// The alias to move.
-        to: String,
-        /// Expected current version of the alias.
-        expect: Option<Expect>,
-        /// Gates as written.
-        require: Vec<String>,
-        /// Reason for the log.
-        reason: String,
-    },
-    /// Moves an alias back.
-    Rollback {
-        model: String,
-        alias: String,
-        /// The target version; `None` means the version before the last promotion.
-        to: Option<u64>,
-        /// Expected current version of the alias.
-        expect: Option<Expect>,
-        /// Reason for the log.
-        reason: String,
-    },
-    /// Compares two versions metric by metric.
-    Compare {
-        /// A reference: `MODEL` (its best version), `MODEL@ALIAS`, `MODEL:VERSION`.
-        left: String,
-        /// The other version, in the same form.
-        right: String,
-        /// Format of the table.
-        style: Style,
-    },
-    /// Shows all versions of a model, or of all models of a data format, with the papers' metrics.
-    Leaderboard {
-        /// A model, or `humanml3d` or `kit`.
-        of: String,
-        /// Includes the papers' rows.
-        published: bool,
-        /// Format of the table.
-        style: Style,
-    },
-    /// Shows the artifacts that an artifact was made from.
-    Lineage {
-        /// A model version or a digest.
-        reference: String,
-    },
-    /// Checks the whole store.
-    Fsck,
-    /// Removes blobs that are no longer needed.
-    Gc {
-        /// Only lists the blobs to remove.
-        dry_run: bool,
-        /// Minutes for which a fresh blob is kept.
-        grace_minutes: Option<u32>,
-    },
-    /// Deletes an ended run.
-    Forget {
-        /// Name of the run.
-        run: String,
-    },
-    /// Deletes runs that ended before a time.
-    ForgetEnded {
-        /// The time, in milliseconds since 1970.
-        before_ms: i64,
-    },
-    /// Deletes unreferenced data of runs that ended before a time; the runs stay.
-    ForgetLeftovers {
-        /// The time, in milliseconds since 1970.
-        before_ms: i64,
-    },
-    /// Shows the newest lines of the audit log.
-    Audit {
-        /// Number of lines.
-        limit: usize,
-    },
-}
-
-impl Command {
-    /// Returns the scope that a token needs for the command.
-    pub fn scope(&self) -> Scope {
-        match self {
-            Self::List
-            | Self::Show { .. }
-            | Self::History { .. }
-            | Self::Compare { .. }
-            | Self::Leaderboard { .. }
-            | Self::Lineage { .. } => Scope::Read,
-            Self::Promote { .. } | Self::Rollback { .. } => Scope::Promote,
-            // Reads every byte of the store.
-            Self::Audit { .. }
-            | Self::Fsck
-            | Self::Gc { .. }
-            | Self::Forget { .. }
-            | Self::ForgetEnded { .. }
-            | Self::ForgetLeftovers { .. } => Scope::Admin,
-        }
-    }
-
-    /// Returns the model and alias that the command moves.
-    pub fn moves(&self) -> Option<(&str, &str)> {
-        match self {
-            Self::Promote { reference, to, .. } => Some((reference, to)),
-            Self::Rollback { model, alias, .. } => Some((model, alias)),
-            _ => None,
-        }
-    }
-
-    /// Formats the command and its object for a log.
-    pub fn in_short(&self) -> String {
-        match self {
-            Self::List => "list".into(),
-            Self::Show { reference } => format!("show {reference}"),
-            Self::History { model, .. } => format!("history {model}"),
-            Self::Promote { reference, to, .. } => format!("promote {reference} to {to}"),
-            Self::Rollback { model, alias, .. } => format!("rollback {model}@{alias}"),
-            Self::Compare { left, right, .. } => format!("compare {left} {right}"),
-            Self::Leaderboard { of, .. } => format!("leaderboard {of}"),
-            Self::Lineage { reference } => format!("lineage {reference}"),
-            Self::Fsck => "fsck".into(),
-            Self::Gc { dry_run, .. } => if *dry_run { "gc --dry-run" } else { "gc" }.into(),
-            Self::Forget { run } => format!("forget {run}"),
-            Self::ForgetEnded { before_ms } => format!("forget --ended-before {before_ms}"),
-            Self::ForgetLeftovers { before_ms } => format!("forget --leftovers-before {before_ms}"),
-            Self::Audit { limit } => format!("audit {limit}"),
-        }
-    }
-
-    /// Returns true if the command changes nothing in the store and therefore needs no holder.
-    pub fn only_reads(&self) -> bool {
-        match self {
-            Self::List
-            | Self::Show { .. }
-            | Self::History { .. }
-            | Self::Compare { .. }
-            | Self::Leaderboard { .. }
-            | Self::Lineage { .. }
-            | Self::Audit { .. }
-            | Self::Fsck => true,
-            Self::Gc { dry_run, .. } => *dry_run,
-            Self::Promote { .. }
-            | Self::Rollback { .. }
-            | Self::Forget { .. }
-            | Self::ForgetEnded { .. }
-            | Self::ForgetLeftovers { .. } => false,
-        }
-    }
-}
 
 /// Result of a command.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -407,20 +242,9 @@ async fn answer(command: Command, store: &ReadStore, holder: Option<(&Store, &st
             Data::History { model, history }
         }
         Command::Promote { reference, to, expect, require, reason } => {
-            let reference: ModelRef = reference.parse().map_err(invalid)?;
-            let alias: Alias = to.parse().map_err(invalid)?;
-            for gate in &require {
-                gate.parse::<Gate>().map_err(invalid)?;
-            }
-            let Some(pick) = reference.pick else {
-                let model = reference.model;
-                return Err(invalid(format!(
-                    "`{model}` has several versions: say `{model}@best` or `{model}:VERSION`"
-                )));
-            };
             let (store, actor) = writes()?;
-            let promotion = store.promote(&reference.model, pick, &alias, expect, require, &reason, actor).await?;
-            Data::Promotion { promotion }
+            let order = Move { reference: &reference, to: &to, expect, require, reason: &reason };
+            Data::Promotion { promotion: promote(store, actor, order).await? }
         }
         Command::Rollback { model, alias, to, expect, reason } => {
             let (model, alias): (ModelName, Alias) = (model.parse().map_err(invalid)?, alias.parse().map_err(invalid)?);
@@ -435,66 +259,104 @@ async fn answer(command: Command, store: &ReadStore, holder: Option<(&Store, &st
         Command::Leaderboard { of, published, style } => {
             Data::Leaderboard { leaderboard: leaderboard(store, &of, published).await?, style }
         }
-        Command::Lineage { reference } => {
-            let digest = match reference.parse::<Digest>() {
-                Ok(digest) => digest,
-                Err(_) => store.resolve(&reference).await?.artifact,
-            };
-            let nodes = store.lineage(digest).await?;
-            if nodes.iter().all(|node| node.kind.is_none() && node.inputs.is_empty()) && !exists(store, digest).await? {
-                return Err(Refused::from(QueryError::NotFound(format!("no artifact {digest}"))));
-            }
-            Data::Lineage { nodes }
-        }
-        Command::Audit { limit } => {
-            let dir = store.dir().to_owned();
-            let read = tokio::task::spawn_blocking(move || audit::read(&dir, limit.min(MOST_LINES))).await;
-            let failed = |e: &dyn std::fmt::Display| QueryError::Storage(format!("the audit log cannot be read: {e}"));
-            Data::Audit { entries: read.map_err(|e| failed(&e))?.map_err(|e| failed(&e))? }
-        }
-        Command::Fsck => {
-            let report = store.fsck().await?;
-            if !report.problems.is_empty() {
-                let message = format!("{} problems found; the first: {}", report.problems.len(), report.problems[0]);
-                let hint = "restore the store from a backup, or remove the damaged blobs under `blobs/` and run the pipelines \
-                            that made them again";
-                let mut answer = Answer::refused(error("damaged", message, Some(hint)));
-                answer.data = Some(Data::Fsck { report });
-                return Err(answer.into());
-            }
-            Data::Fsck { report }
-        }
+        Command::Lineage { reference } => lineage(store, &reference).await?,
+        Command::Audit { limit } => audit(store, limit).await?,
+        Command::Fsck => verified(store.fsck().await?)?,
         Command::Gc { dry_run, grace_minutes } => {
             let grace_ms = grace_minutes.map_or(GRACE_MS, |minutes| i64::from(minutes) * 60_000);
             let plan = if dry_run { store.gc_plan(grace_ms).await? } else { writes()?.0.gc(grace_ms).await? };
             Data::Gc { dry_run, plan }
         }
-        Command::Forget { run } => {
-            let run = RunId::new(run);
-            let gone = writes()?.0.forget(&run).await?;
-            Data::Forgotten { runs: vec![(run, gone)] }
-        }
-        Command::ForgetEnded { before_ms } => {
-            let mut runs = Vec::new();
-            // One transaction each, so that other writes can proceed in between.
-            for run in store.ended_before(before_ms).await? {
-                let gone = writes()?.0.forget(&run).await?;
-                runs.push((run, gone));
-            }
-            Data::Forgotten { runs }
-        }
-        Command::ForgetLeftovers { before_ms } => {
-            let mut runs = Vec::new();
-            for run in store.ended_before(before_ms).await? {
-                let gone = writes()?.0.forget_leftovers(&run, before_ms).await?;
-                if gone != Forgotten::default() {
-                    runs.push((run, gone));
+        Command::Forget { run, ended_before, leftovers_before } => {
+            let store = writes()?.0;
+            let runs = match (run, ended_before, leftovers_before) {
+                (Some(run), None, None) => {
+                    let run = RunId::new(run);
+                    let gone = store.forget(&run).await?;
+                    vec![(run, gone)]
                 }
-            }
+                (None, Some(before_ms), None) => forget_ended(store, before_ms).await?,
+                (None, None, Some(before_ms)) => forget_leftovers(store, before_ms).await?,
+                _ => return Err(invalid("`forget` needs one run, `ended_before` or `leftovers_before`")),
+            };
             Data::Forgotten { runs }
         }
     };
     Ok(Answer::done(data))
+}
+
+/// A promotion as written.
+struct Move<'a> {
+    reference: &'a str,
+    to: &'a str,
+    expect: Option<Expect>,
+    require: Vec<String>,
+    reason: &'a str,
+}
+
+async fn promote(store: &Store, actor: &str, order: Move<'_>) -> Result<Promotion, Refused> {
+    let reference: ModelRef = order.reference.parse().map_err(invalid)?;
+    let alias: Alias = order.to.parse().map_err(invalid)?;
+    for gate in &order.require {
+        gate.parse::<Gate>().map_err(invalid)?;
+    }
+    let Some(pick) = reference.pick else {
+        let model = reference.model;
+        return Err(invalid(format!("`{model}` has several versions; write `{model}@best` or `{model}:VERSION`")));
+    };
+    let Move { expect, require, reason, .. } = order;
+    Ok(store.promote(&reference.model, pick, &alias, expect, require, reason, actor).await?)
+}
+
+async fn lineage(store: &ReadStore, reference: &str) -> Result<Data, Refused> {
+    let digest = match reference.parse::<Digest>() {
+        Ok(digest) => digest,
+        Err(_) => store.resolve(reference).await?.artifact,
+    };
+    let nodes = store.lineage(digest).await?;
+    if nodes.iter().all(|node| node.kind.is_none() && node.inputs.is_empty()) && !exists(store, digest).await? {
+        return Err(Refused::from(QueryError::NotFound(format!("no artifact {digest}"))));
+    }
+    Ok(Data::Lineage { nodes })
+}
+
+async fn audit(store: &ReadStore, limit: usize) -> Result<Data, Refused> {
+    let dir = store.dir().to_owned();
+    let read = tokio::task::spawn_blocking(move || audit::read(&dir, limit.min(MOST_LINES))).await;
+    let failed = |e: &dyn std::fmt::Display| QueryError::Storage(format!("the audit log cannot be read: {e}"));
+    Ok(Data::Audit { entries: read.map_err(|e| failed(&e))?.map_err(|e| failed(&e))? })
+}
+
+/// Returns the report, or an error with the report if it has problems.
+fn verified(report: fsck::Report) -> Result<Data, Refused> {
+    let Some(first) = report.problems.first() else { return Ok(Data::Fsck { report }) };
+    let message = format!("{} problems found; the first: {first}", report.problems.len());
+    let hint = "restore the store from a backup, or remove the damaged blobs under `blobs/` and run the pipelines \
+                that made them again";
+    let mut answer = Answer::refused(error("damaged", message, Some(hint)));
+    answer.data = Some(Data::Fsck { report });
+    Err(answer.into())
+}
+
+/// Deletes runs in one transaction each, so that other writes can proceed in between.
+async fn forget_ended(store: &Store, before_ms: i64) -> Result<Vec<(RunId, Forgotten)>, Refused> {
+    let mut runs = Vec::new();
+    for run in store.ended_before(before_ms).await? {
+        let gone = store.forget(&run).await?;
+        runs.push((run, gone));
+    }
+    Ok(runs)
+}
+
+async fn forget_leftovers(store: &Store, before_ms: i64) -> Result<Vec<(RunId, Forgotten)>, Refused> {
+    let mut runs = Vec::new();
+    for run in store.ended_before(before_ms).await? {
+        let gone = store.forget_leftovers(&run, before_ms).await?;
+        if gone != Forgotten::default() {
+            runs.push((run, gone));
+        }
+    }
+    Ok(runs)
 }
 
 /// Returns the version that a reference names. A model alone means its best version, or its newest if no metric ranks

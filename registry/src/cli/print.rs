@@ -7,15 +7,17 @@ use checkpoint::model::{Model, Parts};
 use comfy_table::{ContentArrangement, Table, presets};
 use protocol::artifact::Role;
 use protocol::message::ApiError;
-use protocol::{Digest, Manifest, printable};
+use protocol::{Digest, Manifest, RunId, printable};
 use serde_json::json;
 
 use super::{Answer, Data, Output};
+use crate::audit::AuditEntry;
 use crate::backup::Summary;
 use crate::clock::format_ms;
 use crate::forget::Forgotten;
-use crate::leaderboard;
-use crate::versions::{Action, Promotion, Version};
+use crate::retention::Plan;
+use crate::versions::{self, Action, Promotion, Version};
+use crate::{LineageNode, fsck, leaderboard};
 
 /// Prints an answer.
 pub(super) fn show(answer: &Answer, output: Output) -> io::Result<()> {
@@ -48,99 +50,12 @@ pub fn show_error(error: &ApiError, output: Output) -> io::Result<()> {
 /// Formats an answer's data as text.
 pub fn render(data: &Data) -> String {
     match data {
-        Data::Models { models } if models.is_empty() => "no models yet: a `register` stage makes one\n".into(),
-        Data::Models { models } => {
-            let mut table = table(&["MODEL", "VERSIONS", "BEST", "METRIC", "ALIASES"]);
-            for model in models {
-                let mode = model.mode.map(|mode| format!(" ({})", json!(mode).as_str().unwrap_or_default()));
-                table.add_row([
-                    model.model.to_string(),
-                    model.versions.to_string(),
-                    dash(model.best),
-                    format!("{}{}", dash(model.metric.as_ref()), mode.unwrap_or_default()),
-                    list(model.aliases.iter().map(|(alias, version)| format!("{alias}={version}"))),
-                ]);
-            }
-            format!("{}\n", table.trim_fmt())
-        }
-        Data::Model { model, versions } => {
-            let mut table = table(&["VERSION", "ALIASES", "METRICS", "FROM", "REGISTERED"]);
-            for version in versions {
-                let best = (model.best == Some(version.version)).then(|| "best".to_owned());
-                table.add_row([
-                    version.version.to_string(),
-                    list(best.into_iter().chain(version.aliases.iter().cloned())),
-                    list(
-                        leaderboard::in_brief(version, model.metric.as_deref())
-                            .into_iter()
-                            .map(|(metric, measure)| format!("{metric}={}", leaderboard::in_words(measure))),
-                    ),
-                    source(version),
-                    format_ms(version.created_ms),
-                ]);
-            }
-            format!("{}\n{}\n", model.model, table.trim_fmt())
-        }
-        Data::Version { version, manifest, fits, bases } => {
-            let mut text = format!("{}:{}\n", version.model, version.version);
-            let lines = [
-                ("artifact", version.artifact.to_string()),
-                ("aliases", list(version.aliases.iter().cloned())),
-                ("from", source(version)),
-                ("registered", format_ms(version.created_ms)),
-            ];
-            for (name, value) in lines.into_iter().chain(drawn(manifest)).chain(made_for(fits)).chain(beside(bases)) {
-                text += &format!("  {name:<11} {value}\n");
-            }
-            let mut values = table(&["EVALUATION", "METRIC", "VALUE, ± HALF THE 95 % INTERVAL"]);
-            for (stage, measures) in leaderboard::measured(version) {
-                for (metric, measure) in leaderboard::in_order(&measures) {
-                    values.add_row([dash(stage.as_ref()), metric.clone(), leaderboard::in_words(measure)]);
-                }
-            }
-            if !version.metrics.is_empty() {
-                text += &format!("{}\n\n", values.trim_fmt());
-            }
-            let mut table = table(&["FILE", "BYTES", "BLOB"]);
-            for (name, file) in &manifest.files {
-                table.add_row([name.clone(), file.bytes.to_string(), file.digest.short()]);
-            }
-            format!("{text}{}\n", table.trim_fmt())
-        }
+        Data::Models { models } => models_as_table(models),
+        Data::Model { model, versions } => versions_as_table(model, versions),
+        Data::Version { version, manifest, fits, bases } => version_in_full(version, manifest, fits, bases),
         Data::History { model, history } if history.is_empty() => format!("no alias of `{model}` has moved yet\n"),
-        Data::History { history, .. } => {
-            let mut table = table(&["#", "WHEN", "ALIAS", "ACTION", "FROM", "TO", "WHO", "WHY", "GATES"]);
-            for entry in history {
-                table.add_row([
-                    entry.id.to_string(),
-                    format_ms(entry.at_ms),
-                    entry.alias.to_string(),
-                    action(entry).to_owned(),
-                    dash(entry.from),
-                    entry.to.to_string(),
-                    entry.actor.clone(),
-                    entry.reason.clone(),
-                    list(entry.gates.iter().map(|gate| format!("{} ({})", gate.gate, dash(gate.value)))),
-                ]);
-            }
-            format!("{}\n", table.trim_fmt())
-        }
-        Data::Audit { entries } if entries.is_empty() => "the audit log is empty\n".into(),
-        Data::Audit { entries } => {
-            let mut table = table(&["WHEN", "WHO", "FROM", "CALL", "OBJECT", "STATUS", "CALLS"]);
-            for entry in entries {
-                table.add_row([
-                    format_ms(entry.at_ms),
-                    entry.who.clone(),
-                    entry.from.clone(),
-                    entry.call.clone(),
-                    entry.object.clone(),
-                    entry.status.to_string(),
-                    entry.count.to_string(),
-                ]);
-            }
-            format!("{}\n", table.trim_fmt())
-        }
+        Data::History { history, .. } => history_as_table(history),
+        Data::Audit { entries } => audit_as_table(entries),
         Data::Promotion { promotion } => {
             let Promotion { model, alias, from, to, .. } = promotion;
             let from = from.map_or_else(|| "nothing".into(), |from| format!("version {from}"));
@@ -152,72 +67,13 @@ pub fn render(data: &Data) -> String {
         }
         Data::Comparison { comparison, style } => comparison.render(*style),
         Data::Leaderboard { leaderboard, style } => leaderboard.render(*style),
-        Data::Lineage { nodes } => {
-            let mut table = table(&["ARTIFACT", "KIND", "STAGE", "RUN", "MADE OF"]);
-            for node in nodes {
-                table.add_row([
-                    format!("{}{}", "  ".repeat(node.depth as usize), node.digest.short()),
-                    dash(node.kind.as_ref()),
-                    dash(node.stage.as_ref()),
-                    dash(node.run.as_ref()),
-                    list(node.inputs.iter().map(|(role, digest)| format!("{role}={}", digest.short()))),
-                ]);
-            }
-            format!("{}\n", table.trim_fmt())
-        }
-        Data::Fsck { report } => {
-            let mut text = format!(
-                "{} blobs ({}) hashed, {} references followed, {} problems\n",
-                report.blobs,
-                size(report.bytes),
-                report.references,
-                report.problems.len()
-            );
-            for problem in &report.problems {
-                text += &format!("  {problem}\n");
-            }
-            for note in &report.notes {
-                text += &format!("  note: {note}\n");
-            }
-            text
-        }
-        Data::Gc { dry_run, plan } => {
-            let mut text = String::new();
-            for digest in &plan.remove {
-                text += &format!("  {digest}\n");
-            }
-            let verb = if *dry_run { "would remove" } else { "removed" };
-            let fresh =
-                if plan.fresh == 0 { String::new() } else { format!(", {} within their grace period", plan.fresh) };
-            let uploads = match plan.uploads {
-                0 => String::new(),
-                1 => ", the parts of 1 unfinished upload".to_owned(),
-                uploads => format!(", the parts of {uploads} unfinished uploads"),
-            };
-            text + &format!(
-                "{verb} {} blobs ({}){uploads}; {} are needed{fresh}\n",
-                plan.remove.len(),
-                size(plan.bytes),
-                plan.kept
-            )
-        }
+        Data::Lineage { nodes } => lineage_as_table(nodes),
+        Data::Fsck { report } => problems_of(report),
+        Data::Gc { dry_run, plan } => removed(*dry_run, plan),
         Data::Adopted { store } => {
             format!("store {store} is repaired; `registry fsck` lists missing data\n")
         }
-        Data::Forgotten { runs } if runs.is_empty() => "no run that ended before that time has data to forget\n".into(),
-        Data::Forgotten { runs } => {
-            let mut text = String::new();
-            for (run, gone) in runs {
-                let Forgotten { values, lines, checkpoints, results, kept } = gone;
-                text += &format!(
-                    "forgot {run}: {values} values, {lines} log lines, {checkpoints} checkpoints, {results} results of stages\n"
-                );
-                for stage in kept {
-                    text += &format!("  {stage} stays: a model, a pin or another run needs it\n");
-                }
-            }
-            text + "`registry gc` removes blobs that are no longer needed\n"
-        }
+        Data::Forgotten { runs } => forgotten(runs),
         Data::BackedUp { summary, dir } => {
             let Summary { store, at_ms, blobs, bytes } = summary;
             let (at, bytes, dir) = (format_ms(*at_ms), size(*bytes), dir.display());
@@ -242,6 +98,168 @@ pub fn render(data: &Data) -> String {
             )
         }
     }
+}
+
+fn models_as_table(models: &[versions::Model]) -> String {
+    if models.is_empty() {
+        return "no models yet; a `register` stage creates one\n".into();
+    }
+    let mut table = table(&["MODEL", "VERSIONS", "BEST", "METRIC", "ALIASES"]);
+    for model in models {
+        let mode = model.mode.map(|mode| format!(" ({})", json!(mode).as_str().unwrap_or_default()));
+        table.add_row([
+            model.model.to_string(),
+            model.versions.to_string(),
+            dash(model.best),
+            format!("{}{}", dash(model.metric.as_ref()), mode.unwrap_or_default()),
+            list(model.aliases.iter().map(|(alias, version)| format!("{alias}={version}"))),
+        ]);
+    }
+    format!("{}\n", table.trim_fmt())
+}
+
+fn versions_as_table(model: &versions::Model, versions: &[Version]) -> String {
+    let mut table = table(&["VERSION", "ALIASES", "METRICS", "FROM", "REGISTERED"]);
+    for version in versions {
+        let best = (model.best == Some(version.version)).then(|| "best".to_owned());
+        let metrics = leaderboard::in_brief(version, model.metric.as_deref());
+        table.add_row([
+            version.version.to_string(),
+            list(best.into_iter().chain(version.aliases.iter().cloned())),
+            list(metrics.into_iter().map(|(metric, measure)| format!("{metric}={}", leaderboard::in_words(measure)))),
+            source(version),
+            format_ms(version.created_ms),
+        ]);
+    }
+    format!("{}\n{}\n", model.model, table.trim_fmt())
+}
+
+fn version_in_full(version: &Version, manifest: &Manifest, fits: &BTreeMap<Role, Parts>, bases: &[String]) -> String {
+    let mut text = format!("{}:{}\n", version.model, version.version);
+    let lines = [
+        ("artifact", version.artifact.to_string()),
+        ("aliases", list(version.aliases.iter().cloned())),
+        ("from", source(version)),
+        ("registered", format_ms(version.created_ms)),
+    ];
+    for (name, value) in lines.into_iter().chain(drawn(manifest)).chain(made_for(fits)).chain(beside(bases)) {
+        text += &format!("  {name:<11} {value}\n");
+    }
+    let mut values = table(&["EVALUATION", "METRIC", "VALUE, ± HALF THE 95 % INTERVAL"]);
+    for (stage, measures) in leaderboard::measured(version) {
+        for (metric, measure) in leaderboard::in_order(&measures) {
+            values.add_row([dash(stage.as_ref()), metric.clone(), leaderboard::in_words(measure)]);
+        }
+    }
+    if !version.metrics.is_empty() {
+        text += &format!("{}\n\n", values.trim_fmt());
+    }
+    let mut files = table(&["FILE", "BYTES", "BLOB"]);
+    for (name, file) in &manifest.files {
+        files.add_row([name.clone(), file.bytes.to_string(), file.digest.short()]);
+    }
+    format!("{text}{}\n", files.trim_fmt())
+}
+
+fn history_as_table(history: &[Promotion]) -> String {
+    let mut table = table(&["#", "WHEN", "ALIAS", "ACTION", "FROM", "TO", "WHO", "WHY", "GATES"]);
+    for entry in history {
+        table.add_row([
+            entry.id.to_string(),
+            format_ms(entry.at_ms),
+            entry.alias.to_string(),
+            action(entry).to_owned(),
+            dash(entry.from),
+            entry.to.to_string(),
+            entry.actor.clone(),
+            entry.reason.clone(),
+            list(entry.gates.iter().map(|gate| format!("{} ({})", gate.gate, dash(gate.value)))),
+        ]);
+    }
+    format!("{}\n", table.trim_fmt())
+}
+
+fn audit_as_table(entries: &[AuditEntry]) -> String {
+    if entries.is_empty() {
+        return "the audit log is empty\n".into();
+    }
+    let mut table = table(&["WHEN", "WHO", "FROM", "CALL", "OBJECT", "STATUS", "CALLS"]);
+    for entry in entries {
+        table.add_row([
+            format_ms(entry.at_ms),
+            entry.who.clone(),
+            entry.from.clone(),
+            entry.call.clone(),
+            entry.object.clone(),
+            entry.status.to_string(),
+            entry.count.to_string(),
+        ]);
+    }
+    format!("{}\n", table.trim_fmt())
+}
+
+fn lineage_as_table(nodes: &[LineageNode]) -> String {
+    let mut table = table(&["ARTIFACT", "KIND", "STAGE", "RUN", "MADE OF"]);
+    for node in nodes {
+        table.add_row([
+            format!("{}{}", "  ".repeat(node.depth as usize), node.digest.short()),
+            dash(node.kind.as_ref()),
+            dash(node.stage.as_ref()),
+            dash(node.run.as_ref()),
+            list(node.inputs.iter().map(|(role, digest)| format!("{role}={}", digest.short()))),
+        ]);
+    }
+    format!("{}\n", table.trim_fmt())
+}
+
+fn problems_of(report: &fsck::Report) -> String {
+    let mut text = format!(
+        "{} blobs ({}) hashed, {} references followed, {} problems\n",
+        report.blobs,
+        size(report.bytes),
+        report.references,
+        report.problems.len()
+    );
+    for problem in &report.problems {
+        text += &format!("  {problem}\n");
+    }
+    for note in &report.notes {
+        text += &format!("  note: {note}\n");
+    }
+    text
+}
+
+fn removed(dry_run: bool, plan: &Plan) -> String {
+    let mut text = String::new();
+    for digest in &plan.remove {
+        text += &format!("  {digest}\n");
+    }
+    let verb = if dry_run { "would remove" } else { "removed" };
+    let fresh = if plan.fresh == 0 { String::new() } else { format!(", {} within their grace period", plan.fresh) };
+    let (count, bytes, kept) = (plan.remove.len(), size(plan.bytes), plan.kept);
+    let uploads = match plan.uploads {
+        0 => String::new(),
+        1 => ", the parts of 1 unfinished upload".to_owned(),
+        uploads => format!(", the parts of {uploads} unfinished uploads"),
+    };
+    text + &format!("{verb} {count} blobs ({bytes}){uploads}; {kept} are needed{fresh}\n")
+}
+
+fn forgotten(runs: &[(RunId, Forgotten)]) -> String {
+    if runs.is_empty() {
+        return "no run that ended before that time has data to forget\n".into();
+    }
+    let mut text = String::new();
+    for (run, gone) in runs {
+        let Forgotten { values, lines, checkpoints, results, kept } = gone;
+        text += &format!(
+            "forgot {run}: {values} values, {lines} log lines, {checkpoints} checkpoints, {results} results of stages\n"
+        );
+        for stage in kept {
+            text += &format!("  {stage} stays: a model, a pin or another run needs it\n");
+        }
+    }
+    text + "`registry gc` removes blobs that are no longer needed\n"
 }
 
 fn table(header: &[&str]) -> Table {

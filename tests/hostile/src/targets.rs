@@ -178,7 +178,7 @@ fn sentences(bytes: &[u8]) -> bool {
 
 fn pipeline(bytes: &[u8]) -> bool {
     let Ok(content) = std::str::from_utf8(bytes) else { return false };
-    read(protocol::pipeline::read("x.yaml", content, &[])).is_some()
+    read(pipeline::read("x.yaml", content, &[])).is_some()
 }
 
 fn waypoints(bytes: &[u8]) -> bool {

@@ -12,9 +12,9 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use coordinator::{Config, Connections, Coordinator};
+use pipeline::{Pipeline, PipelineStage, StageInput};
 use protocol::Seed;
 use protocol::message::{Assignment, MetricBatch, MetricRow, Submit};
-use protocol::pipeline::{Pipeline, PipelineStage, StageInput};
 use protocol::stage::{Backend, DataSynthetic, EncodeLatents, Placement, StageSettings, TrainVae, WorkerRange};
 use registry::{Holder, Store};
 

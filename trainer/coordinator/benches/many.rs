@@ -13,11 +13,11 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use coordinator::{Config, Control, Coordinator, Handle};
+use pipeline::Pipeline;
 use protocol::limits;
 use protocol::message::{
     DesiredAssignments, Grant, Join, Joined, LogBatch, MetricBatch, MetricRow, PROTOCOL_VERSION, Poll, Submit,
 };
-use protocol::pipeline::Pipeline;
 use protocol::proof::SECRET_HEADER;
 use protocol::stage::Backend;
 use registry::cli::Command;
@@ -43,7 +43,7 @@ fn pipeline(seed: u64) -> Result<Pipeline> {
     let text = format!(
         "name: many\nseed: {seed}\ndataset: {{format: synthetic}}\nstages:\n  vae: {{kind: train.vae}}\n  latents: {{kind: encode.latents}}\n"
     );
-    protocol::pipeline::read("many.yaml", &text, &[]).map_err(|mistakes| mistakes.to_string().into())
+    pipeline::read("many.yaml", &text, &[]).map_err(|mistakes| mistakes.to_string().into())
 }
 
 async fn start(dir: &Path) -> Result<Handle> {
@@ -230,7 +230,7 @@ fn large(stages: usize, seed: u64) -> Result<serde_json::Value> {
     for i in 0..stages.saturating_sub(2) {
         text += &format!("  latents{i}: {{kind: encode.latents}}\n");
     }
-    let read = protocol::pipeline::read("large.yaml", &text, &[]).map_err(|mistakes| mistakes.to_string())?;
+    let read = pipeline::read("large.yaml", &text, &[]).map_err(|mistakes| mistakes.to_string())?;
     Ok(serde_json::to_value(read)?)
 }
 

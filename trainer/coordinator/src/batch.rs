@@ -16,10 +16,10 @@ use protocol::message::Poll;
 use registry::{Write, WriteError};
 
 use crate::decide::decide;
+use crate::decide::outcome::refused_for_good;
 use crate::event::{Effect, Event, Observation};
 use crate::invariants;
 use crate::observe::{is_quiet, observe};
-use crate::outcome::refused_for_good;
 use crate::rejected::Rejected;
 use crate::state::State;
 use crate::time::{Millis, Moment};

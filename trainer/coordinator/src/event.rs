@@ -4,8 +4,8 @@
 //! [`Observation`] is a poll or a tick of the clock. [`observe`](crate::observe) turns it into events only where
 //! something follows from it, so that heartbeats cost no disk write.
 
+use pipeline::Pipeline;
 use protocol::message::{CommitCheckpoint, Join, Poll, ReportOutcome, TaskOutcome};
-use protocol::pipeline::Pipeline;
 use protocol::stage::Keep;
 use protocol::{Alias, Digest, Fence, Incarnation, Owner, RunId, StageName, TaskId, WorkerId};
 use registry::Write;

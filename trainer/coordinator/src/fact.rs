@@ -10,8 +10,8 @@
 
 use std::collections::BTreeMap;
 
+use pipeline::PipelineStage;
 use protocol::message::{ReportOutcome, RunState};
-use protocol::pipeline::PipelineStage;
 use protocol::stage::Placement;
 use protocol::{Attempt, Digest, Fence, RunId, StageName, WorkerId};
 use serde::{Deserialize, Serialize};

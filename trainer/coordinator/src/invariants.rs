@@ -26,7 +26,7 @@ use std::sync::Arc;
 
 use protocol::message::{Member, RunState};
 
-use crate::schedule;
+use crate::decide::schedule;
 use crate::state::State;
 use crate::state::evidence;
 use crate::state::execution::{ExecutionState, StageExecution};

@@ -16,26 +16,22 @@ mod history;
 pub mod invariants;
 pub mod journal;
 pub mod observe;
-mod outcome;
 pub mod policy;
-mod reconcile;
 pub mod register;
 mod rejected;
-mod schedule;
 pub mod search;
 pub mod shell;
 pub mod state;
-mod sweep;
 mod time;
 pub mod value;
 mod view;
 
 pub use batch::Refused;
 pub use decide::decide;
+pub use decide::outcome::refused_for_good;
 pub use event::{Effect, Event, Observation};
 pub use fact::Fact;
 pub use observe::observe;
-pub use outcome::refused_for_good;
 pub use policy::{GrantOrder, Policy};
 pub use rejected::Rejected;
 pub use shell::{

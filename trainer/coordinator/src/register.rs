@@ -6,7 +6,7 @@
 use std::collections::BTreeMap;
 
 use checkpoint::model::Parts;
-use protocol::pipeline::PipelineStage;
+use pipeline::PipelineStage;
 use protocol::stage::{Mode, Register, Sampler};
 use protocol::{Alias, Digest, ModelName, StageName};
 use registry::Write;
@@ -179,15 +179,15 @@ fn best(from: &[String], metrics: &[BTreeMap<String, f64>], settings: &Register)
 mod tests {
     use std::sync::Arc;
 
+    use pipeline::Pipeline;
     use protocol::Owner;
-    use protocol::pipeline::Pipeline;
 
     use super::*;
 
     fn pipeline() -> Pipeline {
         let text = "name: p\nseed: 1\ndataset: {format: synthetic}\nstages:\n  vae: {kind: train.vae}\n  latents: {kind: encode.latents}\n  \
                     mld: {kind: train.mld}\n  fid: {kind: evaluate.latent_fid, model: mld}\n  release: {kind: register, model: m, from: mld, promote: {to: prod}}\n";
-        protocol::pipeline::read("p.yaml", text, &[]).unwrap_or_else(|mistakes| panic!("{mistakes}"))
+        pipeline::read("p.yaml", text, &[]).unwrap_or_else(|mistakes| panic!("{mistakes}"))
     }
 
     #[test]

@@ -2,10 +2,10 @@
 
 use std::collections::BTreeSet;
 
+use pipeline::PipelineStage;
 use protocol::message::{
     Assignment, DesiredAssignments, Prepare, Progress, Role, RunState, RunView, StageState, StageTask, StageView,
 };
-use protocol::pipeline::PipelineStage;
 use protocol::stage::{Backend, Shape};
 use protocol::units::grouped;
 use protocol::{Digest, Generation, Incarnation, StageName, TaskId, WorkerId, canonical};
@@ -168,7 +168,7 @@ impl State {
                         unit: "steps".into(),
                         ..Default::default()
                     };
-                    (view.progress, view.message) = (progress, Some(crate::sweep::in_words(&sweep)));
+                    (view.progress, view.message) = (progress, Some(crate::decide::sweep::in_words(&sweep)));
                 }
             }
             Status::Active { .. } => {
@@ -220,8 +220,10 @@ impl State {
             ExecutionState::Open => {
                 let min = execution.placement.workers.min.max(1);
                 let workers = if min == 1 { "worker" } else { "workers" };
-                let set =
-                    execution.bound_to().map(|set| format!(" with {set}, like the earlier ones")).unwrap_or_default();
+                let set = execution
+                    .bound_to()
+                    .map(|set| format!(" with {set}, like the earlier workers"))
+                    .unwrap_or_default();
                 let backend = execution.backend.name();
                 (StageState::Ready, Some(format!("waits for {min} idle `{backend}` {workers}{set}")))
             }

@@ -11,10 +11,10 @@ use std::time::{Duration, Instant};
 
 use access::Server;
 use coordinator::{Config, Coordinator, Handle};
+use pipeline::{Pipeline, PipelineStage, StageInput};
 use protocol::message::{
     Assignment, DesiredAssignments, Join, Joined, Poll, ReportOutcome, RunView, Submit, TaskOutcome,
 };
-use protocol::pipeline::{Pipeline, PipelineStage, StageInput};
 use protocol::proof::{BlobStored, GRANT_HEADER, SECRET_HEADER, Vouched};
 use protocol::stage::{Backend, DataSynthetic, EncodeLatents, Placement, StageSettings, TrainVae, WorkerRange};
 use protocol::{ArtifactKind, Digest, FileEntry, Incarnation, Manifest, RunId, Seed, TaskId};

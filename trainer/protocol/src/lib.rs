@@ -1,4 +1,4 @@
-//! The types that two builds of Stride must agree on: names, pipelines, stage settings and messages.
+//! The types that two builds of Stride must agree on: names, settings of stages, sweeps and messages.
 //!
 //! Not its job: I/O, clocks, async, tensors. Everything here is plain data with serde, so that the control plane builds
 //! in seconds and a message can be read without running anything.
@@ -12,7 +12,6 @@ pub mod limits;
 pub mod message;
 pub mod model_ref;
 pub mod owner;
-pub mod pipeline;
 pub mod printable;
 pub mod proof;
 pub mod spelling;
@@ -25,6 +24,5 @@ pub use digest::Digest;
 pub use id::{Alias, Attempt, Fence, Generation, Incarnation, ModelName, RunId, Seed, StageName, TaskId, WorkerId};
 pub use model_ref::{ModelRef, Pick};
 pub use owner::{Group, Owner};
-pub use pipeline::Pipeline;
 pub use printable::{excerpt, excerpts, json_mistake, printable, show_excerpts};
 pub use units::Steps;

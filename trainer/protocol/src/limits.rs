@@ -46,7 +46,7 @@ pub const CURVE_RUNS: usize = 50;
 /// Seconds after which a caller should retry.
 pub const COME_AGAIN_S: u32 = 1;
 
-// Limits of pipelines. The range of each numeric setting of a stage is in `pipeline::ranges`.
+// Limits of pipelines. The range of each numeric setting of a stage stands beside its field.
 
 /// Largest size of a pipeline file, in bytes.
 pub const PIPELINE_BYTES: u64 = 1 << 20;

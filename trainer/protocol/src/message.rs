@@ -356,7 +356,7 @@ impl FailureClass {
 /// `POST /v1/runs`: submits a pipeline.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Submit {
-    /// The validated pipeline as JSON (`protocol::pipeline::Pipeline`).
+    /// The validated pipeline as JSON (`pipeline::Pipeline`).
     pub pipeline: serde_json::Value,
     /// YAML as written, kept for display.
     pub source: String,

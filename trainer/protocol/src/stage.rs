@@ -179,7 +179,7 @@ impl StageSettings {
 
     /// The settings for the reader of pipelines and the reference of keys. They include references that are not
     /// serialised while empty; those are left out so that they do not change the keys of older stages.
-    pub(crate) fn example(&self) -> serde_json::Value {
+    pub fn example(&self) -> serde_json::Value {
         let mut json = serde_json::to_value(self).expect("settings are JSON");
         for reference in self.clone().refs() {
             if let Some(json) = json.as_object_mut()
@@ -242,15 +242,15 @@ impl StageSettings {
     }
 
     /// Schema of the kind's keys.
-    pub(crate) fn schema(&self, generator: &mut schemars::SchemaGenerator) -> schemars::Schema {
+    pub fn schema(&self, generator: &mut schemars::SchemaGenerator) -> schemars::Schema {
         self.spec().schema(generator)
     }
 
-    pub(crate) fn check(&self, problems: &mut Problems) {
+    pub fn check(&self, problems: &mut Problems) {
         self.spec().check(problems);
     }
 
-    pub(crate) fn check_neighbours(&self, stages: &Neighbours<'_>, problems: &mut Problems) {
+    pub fn check_neighbours(&self, stages: &Neighbours<'_>, problems: &mut Problems) {
         self.spec().check_neighbours(stages, problems);
     }
 }

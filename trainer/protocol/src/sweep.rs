@@ -11,8 +11,8 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
-use crate::stage::{Mode, Placement, Ref, StageSettings, Target, WorkerRange};
-use crate::{ArtifactKind, StageName, Steps, pipeline};
+use crate::stage::{Mode, Ref, StageSettings, Target};
+use crate::{ArtifactKind, StageName, Steps};
 
 /// Method of searching the space.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
@@ -141,25 +141,6 @@ impl Sweep {
         }
     }
 
-    /// Inserts `values` into `base` and the evaluating stage, each value into its own stage.
-    ///
-    /// # Errors
-    /// Values that do not fit, each with the violated rule.
-    pub fn with_values(&self, base: &StageSettings, values: &Values) -> Result<(StageSettings, StageSettings), String> {
-        let (mut own, mut of_evaluation) = (Values::new(), Values::new());
-        for (path, value) in values {
-            match in_evaluation(path) {
-                Some(path) => of_evaluation.insert(path.to_owned(), value.clone()),
-                None => own.insert(path.clone(), value.clone()),
-            };
-        }
-        let evaluate = match of_evaluation.is_empty() {
-            true => (*self.evaluate).clone(),
-            false => with_values(&self.evaluate, &of_evaluation)?,
-        };
-        Ok((with_values(base, &own)?, evaluate))
-    }
-
     /// Number of trials before equal ones are left out.
     pub fn trials(&self) -> usize {
         let points = self.points().unwrap_or(usize::MAX);
@@ -175,21 +156,6 @@ impl Sweep {
 pub fn setting(settings: &StageSettings, path: &str) -> Option<Value> {
     let json = serde_json::to_value(settings).ok()?;
     path.split('.').try_fold(&json, |value, key| value.get(key)).cloned()
-}
-
-/// Inserts `values` into `base`.
-///
-/// # Errors
-/// Values that do not fit, each with the violated rule.
-pub fn with_values(base: &StageSettings, values: &Values) -> Result<StageSettings, String> {
-    let mut json = serde_json::to_value(base).map_err(|e| e.to_string())?;
-    for (path, value) in values {
-        let place = path.split('.').try_fold(&mut json, |value, key| value.get_mut(key));
-        *place.ok_or_else(|| format!("there is no setting `{path}`"))? = value.clone();
-    }
-    let settings: StageSettings = serde_json::from_value(json).map_err(|e| e.to_string())?;
-    let broken = pipeline::broken_rules(&settings, &Placement::default());
-    if broken.is_empty() { Ok(settings) } else { Err(broken.join("; ")) }
 }
 
 /// Field of `evaluate` that names the evaluated stage with output `kind`, whether it is set or still empty.
@@ -220,9 +186,4 @@ pub const STATE_OUTPUT: &str = "state";
 /// Name of the training part of a rung; the evaluation's has the suffix `.eval`. Users' names have no dots.
 pub fn rung_name(stage: &StageName, trial: usize, rung: usize) -> StageName {
     StageName::new(format!("{stage}.t{trial:02}.r{rung}"))
-}
-
-/// Placement of the stages of a trial: one worker each, so that trials run side by side.
-pub(crate) fn beside(placement: &Placement) -> Placement {
-    Placement { workers: WorkerRange { min: 1, max: 1 }, ..placement.clone() }
 }

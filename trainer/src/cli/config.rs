@@ -5,9 +5,9 @@ use models::device::{self, DeviceInfo};
 use serde_json::Value;
 
 use super::args::PipelineArgs;
-use crate::pipeline_file;
-use crate::print::{self, Output};
-use crate::problem::{Problem, Result, exit};
+use crate::local::pipeline_file;
+use crate::report::print::{self, Output};
+use crate::report::problem::{Problem, Result, exit};
 
 #[derive(Debug, Subcommand)]
 pub(crate) enum ConfigVerb {
@@ -37,9 +37,9 @@ pub(crate) struct SchemaArgs {
 
 pub(crate) fn schema(args: &SchemaArgs) -> u8 {
     if args.markdown {
-        print::out(protocol::pipeline::markdown().trim_end());
+        print::out(pipeline::markdown().trim_end());
     } else {
-        print::json(&protocol::pipeline::json_schema());
+        print::json(&pipeline::json_schema());
     }
     0
 }

@@ -7,7 +7,7 @@ use access::Tokens;
 use clap::Args;
 use coordinator::Config;
 
-use crate::problem::Result;
+use crate::report::problem::Result;
 
 #[derive(Debug, Args)]
 pub(super) struct EndpointArgs {

@@ -16,9 +16,9 @@ use super::remote::check_parent;
 use super::sampler::SamplerArgs;
 use super::sentences::SentenceArgs;
 use crate::client::Target;
-use crate::print::{self, Output};
-use crate::problem::{Problem, Result};
 use crate::reader::Reader;
+use crate::report::print::{self, Output};
+use crate::report::problem::{Problem, Result};
 
 /// Default sentences: movements that every dataset has.
 const SENTENCES: [&str; 6] = [
@@ -75,7 +75,7 @@ pub(crate) async fn gallery(args: GalleryArgs) -> Result<u8> {
         return Err(Problem::usage(format!("cannot write `{}`: expected .html or .png", args.out.display())));
     }
     if names.is_empty() {
-        return Err(Problem::usage(format!("no stage of run `{}` gave a model yet", run.run)));
+        return Err(Problem::usage(format!("no stage of run `{}` has a model yet", run.run)));
     }
     let (device, _) = model::device(args.backend.as_deref())?;
 

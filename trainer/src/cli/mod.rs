@@ -35,12 +35,12 @@ use protocol::StageName;
 use registry::{OpenError, ReadStore};
 
 use self::args::{BlobArgs, PipelineArgs};
-use crate::advice::advice;
 use crate::client::Target;
-use crate::print::{self, Output};
-use crate::problem::{Problem, Result, exit};
+use crate::local::advice::advice;
+use crate::local::{cost, pipeline_file, plan, run, verify};
 use crate::reader::Reader;
-use crate::{cost, pipeline_file, plan, run, verify};
+use crate::report::print::{self, Output};
+use crate::report::problem::{Problem, Result, exit};
 
 /// Trains text-to-motion models across workers and stores the results
 #[derive(Debug, Parser)]

@@ -5,8 +5,8 @@ use std::path::PathBuf;
 use mocap::export::{ExportError, Motion, Outs, Written};
 
 use super::remote::check_parent;
-use crate::print::Output;
-use crate::problem::{Problem, Result, exit};
+use crate::report::print::Output;
+use crate::report::problem::{Problem, Result, exit};
 
 /// The value of `-o` that requests a report on standard output instead of a file.
 const JSON: &str = "json";

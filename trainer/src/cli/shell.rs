@@ -5,8 +5,8 @@ use std::path::PathBuf;
 use clap::{Args, Command};
 use clap_complete::Shell;
 
-use crate::print;
-use crate::problem::{Problem, Result};
+use crate::report::print;
+use crate::report::problem::{Problem, Result};
 
 #[derive(Debug, Args)]
 #[command(after_help = "\

@@ -15,12 +15,12 @@ use protocol::stage::{
     Sampler, Split, StageSettings, TextEmbed, TrainLength, TrainVae, Training,
 };
 use protocol::{ArtifactKind, Digest, Manifest, Seed, Steps};
+use stage_lab::Bench;
 use stages::artifacts::{self, DenoiserMeta, Latents, MODEL_FILE, VaeMeta, to_meta};
 use stages::generate::Generator;
-use stages::generator::{self, Batch as Motions};
-use stages::testing::Bench;
-use stages::text;
-use stages::timing::{Times, WARM_UP, sentences, time};
+use stages::generate::generator::{self, Batch as Motions};
+use stages::generate::timing::{Times, WARM_UP, sentences, time};
+use stages::parts::text;
 
 const LATENT: LatentShape = LatentShape { tokens: 2, dim: 4 };
 
@@ -381,7 +381,7 @@ fn a_model_with_a_length_estimator_says_how_long_a_motion_is() {
     let mut other = part;
     other.meta["fits"]["text"] = serde_json::to_value(Digest::of(b"another encoder")).expect("a digest");
     let refused = with(&other).expect_err("another encoder").to_string();
-    assert!(refused.contains("`length` was made for the `text`"), "{refused}");
+    assert!(refused.contains("`length` was trained with the `text`"), "{refused}");
 }
 
 /// A student's prediction in its last step equals the generated motion, and all steps of a teacher are reported.

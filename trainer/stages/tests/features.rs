@@ -8,9 +8,9 @@ use protocol::stage::{
     StageSettings, TextEmbed, TrainEvaluator, TrainMdm, TrainMld, TrainStableMoFusion, Training,
 };
 use protocol::{Digest, Seed, Steps};
+use stage_lab::{Bench, Script};
 use stages::context::Outcome;
 use stages::generate::Generator;
-use stages::testing::{Bench, Script};
 
 const STEPS: u64 = 9;
 
@@ -224,7 +224,7 @@ fn training_goes_on_from_a_trained_model() {
     );
     let smf = TrainStableMoFusion { init: "host".into(), ..stablemofusion() };
     let refused = bench.run("smf", &smf.into(), &inputs).unwrap_err().to_string();
-    assert!(refused.contains("nothing of `init` fits"), "{refused}");
+    assert!(refused.contains("`init` does not match this network"), "{refused}");
 }
 
 /// The latent host, through its decoder.

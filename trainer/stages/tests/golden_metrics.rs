@@ -3,10 +3,10 @@
 use std::path::Path;
 
 use serde_json::Value;
-use stages::evaluation::control::ControlErrors;
-use stages::evaluation::frechet::Gaussian;
-use stages::evaluation::jerk::{JerkError, jerk};
-use stages::evaluation::{joints, retrieval, skating, spread};
+use stages::metrics::control::ControlErrors;
+use stages::metrics::frechet::Gaussian;
+use stages::metrics::jerk::{JerkError, jerk};
+use stages::metrics::{joints, retrieval, skating, spread};
 
 fn array(path: &Path) -> (Vec<u64>, Vec<f32>) {
     let bytes = std::fs::read(path).unwrap_or_else(|e| panic!("{}: {e}", path.display()));

@@ -4,7 +4,7 @@
 use protocol::stage::ControlSetting;
 use safetensors::{Dtype, SafeTensors};
 use serde_json::Value;
-use stages::hint::{Hint, NormalisedHints, share, told_frames};
+use stages::parts::hint::{Hint, NormalisedHints, share, told_frames};
 
 /// Shape and values of a tensor of any type.
 fn array(file: &SafeTensors<'_>, name: &str) -> Option<(Vec<usize>, Vec<f64>)> {

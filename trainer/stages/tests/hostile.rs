@@ -14,7 +14,7 @@ use models::names::to_bytes;
 use models::networks::{Evaluator, EvaluatorConfig, Init};
 use protocol::Seed;
 use protocol::stage::Positions;
-use stages::testing::hostile_models::{self, Form, PARTS};
+use stage_lab::hostile_models::{self, Form, PARTS};
 
 #[global_allocator]
 static MEMORY: Cap<System> = Cap::new(System, usize::MAX);
@@ -149,11 +149,11 @@ const TARGETS: [Target; 3] = [
         .named(hostile_networks)
         .within(PICKLE_MEMORY)
         .words("F32 ¦F64 ¦BF16 ¦I64 ¦BOOL ¦ 0 ¦ 1¦\nF32 ¦.weight¦.bias¦.0.¦.1.¦state_dict.¦vae.¦denoiser.¦trans.¦model.¦latent_pre.weight ¦latent_proj.weight ¦time_embedding.cond_proj.weight ¦output_proj_bias ¦net.mid_attn.fn.fn.to_qkv.weight ¦.attn.mask ¦h\0¦R¦."),
-    Target::new("evaluator", stages::testing::hostile::evaluator, evaluators)
+    Target::new("evaluator", stage_lab::hostile::evaluator, evaluators)
         .named(hostile_evaluators)
         .within(PICKLE_MEMORY)
         .words("text_encoder¦movement_encoder.main.0.weight¦\"shape\":[¦\"data_offsets\":[¦cposix\nsystem\n¦h\0¦2¦(¦t¦R¦}¦]¦b¦Q¦."),
-    Target::new("vocabulary", stages::testing::hostile::vocabulary, vocabularies)
+    Target::new("vocabulary", stage_lab::hostile::vocabulary, vocabularies)
         .named(named::torch)
         .within(PICKLE_MEMORY)
         .words("X\u{3}\0\0\0sos¦K\u{1}¦h\0¦q\0¦2¦(¦t¦}¦]¦s¦u¦.¦cposix\nsystem\n¦I-1\n¦L99999999999999999999L\n"),
@@ -181,7 +181,7 @@ fn vocabulary() {
 
 #[test]
 fn no_error_quotes_a_file() {
-    assert_eq!(stages::testing::hostile::CANARY, canary::CANARY);
+    assert_eq!(stage_lab::hostile::CANARY, canary::CANARY);
     TARGETS.iter().for_each(|target| canary::run(target, 30));
 }
 

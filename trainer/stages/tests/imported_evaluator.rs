@@ -18,13 +18,13 @@ use protocol::message::StageTask;
 use protocol::stage::{CheckpointPolicy, DataFormat, DataOpen, EvaluateT2m, ImportEvaluator, Split, StageSettings};
 use protocol::{Digest, RunId, Seed, StageName};
 use safetensors::SafeTensors;
+use stage_lab::{Bench, MemoryAttempt};
 use stages::artifacts;
 use stages::context::{Outcome, Part};
-use stages::evaluation::retrieval::in_groups;
-use stages::evaluator::TrainedEvaluator;
 use stages::kinds;
-use stages::testing::{Bench, MemoryAttempt};
-use stages::words::Words;
+use stages::metrics::retrieval::in_groups;
+use stages::parts::evaluator::TrainedEvaluator;
+use stages::parts::words::Words;
 
 #[path = "../../models/tests/common/mod.rs"]
 mod fixtures;

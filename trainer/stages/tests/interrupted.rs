@@ -9,8 +9,8 @@ use std::time::Duration;
 use protocol::Seed;
 use protocol::message::StageTask;
 use protocol::stage::{Backend, CheckpointPolicy, DataFeatures, DataFormat, DataOpen, DataSynthetic, StageSettings};
+use stage_lab::{MemoryAttempt, MemoryBlobs};
 use stages::context::{Outcome, Part, StageError};
-use stages::testing::{MemoryAttempt, MemoryBlobs};
 
 fn attempt(settings: StageSettings) -> MemoryAttempt {
     let task = StageTask {

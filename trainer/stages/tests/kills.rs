@@ -9,7 +9,7 @@ use std::collections::BTreeMap;
 
 use protocol::stage::{CheckpointPolicy, Shape, StageSettings};
 use protocol::{Digest, Steps};
-use stages::testing::{Bench, Script};
+use stage_lab::{Bench, Script};
 
 /// Steps of the stage that is killed at every step.
 const STEPS: u64 = 60;

@@ -6,8 +6,8 @@ use std::collections::BTreeMap;
 
 use protocol::stage::Shape;
 use protocol::{Digest, Steps};
+use stage_lab::{Bench, Script};
 use stages::context::Outcome;
-use stages::testing::{Bench, Script};
 
 use common::Link;
 

@@ -2,7 +2,7 @@
 
 use motion::{DataPath, Dataset};
 use protocol::stage::{DataFormat, Split};
-use stages::evaluation::{joints, reconstruction};
+use stages::metrics::{joints, reconstruction};
 
 /// Rows of a guess at a clip: global, aligned and local error in mm, smooth-L1 of the features.
 type Row = (&'static str, fn(&[f32], usize) -> Vec<f32>, [f64; 4]);

@@ -11,13 +11,13 @@ use protocol::stage::{
     Batch, CheckpointPolicy, ClipIds, ClipOutput, DataSynthetic, Sampler, StableMoFusionNetwork, StageSettings,
     TextEmbed, TextEncoder, TrainStableMoFusion, Training,
 };
-use protocol::{Digest, RunId, Seed, StageName, Steps};
-use serde_json::Value;
+use protocol::{ArtifactKind, Digest, Manifest, RunId, Seed, StageName, Steps};
+use serde_json::{Value, json};
+use stage_lab::{Bench, MemoryAttempt, MemoryBlobs};
 use stages::artifacts::{Embeddings, Tensors};
 use stages::external;
 use stages::generate::Generator;
-use stages::testing::{Bench, MemoryAttempt, MemoryBlobs};
-use stages::text::{self, Named};
+use stages::parts::text::{self, Named};
 
 mod common;
 
@@ -262,4 +262,31 @@ fn models_are_trained_and_drawn_with_encoders_of_folders() {
             assert!(drawn.features != draw("someone jumps and turns").features, "{name}: the caption counts");
         }
     }
+}
+
+#[test]
+fn an_encoder_is_opened_by_its_manifest_alone() {
+    let blobs = MemoryBlobs::default();
+    let open = |manifest: &Manifest| text::open(manifest, &blobs, &Device::flex());
+    let encoder = open(&text::built_in()).expect("built in");
+    let captions = ["a man walks", ""];
+    let pooled = encoder.pooled(&captions).expect("built in");
+    assert_eq!(pooled.len(), 2 * encoder.dim());
+    let tokens = encoder.tokens(&captions).expect("built in");
+    assert_eq!(
+        tokens.iter().map(|rows| rows.len() / encoder.token_dim()).collect::<Vec<_>>(),
+        [4, 1],
+        "words and the end"
+    );
+    assert_eq!(tokens[1], pooled[encoder.dim()..], "an empty caption is its end alone");
+    assert_ne!(tokens[0], encoder.tokens(&["a walks man"]).expect("built in")[0], "in order");
+
+    let other = Manifest::new(ArtifactKind::TextEncoder, json!({"encoder": "bert", "dim": 512}));
+    let refused = open(&other).expect_err("this build has no text encoder").to_string();
+    assert!(refused.contains("`bert`") && refused.contains("hashed, clip, t5, sentence-t5"), "{refused}");
+    let bare = Manifest::new(ArtifactKind::TextEncoder, json!({"encoder": "clip", "dim": 512}));
+    let refused = open(&bare).expect_err("no sizes").to_string();
+    assert!(refused.contains("cannot parse its manifest"), "{refused}");
+    let refused = open(&Manifest::new(ArtifactKind::Vae, json!({}))).expect_err("a VAE").to_string();
+    assert!(refused.contains("Vae"), "{refused}");
 }

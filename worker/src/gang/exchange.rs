@@ -76,7 +76,7 @@ pub(crate) fn rendezvous(
                 if elapsed > limit || is_slow {
                     let elapsed = elapsed.as_secs_f32();
                     let reason =
-                        format!("{barrier}: it has taken {sent} of the state's {bytes} bytes after {elapsed:.0} s");
+                        format!("{barrier}: it received {sent} of {bytes} bytes of the state in {elapsed:.0} s");
                     mesh.lose(peer, LossCause::Slow, reason);
                     return Err(Halt::Peer);
                 }
@@ -107,7 +107,7 @@ pub(crate) fn adopt(
     let length = expect(mesh.next(source, &barrier, interrupt)?, Kind::StateLength, mesh, source)?.step;
     let wanted: u64 = room.iter().map(|piece| piece.len() as u64).sum();
     if length < wanted || length - wanted > MAX_BEHIND_STATE {
-        let what = format!("offers a state of {length} bytes, expected {wanted} and at most {MAX_BEHIND_STATE} more");
+        let what = format!("offers a state of {length} bytes; expected {wanted} and at most {MAX_BEHIND_STATE} more");
         return Err(disagree(mesh, &barrier, source, &what));
     }
     let mut room = Room::new(room);
@@ -117,7 +117,7 @@ pub(crate) fn adopt(
         there += frame.bytes().len() as u64;
         let Payload::Bytes(piece) = frame.payload else { unreachable!("a state's frames carry bytes") };
         if piece.is_empty() || there > length {
-            let what = format!("sends a state of {length} bytes in pieces of another length");
+            let what = format!("sends pieces that do not add up to its state of {length} bytes");
             return Err(disagree(mesh, &barrier, source, &what));
         }
         if directly {
@@ -195,15 +195,13 @@ pub(crate) struct Total {
 pub(crate) fn exchange(mesh: &Mesh, contribution: &Contribution<'_>, interrupt: Interrupt<'_>) -> Result<Total, Halt> {
     let (own, size) = (mesh.config.rank, mesh.size());
     let root = 0..contribution.slices;
-    let mut length = contribution.parts.first().map(|(_, part)| part.len());
     if size == 1 {
-        let mut sum = vec![0.0; length.unwrap_or(0)];
+        let length = contribution.parts.first().map_or(0, |(_, part)| part.len());
+        let mut sum = vec![0.0; length];
         tree::sum(&root, &contribution.parts, &mut sum);
         return Ok(Total { sum, drain: contribution.drain, durable: contribution.durable });
     }
     let barrier = format!("barrier `exchange` of step {} in generation {}", contribution.step, mesh.config.generation);
-    let disagree = |peer: usize, what: String| disagree(mesh, &barrier, peer, &what);
-
     let halt = interrupt;
     let interrupt: Interrupt<'_> = &|| {
         mesh.watch_pace();
@@ -230,26 +228,65 @@ pub(crate) fn exchange(mesh: &Mesh, contribution: &Contribution<'_>, interrupt: 
         })?;
     }
 
-    // Reduce-scatter, receiving: our chunk of the peers' nodes.
-    let mut drain = contribution.drain;
-    let mut durable = if own == 0 { contribution.durable } else { 0 };
-    let mut theirs: Vec<(Node, Vec<f32>)> = Vec::new();
+    let received = receive_parts(mesh, &barrier, contribution, interrupt)?;
+    let length = received.length.ok_or_else(|| Halt::Fault(format!("{barrier}: no member has a slice")))?;
+
+    // Sum our chunk up to the root of the tree.
+    let chunk = tree::share(length, own, size);
+    let mut known: Vec<(Node, &[f32])> =
+        contribution.parts.iter().map(|(slice, part)| (slice.clone(), &part[chunk.clone()])).collect();
+    known.extend(received.sums.iter().map(|(node, sum)| (node.clone(), sum.as_slice())));
+    known.sort_by_key(|(node, _)| node.start);
+    let mut sum = vec![0.0; length];
+    tree::sum(&root, &known, &mut sum[chunk.clone()]);
+    gather(mesh, &barrier, contribution.step, &mut sum, interrupt)?;
+    if let Some(slow) = mesh.pace.end(mesh.others()) {
+        mesh.complain(slow);
+    }
+    Ok(Total { sum, drain: received.drain, durable: received.durable })
+}
+
+/// Parts and flags of a step from all peers.
+struct Received {
+    /// This member's chunk of the peers' nodes.
+    sums: Vec<(Node, Vec<f32>)>,
+    /// Length of the whole buffer, unless no member has a slice.
+    length: Option<usize>,
+    drain: bool,
+    durable: u64,
+}
+
+/// Receives this member's chunk of each peer's nodes: the second half of the reduce-scatter.
+fn receive_parts(
+    mesh: &Mesh,
+    barrier: &str,
+    contribution: &Contribution<'_>,
+    interrupt: Interrupt<'_>,
+) -> Result<Received, Halt> {
+    let disagree = |peer: usize, what: String| disagree(mesh, barrier, peer, &what);
+    let (own, size) = (mesh.config.rank, mesh.size());
+    let mut received = Received {
+        sums: Vec::new(),
+        length: contribution.parts.first().map(|(_, part)| part.len()),
+        drain: contribution.drain,
+        durable: if own == 0 { contribution.durable } else { 0 },
+    };
     for peer in mesh.others() {
-        let (mut came, begin) = mesh.next_timed(peer, &barrier, interrupt)?;
+        let (mut came, begin) = mesh.next_timed(peer, barrier, interrupt)?;
         let begin = expect(begin, Kind::Begin, mesh, peer)?;
         if begin.step != contribution.step || begin.a != number(contribution.slices) {
             return Err(disagree(
                 peer,
-                format!("is at step {} with {} slices, not {}", begin.step, begin.a, contribution.slices),
+                format!("is at step {} with {} slices; expected {} slices", begin.step, begin.a, contribution.slices),
             ));
         }
         let (at, stored) = numbers(&begin).ok_or_else(|| disagree(peer, "sends a malformed greeting".to_owned()))?;
-        drain |= begin.b & DRAIN != 0;
+        received.drain |= begin.b & DRAIN != 0;
         if begin.b & SAVED != 0 {
             mesh.pace.excuse();
         }
         if peer == 0 {
-            durable = stored;
+            received.durable = stored;
         }
         let nodes = tree::cover(contribution.slices, &tree::share(contribution.slices, peer, size));
         if nodes.is_empty() {
@@ -257,59 +294,50 @@ pub(crate) fn exchange(mesh: &Mesh, contribution: &Contribution<'_>, interrupt: 
             continue;
         }
         let at = usize::try_from(at).map_err(|_| disagree(peer, format!("has a buffer of {at} numbers")))?;
-        let length = *length.get_or_insert(at);
+        let length = *received.length.get_or_insert(at);
         if at != length {
-            return Err(disagree(peer, format!("has a buffer of {at} numbers, not {length}")));
+            return Err(disagree(peer, format!("has a buffer of {at} numbers; expected {length}")));
         }
         let chunk = tree::share(length, own, size);
         for (n, node) in nodes.into_iter().enumerate() {
             let mut numbers = Vec::with_capacity(chunk.len());
             for (p, range) in pieces(&chunk).enumerate() {
-                let (at, frame) = mesh.next_timed(peer, &barrier, interrupt)?;
+                let (at, frame) = mesh.next_timed(peer, barrier, interrupt)?;
                 let frame = expect(frame, Kind::Part, mesh, peer)?;
                 came = at;
                 let place = (frame.a, frame.b) == (number(n), number(p));
                 let Some(part) = floats(frame).filter(|part| place && part.len() == range.len()) else {
-                    return Err(disagree(peer, format!("sends parts out of place at node {n}, piece {p}")));
+                    return Err(disagree(peer, format!("sends an unexpected part at node {n}, piece {p}")));
                 };
                 if numbers.is_empty() && range.len() == chunk.len() { numbers = part } else { numbers.extend(part) }
             }
-            theirs.push((node, numbers));
+            received.sums.push((node, numbers));
         }
         mesh.pace.received(peer, came);
     }
-    let length = length.ok_or_else(|| Halt::Fault(format!("{barrier}: no member has a slice")))?;
+    Ok(received)
+}
 
-    // Sum our chunk up to the root of the tree.
-    let chunk = tree::share(length, own, size);
-    let mut known: Vec<(Node, &[f32])> =
-        contribution.parts.iter().map(|(slice, part)| (slice.clone(), &part[chunk.clone()])).collect();
-    known.extend(theirs.iter().map(|(node, sum)| (node.clone(), sum.as_slice())));
-    known.sort_by_key(|(node, _)| node.start);
-    let mut sum = vec![0.0; length];
-    tree::sum(&root, &known, &mut sum[chunk.clone()]);
-
-    // All-gather: send our chunk of the sum and receive the others'.
+/// Sends this member's chunk of the sum and receives the others': the all-gather.
+fn gather(mesh: &Mesh, barrier: &str, step: u64, sum: &mut [f32], interrupt: Interrupt<'_>) -> Result<(), Halt> {
+    let (own, size, length) = (mesh.config.rank, mesh.size(), sum.len());
     for peer in mesh.others() {
-        for (p, range) in pieces(&chunk).enumerate() {
-            let head = Head::new(Kind::Sum, contribution.step, 0, number(p));
-            mesh.send(peer, &barrier, head, cast_slice(&sum[range]), interrupt)?;
+        for (p, range) in pieces(&tree::share(length, own, size)).enumerate() {
+            let head = Head::new(Kind::Sum, step, 0, number(p));
+            mesh.send(peer, barrier, head, cast_slice(&sum[range]), interrupt)?;
         }
     }
     for peer in mesh.others() {
         for (p, range) in pieces(&tree::share(length, peer, size)).enumerate() {
-            let frame = expect(mesh.next(peer, &barrier, interrupt)?, Kind::Sum, mesh, peer)?;
-            let place = frame.b == number(p) && frame.step == contribution.step;
+            let frame = expect(mesh.next(peer, barrier, interrupt)?, Kind::Sum, mesh, peer)?;
+            let place = frame.b == number(p) && frame.step == step;
             let Some(part) = floats(frame).filter(|part| place && part.len() == range.len()) else {
-                return Err(disagree(peer, format!("sends its sum out of place at piece {p}")));
+                return Err(disagree(mesh, barrier, peer, &format!("sends an unexpected sum at piece {p}")));
             };
             sum[range].copy_from_slice(&part);
         }
     }
-    if let Some(slow) = mesh.pace.end(mesh.others()) {
-        mesh.complain(slow);
-    }
-    Ok(Total { sum, drain, durable })
+    Ok(())
 }
 
 /// Sends a peer its chunk of this member's nodes.
@@ -377,13 +405,14 @@ fn expect(frame: Frame, kind: Kind, mesh: &Mesh, peer: usize) -> Result<Frame, H
     if frame.kind == kind {
         return Ok(frame);
     }
-    let what = format!("sent a frame of kind {:?} where {kind:?} was due", frame.kind);
+    let what = format!("sent a frame of kind {:?}; expected {kind:?}", frame.kind);
     Err(disagree(mesh, &format!("generation {}", mesh.config.generation), peer, &what))
 }
 
 /// Gives up a peer whose messages do not match ours.
 pub(crate) fn disagree(mesh: &Mesh, barrier: &str, peer: usize, what: &str) -> Halt {
-    let reason = format!("{barrier}: `{}` {what}; is it the same build?", mesh.config.members[peer].worker);
+    let reason =
+        format!("{barrier}: `{}` {what}; use the same build for all workers", mesh.config.members[peer].worker);
     mesh.lose(peer, LossCause::Disagrees, reason.clone());
     Halt::Disagree(reason)
 }

@@ -12,8 +12,8 @@
 //!
 //! A decision inspects only the objects that its facts touch, so its cost does not grow with the number of past runs.
 //!
-//! This file defines the order of the steps. Each topic has a file of its own: those in this folder, `outcome`,
-//! `reconcile`, `sweep` and `schedule`. All of them build on `deciding`.
+//! This file defines the order of the steps. Each topic has a file of its own in this folder.
+//! All of them build on `deciding`.
 
 pub(crate) mod attempts;
 pub(crate) mod deciding;
@@ -21,8 +21,12 @@ pub(crate) mod executions;
 mod forget;
 mod gangs;
 mod mending;
+pub(crate) mod outcome;
+mod reconcile;
 mod runs;
+pub(crate) mod schedule;
 mod start;
+pub(crate) mod sweep;
 mod workers;
 
 use registry::Write;
@@ -33,7 +37,6 @@ use crate::event::{Effect, Event};
 use crate::fact::Fact;
 use crate::journal::Decision;
 use crate::rejected::Rejected;
-use crate::schedule;
 use crate::state::State;
 use crate::state::execution::ExecutionState;
 use crate::state::worker::Sign;

@@ -3,8 +3,8 @@
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
+use pipeline::Pipeline;
 use protocol::message::RunState;
-use protocol::pipeline::Pipeline;
 use protocol::{Owner, RunId, StageName, limits};
 use registry::Write;
 
@@ -155,7 +155,7 @@ fn check_pipeline(pipeline: &Pipeline, until: Option<&StageName>) -> Result<(), 
             }
         }
         if !seen.insert(&stage.name) {
-            return Err(Rejected::Invalid(format!("stage `{}` is in the pipeline twice", stage.name)));
+            return Err(Rejected::Invalid(format!("the pipeline has stage `{}` twice", stage.name)));
         }
     }
     match until {

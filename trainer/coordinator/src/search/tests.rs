@@ -181,7 +181,7 @@ fn equal_points_are_not_tried_twice() {
         let different: BTreeSet<String> = searched.trials().iter().map(text).collect();
         assert_eq!((different.len(), searched.trials().len()), (24, 24));
         for point in searched.trials() {
-            protocol::sweep::with_values(&settings(), point).unwrap();
+            pipeline::with_values(&settings(), point).unwrap();
         }
     }
     // A space with 24 points gives at most 24 trials, however many are requested.

@@ -5,8 +5,8 @@ use std::panic::AssertUnwindSafe;
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
 use futures::FutureExt as _;
+use pipeline::Pipeline;
 use protocol::message::{Poll, RunView, StorageProblem, Submit};
-use protocol::pipeline::Pipeline;
 use protocol::stage::Register;
 use protocol::{Alias, Digest, Group, ModelName, Owner, RunId, WorkerId, limits};
 use registry::{Proof, QueryError, ReadStore, Store, WriteError};
@@ -24,8 +24,8 @@ use super::token_table::TokenTable;
 use super::versions::resolve_versions;
 use super::vouching::Reach;
 use crate::batch::{Ask, Front, Refused};
+use crate::decide::outcome::refused_for_good;
 use crate::event::{Effect, Event, Observation};
-use crate::outcome::refused_for_good;
 use crate::rejected::Rejected;
 use crate::state::State;
 use crate::state::run::Control;
@@ -178,7 +178,7 @@ impl ActorHandle {
         // A large pipeline takes a while, so it is parsed outside the threads that answer heartbeats.
         let read = blocking(move || {
             let pipeline: Pipeline = serde_json::from_value(submit.pipeline)
-                .map_err(|e| format!("the pipeline does not parse: {e}; was it made by another build?"))?;
+                .map_err(|e| format!("cannot parse the pipeline: {e}; use the same build for client and server"))?;
             pipeline.check()?;
             Ok(pipeline)
         });

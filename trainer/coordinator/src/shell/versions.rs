@@ -4,7 +4,7 @@
 //! them, so that a later move of an alias has no effect.
 
 use checkpoint::model::{Model, part_of_kind};
-use protocol::pipeline::Pipeline;
+use pipeline::Pipeline;
 use protocol::stage::VersionInput;
 use protocol::{ArtifactKind, Digest};
 use registry::{BlobStore, QueryError, ReadStore};

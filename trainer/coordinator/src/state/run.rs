@@ -14,8 +14,8 @@
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
 
+use pipeline::{Pipeline, PipelineStage};
 use protocol::message::{RunState, StageState, StageView};
-use protocol::pipeline::{Pipeline, PipelineStage};
 use protocol::sweep::STATE_OUTPUT;
 use protocol::{ArtifactKind, Attempt, Digest, Owner, RunId, StageName};
 use serde::{Deserialize, Serialize};
@@ -441,8 +441,8 @@ fn wanted(pipeline: &Pipeline, until: Option<&StageName>) -> BTreeSet<usize> {
 
 #[cfg(test)]
 mod tests {
+    use pipeline::PipelineStage;
     use protocol::Seed;
-    use protocol::pipeline::PipelineStage;
     use protocol::stage::{Backend, StageSettings};
 
     use super::*;

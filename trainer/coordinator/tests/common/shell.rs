@@ -26,7 +26,7 @@ pub(crate) async fn start(dir: &Path, poll_ms: u64) -> TestResult<(Handle, Serve
 }
 
 pub(crate) fn submission() -> TestResult<Submit> {
-    let pipeline = protocol::pipeline::read("p.yaml", TEXT, &[]).map_err(|mistakes| mistakes.to_string())?;
+    let pipeline = pipeline::read("p.yaml", TEXT, &[]).map_err(|mistakes| mistakes.to_string())?;
     Ok(Submit { pipeline: serde_json::to_value(pipeline)?, source: TEXT.into(), idempotency_key: None, until: None })
 }
 

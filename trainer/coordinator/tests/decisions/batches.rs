@@ -15,7 +15,7 @@ fn at(now: u64) -> impl FnMut() -> Moment {
 }
 
 fn submit() -> Ask {
-    let pipeline = protocol::pipeline::read("p.yaml", TEXT, &[]).expect("a pipeline");
+    let pipeline = pipeline::read("p.yaml", TEXT, &[]).expect("a pipeline");
     let (pipeline, source) = (Box::new(pipeline), TEXT.to_owned());
     Ask::Event(Box::new(Event::Submit {
         pipeline,

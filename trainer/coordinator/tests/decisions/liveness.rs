@@ -411,9 +411,9 @@ fn a_pipeline_of_more_than_a_thousand_stages_is_refused() {
     let mut pipeline = pipelines::quickstart(1, WorkerRange::default(), &[]);
     let text = pipeline.stages.remove(1);
     pipeline.stages = (0..=limits::STAGES)
-        .map(|i| protocol::pipeline::PipelineStage { name: format!("s{i}").as_str().into(), ..text.clone() })
+        .map(|i| pipeline::PipelineStage { name: format!("s{i}").as_str().into(), ..text.clone() })
         .collect();
-    let mut take = |pipeline: &protocol::Pipeline| {
+    let mut take = |pipeline: &pipeline::Pipeline| {
         let event = Event::Submit {
             pipeline: Box::new(pipeline.clone()),
             source: String::new(),

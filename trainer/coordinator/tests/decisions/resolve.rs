@@ -5,8 +5,8 @@ use std::collections::BTreeMap;
 
 use crate::common::{PureCoordinator, failed};
 use coordinator::{Control, Effect, Event, Policy};
+use pipeline::Pipeline;
 use protocol::message::{Assignment, FailureClass, ReportOutcome, Role, RunState, StageState, TaskOutcome};
-use protocol::pipeline::Pipeline;
 use protocol::{Digest, RunId};
 
 /// A pipeline with a dataset's folder.
@@ -17,7 +17,7 @@ stages:
 ";
 
 fn pipeline(digest: Option<&[u8]>) -> Pipeline {
-    let mut pipeline = protocol::pipeline::read("p.yaml", TEXT, &[]).unwrap_or_else(|mistakes| panic!("{mistakes}"));
+    let mut pipeline = pipeline::read("p.yaml", TEXT, &[]).unwrap_or_else(|mistakes| panic!("{mistakes}"));
     if let Some(content) = digest {
         pipeline.fill_external(|_, _| Ok::<_, ()>(Digest::of(content))).expect("one folder");
     }
@@ -65,7 +65,7 @@ fn a_stage_without_digests_gets_its_key_from_what_a_worker_finds() {
     assert!(said.contains("has no artifact"), "{said}");
     let other = TaskOutcome::Resolved { digests: BTreeMap::from([("words".to_owned(), Digest::of(b"x"))]) };
     let said = refused(&mut coordinator, &first, other);
-    assert!(said.contains("names other files"), "{said}");
+    assert!(said.contains("digests of other files"), "{said}");
 
     coordinator.report(&first, resolved(b"the folder"));
     let second = coordinator.assignment("a").expect("now the stage");
@@ -131,7 +131,7 @@ dataset: {format: synthetic}
 stages:
   judge: {kind: train.evaluator, words: /data/glove}
 ";
-    let mut pipeline = protocol::pipeline::read("p.yaml", text, &[]).unwrap_or_else(|mistakes| panic!("{mistakes}"));
+    let mut pipeline = pipeline::read("p.yaml", text, &[]).unwrap_or_else(|mistakes| panic!("{mistakes}"));
     pipeline.fill_external(|_, _| Ok::<_, ()>(Digest::of(b"glove"))).expect("one folder");
     let mut coordinator = PureCoordinator::new(Policy::default());
     coordinator.quick = false;

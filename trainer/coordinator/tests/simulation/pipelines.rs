@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use protocol::pipeline::{Pipeline, PipelineStage, StageInput};
+use pipeline::{Pipeline, PipelineStage, StageInput};
 use protocol::stage::{
     Backend, CheckpointPolicy, DataSynthetic, DistillLcm, DistillPcm, EncodeLatents, EvaluateLatentFid, Keep,
     Placement, Promote, Register, StageSettings, TextEmbed, TextEncoder, TrainMld, TrainVae, WorkerRange,
@@ -97,5 +97,5 @@ stages:
   release: {{kind: register, model: m, from: pcm}}
 "
     );
-    protocol::pipeline::read("swept.yaml", &text, &[]).unwrap_or_else(|mistakes| panic!("{mistakes}"))
+    pipeline::read("swept.yaml", &text, &[]).unwrap_or_else(|mistakes| panic!("{mistakes}"))
 }

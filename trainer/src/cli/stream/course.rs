@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use motion::Skeleton;
 use motion::waypoints::{self, Waypoint};
-use stages::stream::{Ask, Segment};
+use stages::generate::stream::{Ask, Segment};
 
 use super::line::Line;
 use super::report::Meter;
@@ -145,7 +145,7 @@ impl Pace {
 #[cfg(test)]
 mod tests {
     use protocol::stage::DataFormat;
-    use stages::stream::Joining;
+    use stages::generate::stream::Joining;
 
     use super::*;
 

@@ -4,11 +4,11 @@
 use std::thread;
 use std::time::{Duration, Instant};
 
-use stages::stream::{Ask, MotionStream, Segment};
+use stages::generate::stream::{Ask, MotionStream, Segment};
 use tokio::sync::{mpsc, oneshot};
 
 use super::opening::{Beginning, Opening};
-use crate::problem::{Problem, Result};
+use crate::report::problem::{Problem, Result};
 
 /// A segment with the time that it took, or the reason of the failure.
 type Drawn = std::result::Result<(Segment, Duration), String>;

@@ -10,7 +10,7 @@ mod real;
 mod report;
 
 use super::out::OutArgs;
-use crate::problem::Result;
+use crate::report::problem::Result;
 
 pub(super) use self::opening::{Opening, StreamArgs};
 

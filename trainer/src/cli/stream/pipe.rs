@@ -9,14 +9,14 @@ use mocap::export::{Motion, Outs};
 use motion::Skeleton;
 use motion::waypoints::Waypoint;
 use stages::generate::Generator;
-use stages::stream::{MotionStream, Segment};
+use stages::generate::stream::{MotionStream, Segment};
 
 use super::super::{model, out};
 use super::course::{Course, Pace};
 use super::line::{self, Form, Line, QUEUE};
 use super::opening::Beginning;
-use crate::print::{self, Output};
-use crate::problem::{Problem, Result};
+use crate::report::print::{self, Output};
+use crate::report::problem::{Problem, Result};
 
 /// Limit of frames kept for files: an hour of HumanML3D, 19 MB.
 const MOST_KEPT: usize = 72_000;
@@ -222,8 +222,8 @@ pub(super) fn run(
         }
     }
     match end? {
-        End::Quiet if !pipe.course.has_begun() => Err(Problem::usage("standard input: holds no sentence")
-            .hint("give a sentence a line, such as `a person walks`")),
+        End::Quiet if !pipe.course.has_begun() => Err(Problem::usage("standard input: has no sentence")
+            .hint("write one sentence per line, such as `a person walks`")),
         End::Quiet => Ok(0),
         End::Line(what) => Err(Problem::usage(format!("standard input: {what}"))),
     }

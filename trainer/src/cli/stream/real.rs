@@ -3,10 +3,10 @@
 use std::path::Path;
 
 use motion::{DataPath, Skeleton, npy};
-use stages::evaluation::junction::{Jump, jumps, usual};
+use stages::metrics::junction::{Jump, jumps, usual};
 
 use super::report::Real;
-use crate::problem::{Problem, Result};
+use crate::report::problem::{Problem, Result};
 
 /// Limit of clips read from a folder, in the order of its list.
 const CLIPS: usize = 256;
@@ -42,7 +42,7 @@ pub(super) fn read(path: &Path, skeleton: &'static Skeleton) -> Result<Real> {
     match usual(&all) {
         Some(usual) if all.len() >= LEAST => Ok(Real { name, usual }),
         _ => Err(Problem::usage(format!(
-            "`{}`: has {} places to measure jumps at; expected at least {LEAST}, some seconds of motion",
+            "`{}`: jumps can be measured at {} frames only; expected at least {LEAST}, some seconds of motion",
             path.display(),
             all.len()
         ))),

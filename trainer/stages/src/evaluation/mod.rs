@@ -1,16 +1,8 @@
-//! Metrics over plain arrays, in f64 and in a fixed order of summation. No tensors, no devices, no artifacts.
+//! The common part of evaluations: what they measure, and their reports. The metrics themselves are in `metrics`.
 
-pub mod control;
-pub mod frechet;
-pub mod interval;
-pub mod jerk;
-pub mod joints;
-pub mod junction;
-pub mod latent_fid;
-pub mod procrustes;
-pub mod recognition;
-pub mod reconstruction;
-pub mod retrieval;
-pub mod skating;
-pub mod spectrum;
-pub mod spread;
+pub(crate) mod entry_draws;
+pub(crate) mod measured;
+pub(crate) mod reconstructor;
+pub(crate) mod report;
+
+pub use report::REPORT_FILE;

@@ -7,7 +7,7 @@ use models::networks::Evaluator;
 use motion::{Skeleton, npy};
 use protocol::Digest;
 use protocol::stage::{DataFormat, ImportEvaluator};
-use stages::evaluator::TrainedEvaluator;
+use stages::parts::evaluator::TrainedEvaluator;
 
 use crate::fixtures::{Arrays, Gates, device, name};
 use crate::world::{FORWARD, World, blank, format_of, text_of, with_file};

@@ -9,12 +9,12 @@ use motion::npy;
 use protocol::Digest;
 use protocol::artifact::Role;
 use protocol::stage::{DataSynthetic, EncodeLatents, ImportModel, ImportedPart, StageSettings};
+use stage_lab::Ran;
 use stages::artifacts::{self, DenoiserMeta};
-use stages::control::ControlMeta;
 use stages::generate::Generator;
-use stages::networks::Autoencoder;
-use stages::testing::Ran;
-use stages::text;
+use stages::parts::control::ControlMeta;
+use stages::parts::networks::Autoencoder;
+use stages::parts::text;
 
 use crate::exports::{expect_file, exported};
 use crate::fixtures::{self, Array, Arrays, Gates, device, json, name};

@@ -9,8 +9,8 @@ use models::networks::{FlowUnet, Gpt, MaskedTransformer, Mmm, ResidualTransforme
 use protocol::artifact::Role;
 use protocol::stage::{ImportModel, ImportedPart};
 use protocol::{Digest, Manifest};
+use stages::parts::tokenizer::TrainedTokenizer;
 use stages::published::{Checkpoint, sizes};
-use stages::tokenizer::TrainedTokenizer;
 
 use crate::exports::{expect_file, exported};
 use crate::fixtures::{self, Arrays, Gates, device, json, name};

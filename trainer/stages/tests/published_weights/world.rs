@@ -14,9 +14,9 @@ use protocol::artifact::Role;
 use protocol::stage::{DataFormat, ImportModel, ImportedPart, StageSettings};
 use protocol::{ArtifactKind, Digest, Manifest};
 use serde_json::Value;
+use stage_lab::{Bench, Ran};
 use stages::artifacts::{self, EmbeddingsMeta, MODEL_FILE, to_meta};
-use stages::testing::{Bench, Ran};
-use stages::text;
+use stages::parts::text;
 
 use crate::fixtures::{device, folders, shared};
 

@@ -63,7 +63,7 @@ fn command(random: &mut Random) -> Value {
         format!("{model}{}", random.pick(&["", ":1", ":2", "@prod", "@staging", "@best", "@latest", ":0", "@@"]));
     let alias = random.pick(&["prod", "staging", "new", "best", "", "../x"]);
     let style = random.pick(&["text", "markdown", "latex", "x"]);
-    match random.below(12) {
+    match random.below(13) {
         0 => json!({"command": "list"}),
         1 => json!({"command": "show", "reference": reference}),
         2 => json!({"command": "history", "model": model, "alias": random.pick(&["prod", "none"])}),
@@ -79,7 +79,8 @@ fn command(random: &mut Random) -> Value {
         8 => json!({"command": random.pick(&["fsck", "audit", "list "]), "limit": 10}),
         9 => json!({"command": "gc", "dry_run": random.below(2) == 0, "grace_minutes": 0}),
         10 => json!({"command": "forget", "run": model}),
-        _ => json!({"command": random.pick(&["forget-ended", "forget-leftovers"]), "before_ms": i64::MAX}),
+        11 => json!({"command": "forget", "ended_before": i64::MAX}),
+        _ => json!({"command": "forget", "leftovers_before": i64::MAX}),
     }
 }
 

@@ -117,7 +117,7 @@ pub(crate) fn as_they_are(kind: &Kind) -> Option<String> {
 }
 
 pub(crate) fn submission(text: &str) -> TestResult<Submit> {
-    let pipeline = protocol::pipeline::read("p.yaml", text, &[]).map_err(|mistakes| mistakes.to_string())?;
+    let pipeline = pipeline::read("p.yaml", text, &[]).map_err(|mistakes| mistakes.to_string())?;
     Ok(Submit { pipeline: serde_json::to_value(pipeline)?, source: text.into(), idempotency_key: None, until: None })
 }
 

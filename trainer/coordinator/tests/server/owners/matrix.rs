@@ -129,8 +129,8 @@ fn cases(lab: &Lab, kind: &Kind, method: &'static str, path: &'static str) -> Op
             for command in [
                 json!({"command": "fsck"}),
                 json!({"command": "gc", "dry_run": true, "grace_minutes": null}),
-                json!({"command": "forget-ended", "before_ms": 0}),
-                json!({"command": "forget-leftovers", "before_ms": 0}),
+                json!({"command": "forget", "ended_before": 0}),
+                json!({"command": "forget", "leftovers_before": 0}),
                 json!({"command": "audit", "limit": 5}),
             ] {
                 case(path.to_owned(), command, admin);

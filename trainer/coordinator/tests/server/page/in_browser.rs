@@ -42,7 +42,7 @@ async fn call<T: Serialize>(server: &Server, secret: &str, method: Method, path:
 
 async fn submit(server: &Server, name: &str) -> TestResult<RunId> {
     let text = pipeline(name);
-    let pipeline = protocol::pipeline::read("p.yaml", &text, &[]).map_err(|mistakes| mistakes.to_string())?;
+    let pipeline = pipeline::read("p.yaml", &text, &[]).map_err(|mistakes| mistakes.to_string())?;
     let submit = Submit { pipeline: serde_json::to_value(pipeline)?, source: text, idempotency_key: None, until: None };
     let answer = call(server, SECRET, Method::POST, "/v1/runs", &submit).await?;
     Ok(answer["run"].as_str().ok_or("a run")?.into())

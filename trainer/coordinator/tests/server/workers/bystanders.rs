@@ -56,7 +56,7 @@ impl Site {
     pub(crate) async fn submit(&self, seed: u64) -> RunId {
         let text =
             format!("name: p\nseed: {seed}\ndataset: {{format: synthetic}}\nstages: {{vae: {{kind: train.vae}}}}\n");
-        let pipeline = protocol::pipeline::read("p.yaml", &text, &[]).map_err(|mistakes| mistakes.to_string()).unwrap();
+        let pipeline = pipeline::read("p.yaml", &text, &[]).map_err(|mistakes| mistakes.to_string()).unwrap();
         let pipeline = serde_json::to_value(pipeline).unwrap();
         let submit = Submit { pipeline, source: text, idempotency_key: None, until: None };
         self.handle.submit(submit).await.unwrap()

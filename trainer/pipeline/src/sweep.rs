@@ -1,0 +1,349 @@
+//! Sweeps in a pipeline: reads `sweep:`. Its rules are in `sweep_rules`, the stages of a trial in `trial`.
+//!
+//! `space` has the stage's own keys, so that a setting is found, checked and corrected as in the stage itself.
+
+use std::collections::BTreeMap;
+
+use protocol::ArtifactKind;
+use protocol::stage::{Mode, StageSettings};
+use protocol::sweep::{Domain, EVALUATE, Rungs, SearchKind, Sweep, evaluated_field, setting};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+use serde_json::{Value, json};
+
+use crate::described::described as schema_of;
+use crate::diagnostic::Position;
+use crate::reader::Reader;
+use crate::schema::{list_keys, overlay, unknown_key};
+use crate::yaml::{Content, Entry, Node};
+
+/// Kinds of domains.
+const DOMAINS: [&str; 3] = ["choice", "uniform", "log_uniform"];
+
+/// Search over some of the stage's settings for the values with the best result of `evaluate`.
+#[derive(Debug, Serialize, Deserialize, JsonSchema)]
+struct Head {
+    /// Search method of the sweep.
+    search: SearchKind,
+    /// Value of `evaluate` that ranks the trials.
+    metric: String,
+    /// Direction of the metric.
+    mode: Mode,
+    /// Number of points of the space to try; a grid may leave it out.
+    trials: usize,
+    /// Largest number of concurrent trials.
+    parallel: usize,
+    /// Budgets of ASHA.
+    rungs: Rungs,
+}
+
+impl Default for Head {
+    fn default() -> Self {
+        Self {
+            search: SearchKind::Asha,
+            metric: String::new(),
+            mode: Mode::Min,
+            trials: 0,
+            parallel: 4,
+            rungs: Rungs::default(),
+        }
+    }
+}
+
+/// Schema of the keys of a sweep.
+pub(crate) fn described() -> Value {
+    let mut schema = schema_of(&Head::default());
+    let properties = &mut schema["properties"];
+    properties["space"] = json!({
+        "description": "Settings of the stage, each with `choice: [a, b]`, `uniform: [from, to]` or `log_uniform: \
+            [from, to]`. Below `evaluate`: settings of the evaluation stage, such as `evaluate: {sampler: {guidance: \
+            {choice: [2, 3]}}}`.",
+        "type": "object",
+    });
+    properties["evaluate"] = json!({
+        "description": "The stage that evaluates a trial: an `evaluate.*` kind and its keys, without the input that \
+            it evaluates.",
+        "type": "object",
+        "required": ["kind"],
+    });
+    schema["required"] = json!(["metric", "space", "evaluate"]);
+    schema
+}
+
+impl Reader {
+    /// Reads `sweep:` of stage `name`, whose kind has the settings `default`.
+    pub(crate) fn sweep(&mut self, entry: &Entry, name: &str, default: &StageSettings) -> Option<Sweep> {
+        let path = format!("stages.{name}.sweep");
+        let owner = format!("`sweep` of stage `{name}`");
+        if default.training().is_none() {
+            let message = format!(
+                "stage `{name}` has kind `{}`, which does not train; only a training stage can have a sweep",
+                default.kind()
+            );
+            self.mistake(entry.key_at, &path, message, None);
+            return None;
+        }
+        let node = &entry.value;
+        if node.map().is_none() {
+            let message = format!("{owner} is {}; expected a mapping", node.describe());
+            let help = "for example `{search: asha, metric: latent_fid, trials: 24, space: {lr: {log_uniform: [1e-4, \
+                1e-3]}}, evaluate: {kind: evaluate.latent_fid}}`";
+            self.mistake(node.at, &path, message, Some(help.into()));
+            return None;
+        }
+        let head = self.typed::<Head>(node, &owner, &path, &["space", "evaluate"]);
+        let mut space = BTreeMap::new();
+        match node.entry("space") {
+            None => {
+                let help = "for example `space: {lr: {log_uniform: [1e-4, 1e-3]}}`";
+                self.mistake(
+                    entry.key_at,
+                    &format!("{path}.space"),
+                    format!("{owner} has no `space`"),
+                    Some(help.into()),
+                );
+                return None;
+            }
+            Some(entry) => {
+                let before = self.mistakes.len();
+                let example = serde_json::to_value(default).ok()?;
+                let walk = Space { default, example: &example, owner: format!("stage `{name}`"), of_stage: true };
+                self.space(&walk, &entry.value, &mut Vec::new(), &format!("{path}.space"), &mut space);
+                if self.mistakes.len() > before {
+                    return None;
+                }
+            }
+        }
+        let evaluate = match node.entry("evaluate") {
+            None => {
+                let help = "write a stage without a name, such as `evaluate: {kind: evaluate.latent_fid, sampler: \
+                    {steps: 1}}`";
+                self.mistake(
+                    entry.key_at,
+                    &format!("{path}.evaluate"),
+                    format!("{owner} has no `evaluate`"),
+                    Some(help.into()),
+                );
+                return None;
+            }
+            Some(entry) => self.evaluation(entry, name, default, &format!("{path}.evaluate"))?,
+        };
+        let of_evaluation = node.entry("space").and_then(|space| space.value.entry(EVALUATE));
+        if let Some(entry) = of_evaluation {
+            let before = self.mistakes.len();
+            let example = serde_json::to_value(&evaluate).ok()?;
+            let owner = format!("`evaluate` of the sweep of stage `{name}`");
+            let walk = Space { default: &evaluate, example: &example, owner, of_stage: false };
+            let mut found = BTreeMap::new();
+            self.space(&walk, &entry.value, &mut Vec::new(), &format!("{path}.space.{EVALUATE}"), &mut found);
+            if self.mistakes.len() > before {
+                return None;
+            }
+            space.extend(found.into_iter().map(|(path, domain)| (format!("{EVALUATE}.{path}"), domain)));
+        }
+        let Head { search, metric, mode, trials, parallel, rungs } = head?;
+        Some(Sweep { search, metric, mode, trials, parallel, rungs, space, evaluate: Box::new(evaluate) })
+    }
+
+    /// Reads the stage that evaluates trials, and fills in its reference to the evaluated stage.
+    fn evaluation(&mut self, entry: &Entry, name: &str, default: &StageSettings, path: &str) -> Option<StageSettings> {
+        let owner = format!("`evaluate` of the sweep of stage `{name}`");
+        let node = &entry.value;
+        if node.map().is_none() {
+            let message = format!("{owner} is {}; expected a mapping with `kind`", node.describe());
+            self.mistake(node.at, path, message, Some("for example `{kind: evaluate.latent_fid}`".into()));
+            return None;
+        }
+        let evaluation = self.kind(node, entry.key_at, &owner, path)?;
+        let gives = default.output().kind;
+        let field = evaluated_field(&evaluation, gives).filter(|_| evaluation.output().kind == ArtifactKind::Report);
+        let Some(field) = field else {
+            let evaluations = StageSettings::all();
+            let evaluations = evaluations.iter().filter(|evaluation| {
+                evaluation.output().kind == ArtifactKind::Report && evaluated_field(evaluation, gives).is_some()
+            });
+            let message = format!("`{}` does not measure {}, the output of `{name}`", evaluation.kind(), gives.noun());
+            let at = node.entry("kind").map_or(node.at, |kind| kind.value.at);
+            let help = format!("kinds that measure it: {}", list_keys(evaluations.map(StageSettings::kind)));
+            self.mistake(at, &format!("{path}.kind"), message, Some(help));
+            return None;
+        };
+        if let Some(written) = node.entry(&field)
+            && written.value.as_text() != Some(name)
+        {
+            let message =
+                format!("`{field}` of {owner} is {}, but a sweep evaluates its own trials", written.value.describe());
+            self.mistake(written.value.at, &format!("{path}.{field}"), message, Some("remove it".into()));
+            return None;
+        }
+        let mut base = serde_json::to_value(&evaluation).ok()?;
+        base[field.as_str()] = Value::String(name.to_owned());
+        self.overlaid(base, node, &owner, path, &[])
+    }
+
+    fn space(
+        &mut self,
+        walk: &Space<'_>,
+        node: &Node,
+        keys: &mut Vec<String>,
+        path: &str,
+        found: &mut BTreeMap<String, Domain>,
+    ) {
+        let place = if keys.is_empty() { "`space`".to_owned() } else { format!("`space.{}`", keys.join(".")) };
+        let Some(entries) = node.map() else {
+            let message =
+                format!("{place} is {}; expected settings of {} with the values to try", node.describe(), walk.owner);
+            self.mistake(node.at, path, message, Some("for example `lr: {log_uniform: [1e-4, 1e-3]}`".into()));
+            return;
+        };
+        if entries.is_empty() {
+            self.mistake(
+                node.at,
+                path,
+                format!("{place} is empty; expected at least one setting of {}", walk.owner),
+                None,
+            );
+        }
+        let example = keys.iter().fold(walk.example, |value, key| &value[key.as_str()]);
+        for entry in entries {
+            // Read once the evaluating stage is known.
+            if keys.is_empty() && walk.of_stage && entry.key == EVALUATE {
+                continue;
+            }
+            let path = format!("{path}.{}", entry.key);
+            let references: Vec<String> =
+                walk.default.clone().refs().into_iter().map(|reference| reference.field.into_owned()).collect();
+            if keys.is_empty() && entry.key == "steps" {
+                let help = "`steps` of the stage is the budget of every trial; search another setting";
+                self.mistake(entry.key_at, &path, "`steps` cannot be searched", Some(help.into()));
+                continue;
+            }
+            if keys.is_empty() && references.contains(&entry.key) {
+                let message = format!("`{}` names a stage or a folder, so it cannot be searched", entry.key);
+                self.mistake(entry.key_at, &path, message, Some("write one stage for each value instead".into()));
+                continue;
+            }
+            let known = example.as_object().into_iter().flat_map(|known| known.keys().map(String::as_str));
+            let known: Vec<&str> = known
+                .filter(|key| {
+                    !keys.is_empty()
+                        || !(["kind", "steps"].contains(key) || references.iter().any(|field| field == key))
+                })
+                .collect();
+            if !known.contains(&entry.key.as_str()) {
+                let (message, help) = unknown_key(&entry.key, &format!("in {place} of {}", walk.owner), &known);
+                self.mistake(entry.key_at, &path, message, Some(help));
+                continue;
+            }
+            keys.push(entry.key.clone());
+            if example[entry.key.as_str()].is_object() {
+                self.space(walk, &entry.value, keys, &path, found);
+            } else if let Some(domain) = self.domain(walk, &entry.value, keys, &path) {
+                found.insert(keys.join("."), domain);
+            }
+            keys.pop();
+        }
+    }
+
+    fn domain(&mut self, walk: &Space<'_>, node: &Node, keys: &[String], path: &str) -> Option<Domain> {
+        let label = format!("`space.{}`", keys.join("."));
+        let help =
+            || Some("write `{choice: [a, b]}`, `{uniform: [from, to]}` or `{log_uniform: [from, to]}`".to_owned());
+        let entry = match node.map() {
+            Some([entry]) => entry,
+            Some(entries) if entries.len() > 1 => {
+                let message = format!("{label} has {} keys; expected one of {}", entries.len(), list_keys(DOMAINS));
+                self.mistake(node.at, path, message, help());
+                return None;
+            }
+            _ => {
+                let message = format!("{label} is {}; expected the values to try", node.describe());
+                self.mistake(node.at, path, message, help());
+                return None;
+            }
+        };
+        if !DOMAINS.contains(&entry.key.as_str()) {
+            let (message, known) = unknown_key(&entry.key, &format!("in {label}"), &DOMAINS);
+            self.mistake(entry.key_at, &format!("{path}.{}", entry.key), message, Some(known));
+            return None;
+        }
+        let path = format!("{path}.{}", entry.key);
+        let Content::List(items) = &entry.value.value else {
+            let message = format!("`{}` of {label} is {}; expected a list", entry.key, entry.value.describe());
+            self.mistake(entry.value.at, &path, message, None);
+            return None;
+        };
+        let mut values = Vec::new();
+        for item in items {
+            let value = self.value(walk, item, keys, &path)?;
+            if values.contains(&value) {
+                self.mistake(item.at, &path, format!("{label} lists {value} twice"), None);
+                return None;
+            }
+            values.push(value);
+        }
+        if entry.key == "choice" {
+            if values.is_empty() {
+                self.mistake(
+                    entry.value.at,
+                    &path,
+                    format!("`choice` of {label} is empty; expected at least one value"),
+                    None,
+                );
+                return None;
+            }
+            return Some(Domain::Choice(values));
+        }
+        let ends: Vec<f64> = values.iter().filter_map(Value::as_f64).collect();
+        match ends[..] {
+            [low, high] if low < high && values.len() == 2 => {
+                if entry.key == "uniform" {
+                    return Some(Domain::Uniform(low, high));
+                }
+                if low > 0.0 {
+                    return Some(Domain::LogUniform(low, high));
+                }
+                let message = format!("`log_uniform` of {label} starts at {low}; expected a number above 0");
+                self.mistake(items[0].at, &path, message, None);
+            }
+            _ => {
+                let message =
+                    format!("`{}` of {label} is not a range; expected two numbers, the smaller one first", entry.key);
+                self.mistake(entry.value.at, &path, message, Some("use `choice` for values without an order".into()));
+            }
+        }
+        None
+    }
+
+    /// Reads a value of the setting, in the form in which the setting itself is written.
+    fn value(&mut self, walk: &Space<'_>, item: &Node, keys: &[String], path: &str) -> Option<Value> {
+        let before = self.mistakes.len();
+        let mut base = walk.example.clone();
+        overlay::<StageSettings>(&mut base, &nested(keys, item), &walk.owner, path, &[], &mut self.mistakes);
+        for mistake in &mut self.mistakes[before..] {
+            mistake.path = path.to_owned();
+        }
+        if self.mistakes.len() > before {
+            return None;
+        }
+        let settings: StageSettings = serde_json::from_value(base).ok()?;
+        setting(&settings, &keys.join("."))
+    }
+}
+
+/// Schema for reading a space.
+struct Space<'a> {
+    default: &'a StageSettings,
+    example: &'a Value,
+    owner: String,
+    /// True for the stage itself, false for the stage that evaluates.
+    of_stage: bool,
+}
+
+/// Builds `{a: {b: item}}` for the keys `a`, `b`.
+fn nested(keys: &[String], item: &Node) -> Node {
+    keys.iter().rev().fold(item.clone(), |value, key| {
+        let at: Position = item.at;
+        Node { at, value: Content::Map(vec![Entry { key: key.clone(), key_at: at, value }]) }
+    })
+}

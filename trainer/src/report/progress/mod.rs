@@ -1,0 +1,334 @@
+//! Shows the progress of a run. On a terminal, each running stage has a bar and each ended stage a line. Otherwise each
+//! change has a line, and each running stage has one a minute.
+
+mod curve;
+
+use std::collections::BTreeMap;
+use std::time::{Duration, Instant};
+
+use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
+use pipeline::Pipeline;
+use protocol::message::{RunView, StageState, StageView};
+use protocol::stage::LossChange;
+use protocol::units::grouped;
+use protocol::{StageName, printable};
+
+use self::curve::Curve;
+use crate::report::print;
+
+const BETWEEN_LINES: Duration = Duration::from_secs(60);
+/// Time without a worker after which a stage reports it; before that, workers are starting or about to be free.
+const PATIENCE: Duration = Duration::from_secs(15);
+
+/// Last displayed state of a stage.
+#[derive(Debug)]
+struct Shown {
+    state: StageState,
+    message: Option<String>,
+    bar: Option<ProgressBar>,
+    line_at: Instant,
+    done: u64,
+    /// Start of its wait for a worker, and whether it was reported.
+    lacks: Option<(Instant, bool)>,
+    curve: Curve,
+}
+
+/// Displays a run's stages as they change.
+#[derive(Debug)]
+pub(crate) struct Progress {
+    bars: Option<MultiProgress>,
+    stages: BTreeMap<StageName, Shown>,
+    changes: BTreeMap<StageName, Vec<LossChange>>,
+    /// Advice for a stage without a worker.
+    for_workers: &'static str,
+}
+
+impl Progress {
+    /// Displays bars if `bars`, else lines. `for_workers` is the advice for getting more workers.
+    pub(crate) fn new(bars: bool, pipeline: &Pipeline, for_workers: &'static str) -> Self {
+        let changes = pipeline.stages.iter().map(|stage| (stage.name.clone(), stage.settings.loss_changes()));
+        Self {
+            bars: bars.then(MultiProgress::new),
+            stages: BTreeMap::new(),
+            changes: changes.filter(|(_, changes)| !changes.is_empty()).collect(),
+            for_workers,
+        }
+    }
+
+    /// Prints a message between the bars.
+    pub(crate) fn note(&self, text: &str) {
+        match &self.bars {
+            // A terminal that is gone needs no message.
+            Some(bars) => drop(bars.println(printable(text))),
+            None => print::note(text),
+        }
+    }
+
+    /// Removes the bars.
+    pub(crate) fn finish(&mut self) {
+        for shown in self.stages.values_mut() {
+            if let Some(bar) = shown.bar.take() {
+                bar.finish_and_clear();
+            }
+        }
+        if let Some(bars) = &self.bars {
+            // The bars are gone already; this only frees the line.
+            let _ = bars.clear();
+        }
+    }
+
+    /// Displays the changes of a run.
+    pub(crate) fn update(&mut self, run: &RunView) {
+        self.update_at(run, Instant::now());
+    }
+
+    fn update_at(&mut self, run: &RunView, now: Instant) {
+        for stage in &run.stages {
+            for line in self.stage(stage, now) {
+                self.note(&line);
+            }
+        }
+    }
+
+    /// Updates a stage and returns the lines that report changes.
+    fn stage(&mut self, stage: &StageView, now: Instant) -> Vec<String> {
+        let shown = self.stages.entry(stage.name.clone()).or_insert_with(|| Shown {
+            state: StageState::Waiting,
+            message: None,
+            bar: None,
+            line_at: now,
+            done: stage.progress.done,
+            lacks: None,
+            curve: Curve::default(),
+        });
+        let mut lines = Vec::new();
+        let progress = &stage.progress;
+        let is_at_work = stage.state == StageState::Running && progress.total > 0;
+        let changes = self.changes.get(&stage.name).map(Vec::as_slice).unwrap_or_default();
+        let passed = changes.iter().filter(|change| (shown.done..progress.done).contains(&change.at));
+        for LossChange { at, what, setting } in passed {
+            let (name, at, total) = (stage.name.as_str(), grouped(*at), grouped(progress.total));
+            lines.push(format!("{name:>14}  from step {at} of {total}: {what} (`{setting}`)"));
+            shown.curve.forget_losses();
+        }
+        shown.done = progress.done;
+        if is_at_work {
+            shown.curve.push(now, progress.done, stage.metrics.get("loss").copied());
+        }
+        if shown.state != stage.state || shown.message != stage.message {
+            // A bar already shows that a stage has started.
+            let is_shown = self.bars.is_some() && stage.state == StageState::Running && progress.done == 0;
+            lines.extend(change(stage, shown.state).filter(|_| !is_shown));
+            if shown.state != stage.state {
+                shown.line_at = now;
+            }
+            shown.state = stage.state;
+            shown.message.clone_from(&stage.message);
+        }
+        shown.lacks = stage.wants_workers.map(|_| shown.lacks.unwrap_or((now, false)));
+        if let Some((since, said @ false)) = &mut shown.lacks
+            && now - *since >= PATIENCE
+        {
+            *said = true;
+            let (name, message) = (stage.name.as_str(), stage.message.as_deref().unwrap_or_default());
+            lines.push(format!("{name:>14}  {message}; {}", self.for_workers));
+        }
+        match (&self.bars, &shown.bar) {
+            (Some(bars), None) if is_at_work => {
+                let bar = ProgressBar::new(progress.total).with_style(style());
+                shown.bar = Some(bars.add(bar.with_prefix(stage.name.to_string())));
+            }
+            (None, _) if is_at_work && now - shown.line_at >= BETWEEN_LINES => {
+                shown.line_at = now;
+                lines.push(format!("{:>14}  {}", stage.name.as_str(), working(stage, &shown.curve, now)));
+            }
+            _ => {}
+        }
+        if is_at_work {
+            if let Some(bar) = &shown.bar {
+                bar.set_length(progress.total);
+                bar.set_position(progress.done);
+                bar.set_message(working(stage, &shown.curve, now));
+            }
+        } else if let Some(bar) = shown.bar.take() {
+            bar.finish_and_clear();
+        }
+        lines
+    }
+}
+
+fn style() -> ProgressStyle {
+    ProgressStyle::with_template("{prefix:>14}  {bar:20} {wide_msg}").unwrap_or_else(|_| ProgressStyle::default_bar())
+}
+
+/// The line for a new state; `before` is the state displayed so far.
+fn change(stage: &StageView, before: StageState) -> Option<String> {
+    let name = stage.name.as_str();
+    let progress = &stage.progress;
+    let says = match stage.state {
+        StageState::Waiting => return None,
+        // A worker may be about to come; see `PATIENCE`.
+        StageState::Ready if stage.wants_workers.is_some() => return None,
+        StageState::Ready => stage.message.clone()?,
+        StageState::Running if before == StageState::Running => return None,
+        StageState::Running if progress.done > 0 => format!("continues at {}", count(stage)),
+        StageState::Running => {
+            let workers: Vec<&str> = stage.workers.iter().map(protocol::WorkerId::as_str).collect();
+            format!("started{}{}", if workers.is_empty() { "" } else { " on " }, workers.join(", "))
+        }
+        StageState::Ran | StageState::Resumed => {
+            let count = if progress.total > 0 { format!(": {}", count(stage)) } else { String::new() };
+            let values = values(stage, 3);
+            let gap = if values.is_empty() { "" } else { "  " };
+            format!("done{count} in {}{gap}{values}", print::duration(stage.wall_s))
+        }
+        StageState::Cached => "cached".to_owned(),
+        StageState::Failed => format!("FAILED: {}", stage.message.as_deref().unwrap_or("no reason given")),
+        StageState::Skipped if !stage.is_asked_for() => return None,
+        StageState::Skipped => format!("skipped: {}", stage.message.as_deref().unwrap_or("")),
+    };
+    Some(format!("{name:>14}  {says}"))
+}
+
+/// Formats a count: `1,204 of 6,000 steps`.
+fn count(stage: &StageView) -> String {
+    let progress = &stage.progress;
+    format!("{} of {} {}", grouped(progress.done), grouped(progress.total), progress.unit).trim_end().to_owned()
+}
+
+/// Formats a running stage: `1,204 of 6,000 steps  23.1/s  3 min 28 s left  ▇▅▃▂▁  loss 0.1834`.
+fn working(stage: &StageView, curve: &Curve, now: Instant) -> String {
+    let progress = &stage.progress;
+    let mut parts = vec![count(stage)];
+    if let Some(rate) = curve.rate(now) {
+        let left = progress.total.saturating_sub(progress.done) as f64 / rate;
+        parts.push(format!("{}/s", print::rounded(rate)));
+        parts.push(format!("{} left", print::duration(left)));
+    }
+    let line = curve.sparkline();
+    parts.extend((!line.is_empty()).then_some(line));
+    let values = values(stage, 3);
+    parts.extend((!values.is_empty()).then_some(values));
+    parts.join("  ")
+}
+
+/// The most important metrics.
+const FIRST: [&str; 3] = ["loss", "fid", "r_precision_top3"];
+
+/// The first few metrics, such as `loss 0.1834  grad_norm 0.71`, without the ends of confidence intervals.
+pub(crate) fn values(stage: &StageView, count: usize) -> String {
+    let end = |key: &str| key.ends_with(".lower") || key.ends_with(".upper");
+    let first = FIRST.iter().filter_map(|key| stage.metrics.get_key_value(*key));
+    let others = stage.metrics.iter().filter(|(key, _)| !FIRST.contains(&key.as_str()) && !end(key));
+    let shown = first.chain(others).take(count).map(|(key, value)| format!("{key} {}", print::number(*value)));
+    printable(&shown.collect::<Vec<_>>().join("  ")).into_owned()
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeMap;
+
+    use protocol::message::Progress as Done;
+
+    use super::*;
+
+    fn stage(state: StageState, done: u64) -> StageView {
+        StageView {
+            name: "vae".into(),
+            kind: "train.vae".into(),
+            state,
+            key: None,
+            outputs: BTreeMap::new(),
+            metrics: BTreeMap::from([("grad_norm".to_owned(), 0.5), ("loss".to_owned(), 0.25)]),
+            progress: Done { done, total: 100, unit: "steps".into(), metrics: BTreeMap::new() },
+            wall_s: 12.0,
+            attempt: protocol::Attempt(1),
+            workers: vec!["w1".into(), "w2".into()],
+            instruction_set: None,
+            message: None,
+            wants_workers: None,
+            of: None,
+            times: Default::default(),
+            needs: vec![],
+        }
+    }
+
+    fn pipeline() -> Pipeline {
+        let text = "name: p\ndataset: {format: synthetic}\nstages:\n  vae: {kind: train.vae, steps: 100, loss: {joint_from: 0.5}}\n";
+        pipeline::read("p.yaml", text, &[]).unwrap_or_else(|mistakes| panic!("{mistakes}"))
+    }
+
+    fn progress() -> Progress {
+        Progress::new(false, &pipeline(), "`--workers N` starts more")
+    }
+
+    #[test]
+    fn changes_are_told_once() {
+        let line = |state, done| change(&stage(state, done), StageState::Waiting);
+        assert_eq!(line(StageState::Running, 0).unwrap(), "           vae  started on w1, w2");
+        assert_eq!(line(StageState::Running, 40).unwrap(), "           vae  continues at 40 of 100 steps");
+        assert_eq!(
+            line(StageState::Ran, 100).unwrap(),
+            "           vae  done: 100 of 100 steps in 12 s  loss 0.2500  grad_norm 0.5000"
+        );
+        assert_eq!(line(StageState::Waiting, 0), None);
+        assert_eq!(change(&stage(StageState::Running, 50), StageState::Running), None);
+    }
+
+    #[test]
+    fn what_was_not_asked_for_has_no_line() {
+        let skipped = |why: &str| {
+            let stage = StageView { message: Some(why.to_owned()), ..stage(StageState::Skipped, 0) };
+            change(&stage, StageState::Waiting)
+        };
+        assert_eq!(skipped(StageView::NOT_ASKED_FOR), None);
+        assert_eq!(skipped("stage `data` failed").unwrap(), "           vae  skipped: stage `data` failed");
+    }
+
+    #[test]
+    fn a_stage_at_work_has_a_line_a_minute() {
+        let (mut progress, start) = (progress(), Instant::now());
+        let mut lines = Vec::new();
+        for second in 0..130 {
+            let now = start + Duration::from_secs(second);
+            let at = |line: String| (second, line);
+            lines.extend(progress.stage(&stage(StageState::Running, 1 + second / 4), now).into_iter().map(at));
+        }
+        let seconds: Vec<u64> = lines.iter().map(|(second, _)| *second).collect();
+        assert_eq!(seconds, [0, 60, 120], "{lines:#?}");
+        let values = "loss 0.2500  grad_norm 0.5000";
+        assert_eq!(
+            lines[1].1,
+            format!("           vae  16 of 100 steps  0.250/s  5 min 36 s left  ▁▁▁▁▁▁▁▁▁▁▁▁▁▁▁▁  {values}")
+        );
+    }
+
+    #[test]
+    fn a_missing_worker_is_mentioned_after_a_while_with_what_to_do() {
+        let (mut progress, start) = (progress(), Instant::now());
+        let waits = StageView {
+            message: Some("waits for 1 idle `flex` worker".to_owned()),
+            wants_workers: Some(1),
+            ..stage(StageState::Ready, 0)
+        };
+        let mut said = |second| progress.stage(&waits, start + Duration::from_secs(second));
+        assert_eq!(said(0), [""; 0]);
+        assert_eq!(said(14), [""; 0]);
+        assert_eq!(said(15), ["           vae  waits for 1 idle `flex` worker; `--workers N` starts more"]);
+        assert_eq!(said(16), [""; 0]);
+    }
+
+    #[test]
+    fn a_jump_of_the_loss_is_explained_where_it_happens() {
+        let (mut progress, start) = (progress(), Instant::now());
+        let mut lines = |done| progress.stage(&stage(StageState::Running, done), start);
+        assert_eq!(lines(10), ["           vae  continues at 10 of 100 steps"]);
+        assert_eq!(lines(50), [""; 0]);
+        let joins = "the loss includes the terms on joints and feet";
+        assert_eq!(lines(52), [format!("           vae  from step 50 of 100: {joins} (`loss.joint_from`)")]);
+        assert_eq!(lines(60), [""; 0]);
+        let mut later = self::progress();
+        let lines = later.stage(&stage(StageState::Running, 70), start);
+        assert_eq!(lines, ["           vae  continues at 70 of 100 steps"], "it joined long ago");
+    }
+}

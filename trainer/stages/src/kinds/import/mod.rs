@@ -1,0 +1,8 @@
+//! The kinds `import.*`: published weights.
+
+mod evaluator;
+mod model;
+
+runners! {
+    Plain: ImportEvaluator, ImportModel;
+}

@@ -1,0 +1,623 @@
+//! `import.model`: converts published weights to the output of our training stages. Sources: MLD, MotionLCM, T2M-GPT,
+//! MoMask, MMM, MDM, DisCoRD.
+//!
+//! Facts that the weights lack come from the publication: the noise schedule of a latent diffusion, MDM's cosine,
+//! DisCoRD's frequencies. Facts that the publication leaves to the user are settings. Tables of positions and other
+//! constants of a published file are kept beside the weights, for a later export.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use burn::module::Module;
+use burn::tensor::Device;
+use checkpoint::model::{self, Model, Parts};
+use models::flat::{Entry, layout};
+use models::names::{Weights, from_bytes};
+use models::networks::{
+    Denoiser, Gpt, Init, MaskedTransformer, Mmm, MomaskConfig, Projection, ResidualTransformer, Tokenizer, Vae,
+};
+use motion::{DataPath, Skeleton, npy};
+use protocol::artifact::Role;
+use protocol::stage::{
+    DataFormat, Diffusion, Family, FlowBackbone, FlowNetwork, FlowPrediction, FlowProjection, ImportModel,
+    ImportedPart, LatentShape, MdmNetwork, NoiseSchedule, Prediction, StageSpec, TextActivation, TokenNetwork,
+    TokenizerNetwork,
+};
+use protocol::{ArtifactKind, Digest, Manifest};
+
+use crate::artifacts::{self, DenoiserMeta, Draft, EmbeddingsMeta, MODEL_FILE, VaeMeta, to_meta, word};
+use crate::context::{AttemptContext, ContextError, Outcome, StageError};
+use crate::external::{self, Given};
+use crate::generate::generator::{
+    FEATURE_DIFFUSION, GeneratorMeta, LATENT_DIFFUSION, MASKED_PREFIX, RESIDUAL_PREFIX, TOKENS,
+};
+use crate::kinds::shape::Plain;
+use crate::parts::control::{CONTROLNET_PREFIX, ControlMeta, TRAJECTORY_PREFIX};
+use crate::parts::flow_decoder::{Backbone, FlowMeta, HEAD};
+use crate::parts::motion_networks::{Architecture, MotionDenoiserMeta};
+use crate::parts::networks::TIME_DIM;
+use crate::parts::tokenizer::TokenizerMeta;
+use crate::parts::{self, model_error, weights};
+use crate::published::{Checkpoint, Found, Taken, sizes};
+use crate::train::data::latents;
+
+/// Name of a single codebook, in our files and in those of T2M-GPT and MMM.
+const CODEBOOK: (&str, &str) = ("quantizer.layers.0.codebook", "quantizer.codebook");
+/// Upper limit of a tokenizer's dilations.
+const REACH: usize = 10_000;
+
+impl Plain for ImportModel {
+    fn run(&self, cx: &mut dyn AttemptContext) -> Result<Outcome, StageError> {
+        external::read(cx, |cx, given| import(self, cx, given))
+    }
+}
+
+fn import(settings: &ImportModel, cx: &mut dyn AttemptContext, given: &Given) -> Result<Outcome, StageError> {
+    let file = Checkpoint::open(given.path("path")?)?;
+    let heads = if settings.heads == 0 { settings.part.heads() } else { settings.heads };
+    let device = cx.device().inner();
+    let mut import = Import { settings, given, file: &file, heads, device, read: BTreeSet::new(), parameters: 0 };
+    let output = match settings.part {
+        ImportedPart::Vae => import.vae(cx)?,
+        ImportedPart::Mld | ImportedPart::Lcm => import.denoiser(cx)?,
+        ImportedPart::Control => import.control(cx)?,
+        ImportedPart::Tokenizer => import.tokenizer(cx)?,
+        ImportedPart::T2mgpt => import.gpt(cx)?,
+        ImportedPart::Momask => import.momask(cx)?,
+        ImportedPart::Mmm => import.mmm(cx)?,
+        ImportedPart::Mdm => import.mdm(cx)?,
+        ImportedPart::Discord => import.discord(cx)?,
+    };
+    if let Some(left_out) = file.left_out(&import.read) {
+        cx.log(&format!("{}: tensors that were not read, by prefix: {left_out}", settings.path));
+    }
+    let metrics = BTreeMap::from([("parameters".to_owned(), import.parameters as f64)]);
+    Ok(Outcome::Finished { output, metrics })
+}
+
+struct Import<'a> {
+    settings: &'a ImportModel,
+    given: &'a Given,
+    file: &'a Checkpoint,
+    heads: usize,
+    device: Device,
+    /// Names of the tensors that were read from the file.
+    read: BTreeSet<String>,
+    parameters: usize,
+}
+
+/// A network under the names of our artifacts.
+struct Network {
+    entries: Vec<Entry>,
+    taken: Taken,
+}
+
+impl Network {
+    /// Adds `prefix` to all names.
+    fn under(mut self, prefix: &str) -> Self {
+        let rename = |entry: &mut Entry| entry.name.insert_str(0, prefix);
+        self.entries.iter_mut().for_each(rename);
+        self.taken.constants.iter_mut().for_each(|(entry, _)| rename(entry));
+        self
+    }
+
+    fn pair(&self) -> (&[Entry], &[f32]) {
+        (&self.entries, &self.taken.values)
+    }
+}
+
+/// Uploads networks as the files of an artifact.
+fn add(draft: &mut Draft, networks: &[Network]) -> Result<(), StageError> {
+    weights::add_all(draft, &networks.iter().map(Network::pair).collect::<Vec<_>>())?;
+    let constants = networks.iter().flat_map(|network| &network.taken.constants);
+    let constants: Vec<_> = constants.map(|(entry, values)| (std::slice::from_ref(entry), &values[..])).collect();
+    if constants.is_empty() {
+        return Ok(());
+    }
+    draft.add_pieces(weights::CONSTANTS_FILE, &Weights::of(&constants).pieces())
+}
+
+/// The setting's value if it departs from the rule, else `None`.
+fn departing(found: bool, rule: bool) -> Option<bool> {
+    (found != rule).then_some(found)
+}
+
+/// Reads a statistic of a folder: the first existing file of `names`, with `len` finite numbers.
+fn statistic(folder: &DataPath, names: [&str; 2], len: usize) -> Result<Vec<f32>, StageError> {
+    let refuse = |what: String| StageError::Input(format!("{}: {what}", folder.display()));
+    let file = names.iter().map(|name| folder.join(name)).find(DataPath::has_entry);
+    let file = file.ok_or_else(|| refuse(format!("the folder has no `{}`", names.join("` or `"))))?;
+    let array = npy::read_any_float(&file).map_err(|e| StageError::Input(e.to_string()))?;
+    let refuse = |what: String| StageError::Input(format!("{}: {what}", file.display()));
+    if array.data.len() != len {
+        return Err(refuse(format!("has shape {:?}; expected {len} numbers", array.shape)));
+    }
+    if let Some(i) = array.data.iter().position(|v| !v.is_finite()) {
+        return Err(refuse(format!("value {i} is {}; expected a finite number", array.data[i])));
+    }
+    Ok(array.data)
+}
+
+/// Reads mean and deviation from a folder.
+fn statistics(folder: &DataPath, names: [[&str; 2]; 2], len: usize) -> Result<(Vec<f32>, Vec<f32>), StageError> {
+    let (mean, std) = (statistic(folder, names[0], len)?, statistic(folder, names[1], len)?);
+    if let Some(i) = std.iter().position(|s| *s <= 0.0) {
+        return Err(StageError::Input(format!(
+            "{}: {}: value {i} is {}; expected a number above 0",
+            folder.display(),
+            names[1][0],
+            std[i]
+        )));
+    }
+    Ok((mean, std))
+}
+
+/// File names of the statistics of features.
+const FEATURES: [[&str; 2]; 2] = [["mean.npy", "Mean.npy"], ["std.npy", "Std.npy"]];
+/// File names of the statistics of joints.
+const JOINTS: [[&str; 2]; 2] = [["Mean_raw.npy", "mean_raw.npy"], ["Std_raw.npy", "std_raw.npy"]];
+
+impl Import<'_> {
+    /// Reads the tensors of a network, which is created from shapes alone.
+    fn network<M: Module>(
+        &mut self,
+        found: &Found<'_>,
+        make: impl FnOnce(&mut Init<'_>) -> M,
+    ) -> Result<Network, StageError> {
+        let entries = layout(&make(&mut Init::shapes(&self.device)));
+        let taken = found.take(&entries, &str::to_owned)?;
+        Ok(self.taken(entries, taken))
+    }
+
+    fn taken(&mut self, entries: Vec<Entry>, taken: Taken) -> Network {
+        self.read.extend(taken.read.iter().cloned());
+        self.parameters += taken.values.len();
+        Network { entries, taken }
+    }
+
+    /// The training data: its format, and the mean and deviation of its features.
+    fn statistics(
+        &self,
+        cx: &dyn AttemptContext,
+        features: usize,
+        found: &Found<'_>,
+    ) -> Result<(DataFormat, Vec<f32>, Vec<f32>), StageError> {
+        let dataset = match self.settings.dataset.is_empty() {
+            true => None,
+            false => {
+                let (_, manifest) = artifacts::input(cx, "dataset", ArtifactKind::Dataset)?;
+                Some(artifacts::dataset(&*cx.blobs(), &manifest)?)
+            }
+        };
+        let format = dataset.as_ref().map_or(self.settings.format, |dataset| dataset.format);
+        let expected = Skeleton::of(format).features;
+        if features != expected {
+            return Err(found.refuse(format!(
+                "its motions have {features} features, but the format `{}` has {expected}; set `format` to the format \
+                 that it was trained on",
+                word(&format)
+            )));
+        }
+        if let Some(dataset) = dataset {
+            return Ok((format, dataset.mean, dataset.std));
+        }
+        let (mean, std) = statistics(self.given.path("statistics")?, FEATURES, features)?;
+        Ok((format, mean, std))
+    }
+
+    /// Opens the text encoder `text`, and checks that its captions have `dim` numbers.
+    fn text(&self, cx: &dyn AttemptContext, found: &Found<'_>, dim: usize) -> Result<Manifest, StageError> {
+        let (_, manifest) = artifacts::input(cx, "text", ArtifactKind::Embeddings)?;
+        let meta: EmbeddingsMeta = artifacts::meta(&manifest, "the caption embeddings")?;
+        if meta.dim != dim {
+            return Err(found.refuse(format!(
+                "it expects {dim} numbers per caption, but `text` has {}; embed with the encoder that it was trained \
+                 with",
+                meta.dim
+            )));
+        }
+        parts::manifest(&*cx.blobs(), meta.text, "the text encoder")
+    }
+
+    fn tokenizer_input(&self, cx: &dyn AttemptContext) -> Result<(Digest, Manifest, TokenizerMeta), StageError> {
+        let (digest, manifest) = artifacts::input(cx, "tokenizer", ArtifactKind::Tokenizer)?;
+        let meta = artifacts::meta(&manifest, "the tokenizer")?;
+        Ok((digest, manifest, meta))
+    }
+
+    /// Checks that a network in the file equals that of a part with the entries `entries`.
+    fn expect_same(
+        &mut self,
+        cx: &dyn AttemptContext,
+        found: Option<Found<'_>>,
+        (entries, part): (&[Entry], &Manifest),
+        (what, field): (&str, &str),
+    ) -> Result<(), StageError> {
+        let Some(found) = found else { return Ok(()) };
+        let other = |why: &str| {
+            let place = found.prefix();
+            found.refuse(format!(
+                "its {what}, `{place}`, differs from that of `{field}`{why}; import the {what} from this file too, or \
+                 leave it out if it is not used"
+            ))
+        };
+        let taken = found.take(entries, &str::to_owned).map_err(|error| other(&format!(" ({error})")))?;
+        let bytes = artifacts::file(&*cx.blobs(), part, MODEL_FILE)?;
+        let corrupt = |e| StageError::Context(ContextError::Corrupt(format!("the {what} of `{field}`: {e}")));
+        let ours = from_bytes(entries, &bytes, "").map_err(corrupt)?;
+        if ours.iter().zip(&taken.values).any(|(ours, theirs)| ours.to_bits() != theirs.to_bits()) {
+            return Err(other(": the values differ"));
+        }
+        self.read.extend(taken.read);
+        Ok(())
+    }
+
+    fn vae(&mut self, cx: &mut dyn AttemptContext) -> Result<Digest, StageError> {
+        let found = sizes::vae(self.file)?;
+        let config = sizes::of_vae(&found, self.heads)?;
+        let (format, mean, std) = self.statistics(cx, config.features, &found)?;
+        let meta = VaeMeta {
+            format,
+            features: config.features,
+            latent: LatentShape { tokens: config.tokens, dim: config.dim },
+            network: sizes::network(config.width, config.layers, config.heads, config.feed_forward),
+            mean,
+            std,
+            projection: departing(config.projection, config.dim != config.width),
+        };
+        let network = self.network(&found, |init| Vae::new(&meta.config(), init))?;
+        let mut draft = Draft::new(cx, ArtifactKind::Vae, to_meta(&meta));
+        add(&mut draft, &[network])?;
+        draft.finish(cx)
+    }
+
+    fn denoiser(&mut self, cx: &mut dyn AttemptContext) -> Result<Digest, StageError> {
+        let (vae_digest, vae_part) = artifacts::input(cx, "vae", ArtifactKind::Vae)?;
+        let vae: VaeMeta = artifacts::meta(&vae_part, "the VAE")?;
+        let found = sizes::denoiser(self.file)?;
+        let config = sizes::of_denoiser(&found, vae.latent.tokens, self.heads)?;
+        let family = self.settings.family().ok_or_else(|| StageError::Fault("the denoiser has no family".into()))?;
+        match (config.guidance_dim, family.is_student()) {
+            (Some(_), false) => {
+                return Err(found.refuse("it embeds a guidance scale, so it is a student; write `part: lcm`"));
+            }
+            (None, true) => {
+                return Err(found.refuse("it embeds no guidance scale, so it is a teacher; write `part: mld`"));
+            }
+            _ => {}
+        }
+        if config.dim != vae.latent.dim {
+            let (ours, theirs) = (config.dim, vae.latent);
+            return Err(found.refuse(format!(
+                "its latent tokens are {ours} wide, but the latents of `vae` are {}x{}; use the VAE that it was \
+                 trained with",
+                theirs.tokens, theirs.dim
+            )));
+        }
+        let text = self.text(cx, &found, config.text_dim)?;
+        let vae_entries = layout(&Vae::new(&vae.config(), &mut Init::shapes(&self.device)));
+        self.expect_same(cx, sizes::find_vae(self.file), (&vae_entries, &vae_part), ("VAE", "vae"))?;
+        let meta = DenoiserMeta {
+            family,
+            latent: vae.latent,
+            network: sizes::network(config.width, config.layers, config.heads, config.feed_forward),
+            diffusion: Diffusion::default(),
+            text_relu: match self.settings.text_activation {
+                TextActivation::Published => config.text_relu,
+                TextActivation::Relu => true,
+                TextActivation::None => false,
+            },
+            guidance_dim: config.guidance_dim.unwrap_or_default(),
+            text_dim: config.text_dim,
+            fits: Parts::from([(Role::VAE, vae_digest), (Role::TEXT, text.digest())]),
+            projection: departing(config.projection, config.dim != config.width),
+            time_dim: (config.time_dim != TIME_DIM).then_some(config.time_dim),
+        };
+        let network = self.network(&found, |init| Denoiser::new(&meta.config(), init))?;
+        let parts = BTreeMap::from([(Role::VAE, vae_part), (Role::TEXT, text)]);
+        latents::publish(cx, vae.format, &meta, network.pair(), parts)
+    }
+
+    fn control(&mut self, cx: &mut dyn AttemptContext) -> Result<Digest, StageError> {
+        let (_, manifest) = artifacts::input(cx, "model", ArtifactKind::Model)?;
+        let model = Model::read(&manifest).map_err(model_error)?;
+        if model.parts.contains_key(&Role::CONTROL) || model.generator != LATENT_DIFFUSION {
+            return Err(StageError::Input(
+                "`model` already has a control part, or is not a latent diffusion model; use the model that the part \
+                 controls"
+                    .into(),
+            ));
+        }
+        let part = parts::part(&*cx.blobs(), &model, &Role::DENOISER, ArtifactKind::Denoiser)?;
+        let base: DenoiserMeta = artifacts::meta(&part, "the denoiser of `model`")?;
+        let entries = layout(&Denoiser::new(&base.config(), &mut Init::shapes(&self.device)));
+        let same = ("denoiser", "model");
+        self.expect_same(cx, sizes::find_denoiser(self.file), (&entries, &part), same)?;
+        if let Some(vae) = sizes::find_vae(self.file) {
+            let part = parts::part(&*cx.blobs(), &model, &Role::VAE, ArtifactKind::Vae)?;
+            let meta: VaeMeta = artifacts::meta(&part, "the VAE of `model`")?;
+            let entries = layout(&Vae::new(&meta.config(), &mut Init::shapes(&self.device)));
+            self.expect_same(cx, Some(vae), (&entries, &part), ("VAE", "model"))?;
+        }
+        let (control, trajectory) = (sizes::controlnet(self.file)?, sizes::trajectory_encoder(self.file)?);
+        let config = sizes::of_trajectory(&trajectory, self.heads)?;
+        let joints = Skeleton::of(model.format).joints;
+        if config.joints != joints {
+            let (found, format) = (config.joints, word(&model.format));
+            return Err(trajectory.refuse(format!("it expects {found} joints, but `{format}` has {joints}")));
+        }
+        if (config.tokens, config.dim) != (base.latent.tokens, base.latent.dim) {
+            return Err(trajectory.refuse(format!(
+                "its tokens are {}x{}, but the latents of `model` are {}x{}; use the model that it was trained with",
+                config.tokens, config.dim, base.latent.tokens, base.latent.dim
+            )));
+        }
+        let (mean, std) = statistics(self.given.path("hint_statistics")?, JOINTS, 3 * joints)?;
+        let meta = ControlMeta {
+            format: model.format,
+            hints: self.settings.hints.clone(),
+            embedding: control.dim("controlnet_cond_embedding.0.weight", 0)?,
+            network: sizes::network(config.width, config.layers, config.heads, config.feed_forward),
+            mean,
+            std,
+            fits: Parts::from([(Role::DENOISER, part.digest())]),
+            projection: departing(config.projection, config.dim != config.width),
+            feedback: 0,
+        };
+        let control = self.network(&control, |init| meta.controlnet(&base, init))?.under(CONTROLNET_PREFIX);
+        let trajectory = self.network(&trajectory, |init| meta.trajectory(&base, init))?.under(TRAJECTORY_PREFIX);
+        let mut draft = Draft::new(cx, ArtifactKind::Control, to_meta(&meta));
+        add(&mut draft, &[control, trajectory])?;
+        let part = draft.into_manifest();
+        cx.put_manifest(&part)?;
+        let model = model::extend(&manifest, None, &BTreeMap::from([(Role::CONTROL, part)])).map_err(model_error)?;
+        Ok(cx.put_manifest(&model)?)
+    }
+
+    fn tokenizer(&mut self, cx: &mut dyn AttemptContext) -> Result<Digest, StageError> {
+        let found = sizes::tokenizer(self.file)?;
+        let found_sizes = sizes::of_tokenizer(&found)?;
+        let (format, mean, std) = self.statistics(cx, found_sizes.features, &found)?;
+        let (depth, growth) = (found_sizes.depth, self.settings.growth);
+        let reach = u32::try_from(depth).ok().and_then(|depth| growth.checked_pow(depth));
+        if reach.is_none_or(|reach| reach > REACH) {
+            return Err(found.refuse(format!(
+                "its dilations grow to {growth}^{depth}; expected at most {REACH} frames; set `growth` to the value \
+                 that it was trained with"
+            )));
+        }
+        let meta = TokenizerMeta {
+            format,
+            features: found_sizes.features,
+            codes: found_sizes.codes,
+            code_dim: found_sizes.code_dim,
+            quantizers: found_sizes.quantizers,
+            network: TokenizerNetwork { width: found_sizes.width, depth, growth, ..TokenizerNetwork::default() },
+            mean,
+            std,
+        };
+        let network = Tokenizer::new(&meta.config(), &mut Init::shapes(&self.device));
+        let entries: Vec<Entry> = layout(&network).into_iter().chain(meta.books()).collect();
+        let alias = |name: &str| match found_sizes.single && name == CODEBOOK.0 {
+            true => CODEBOOK.1.to_owned(),
+            false => name.to_owned(),
+        };
+        let taken = found.take(&entries, &alias)?;
+        let network = self.taken(entries, taken);
+        let mut draft = Draft::new(cx, ArtifactKind::Tokenizer, to_meta(&meta));
+        add(&mut draft, &[network])?;
+        draft.finish(cx)
+    }
+
+    /// Uploads a model of tokens with its parts.
+    fn generator(
+        &self,
+        cx: &mut dyn AttemptContext,
+        (family, network): (Family, TokenNetwork),
+        (longest, text_dim): (usize, usize),
+        (tokenizer, text): ((Digest, Manifest, TokenizerMeta), Manifest),
+        networks: &[Network],
+    ) -> Result<Digest, StageError> {
+        let (digest, part, tokenizer) = tokenizer;
+        let meta = GeneratorMeta {
+            family,
+            network,
+            codes: tokenizer.codes,
+            quantizers: tokenizer.quantizers,
+            longest,
+            text_dim,
+            fits: Parts::from([(Role::TOKENIZER, digest), (Role::TEXT, text.digest())]),
+        };
+        let mut draft = Draft::new(cx, ArtifactKind::TokenGenerator, to_meta(&meta));
+        add(&mut draft, networks)?;
+        let parts = [(Role::GENERATOR, draft.into_manifest()), (Role::TOKENIZER, part), (Role::TEXT, text)];
+        parts::publish_model(cx, TOKENS, tokenizer.format, &parts.into())
+    }
+
+    /// Refuses a network for other codebooks than the tokenizer's.
+    fn expect_codes(found: &Found<'_>, codes: usize, tokenizer: &TokenizerMeta, one: bool) -> Result<(), StageError> {
+        if codes != tokenizer.codes || (one && tokenizer.quantizers != 1) {
+            return Err(found.refuse(format!(
+                "it generates {codes} codes{}, but `tokenizer` has {} codebook(s) of {}; use the tokenizer that it was \
+                 trained with",
+                if one { " of one codebook" } else { "" },
+                tokenizer.quantizers,
+                tokenizer.codes
+            )));
+        }
+        Ok(())
+    }
+
+    fn gpt(&mut self, cx: &mut dyn AttemptContext) -> Result<Digest, StageError> {
+        let tokenizer = self.tokenizer_input(cx)?;
+        let found = sizes::gpt(self.file)?;
+        let config = sizes::of_gpt(&found, self.settings.longest, self.heads)?;
+        Self::expect_codes(&found, config.codes, &tokenizer.2, true)?;
+        let text = self.text(cx, &found, config.text_dim)?;
+        let network = self.network(&found, |init| Gpt::new(&config, init))?;
+        let size = TokenNetwork {
+            width: config.width,
+            layers: config.layers,
+            heads: config.heads,
+            feed_forward: config.rate * config.width,
+            ..TokenNetwork::default()
+        };
+        let lengths = (config.block - 2, config.text_dim);
+        self.generator(cx, (Family::Autoregressive, size), lengths, (tokenizer, text), &[network])
+    }
+
+    fn mmm(&mut self, cx: &mut dyn AttemptContext) -> Result<Digest, StageError> {
+        let tokenizer = self.tokenizer_input(cx)?;
+        let found = sizes::mmm(self.file)?;
+        let config = sizes::of_mmm(&found, self.settings.longest, self.heads)?;
+        Self::expect_codes(&found, config.codes, &tokenizer.2, true)?;
+        if config.dim != tokenizer.2.code_dim {
+            return Err(found.refuse(format!(
+                "it expects codes of width {}, but those of `tokenizer` are {} wide; use the tokenizer that it was \
+                 trained with",
+                config.dim, tokenizer.2.code_dim
+            )));
+        }
+        let text = self.text(cx, &found, config.text_dim)?;
+        let network = self.network(&found, |init| Mmm::new(&config, init))?;
+        let size = TokenNetwork {
+            width: config.width,
+            layers: config.layers,
+            heads: config.heads,
+            feed_forward: config.rate * config.width,
+            word_blocks: config.local,
+            ..TokenNetwork::default()
+        };
+        let lengths = (config.block - 2, config.text_dim);
+        self.generator(cx, (Family::Mmm, size), lengths, (tokenizer, text), &[network])
+    }
+
+    fn momask(&mut self, cx: &mut dyn AttemptContext) -> Result<Digest, StageError> {
+        let tokenizer = self.tokenizer_input(cx)?;
+        let quantizers = tokenizer.2.quantizers;
+        let found = sizes::masked(self.file)?;
+        let config = sizes::of_masked(&found, quantizers, self.heads)?;
+        Self::expect_codes(&found, config.codes, &tokenizer.2, false)?;
+        let text = self.text(cx, &found, config.text_dim)?;
+        let mut networks =
+            vec![self.network(&found, |init| MaskedTransformer::new(&config, init))?.under(MASKED_PREFIX)];
+        match (self.settings.residual.as_str(), quantizers) {
+            ("", 1) => {}
+            ("", many) => {
+                return Err(found.refuse(format!(
+                    "`tokenizer` has {many} codebooks, but this network generates only the first; set `residual` to \
+                     the file of the residual transformer"
+                )));
+            }
+            _ => networks.push(self.above(cx, &config)?.under(RESIDUAL_PREFIX)),
+        }
+        let MomaskConfig { dim, width, layers, heads, feed_forward, text_dim, .. } = config;
+        let size = TokenNetwork { width, layers, heads, feed_forward, embedding: dim, ..TokenNetwork::default() };
+        let lengths = (self.settings.longest, text_dim);
+        self.generator(cx, (Family::Masked, size), lengths, (tokenizer, text), &networks)
+    }
+
+    /// Reads MoMask's network of the layers above the first.
+    fn above(&mut self, cx: &mut dyn AttemptContext, first: &MomaskConfig) -> Result<Network, StageError> {
+        let path = self.given.path("residual")?;
+        let file = Checkpoint::open(path)?;
+        let found = sizes::residual(&file)?;
+        let config = sizes::of_residual(&found, self.heads)?;
+        if config != *first {
+            return Err(found.refuse(format!(
+                "it has {config:?}, but the masked transformer has {first:?}; use two networks of the same size, \
+                 trained with the same tokenizer"
+            )));
+        }
+        let entries = layout(&ResidualTransformer::new(&config, true, &mut Init::shapes(&self.device)));
+        let taken = found.take(&entries, &str::to_owned)?;
+        if let Some(left_out) = file.left_out(&taken.read) {
+            cx.log(&format!("{}: tensors that were not read, by prefix: {left_out}", path.display()));
+        }
+        self.parameters += taken.values.len();
+        Ok(Network { entries, taken })
+    }
+
+    fn mdm(&mut self, cx: &mut dyn AttemptContext) -> Result<Digest, StageError> {
+        let found = sizes::mdm(self.file)?;
+        let config = sizes::of_mdm(&found, self.heads)?;
+        let (format, mean, std) = self.statistics(cx, config.features, &found)?;
+        let text = self.text(cx, &found, config.text_dim)?;
+        let family =
+            self.settings.family().ok_or_else(|| StageError::Fault("the MDM denoiser has no family".into()))?;
+        let size = MdmNetwork {
+            width: config.width,
+            layers: config.layers,
+            heads: config.heads,
+            feed_forward: config.feed_forward,
+            ..MdmNetwork::default()
+        };
+        let diffusion =
+            Diffusion { schedule: NoiseSchedule::Cosine, prediction: Prediction::Sample, ..Diffusion::default() };
+        let meta = MotionDenoiserMeta {
+            family,
+            architecture: Architecture::Mdm(size.clone()),
+            format,
+            diffusion,
+            mask_frames: self.settings.mask_frames,
+            max_frames: self.settings.max_frames,
+            mean,
+            std,
+            text_dim: config.text_dim,
+            fits: Parts::from([(Role::TEXT, text.digest())]),
+        };
+        let network = self.network(&found, |init| meta.mdm(&size, init))?;
+        let mut draft = Draft::new(cx, ArtifactKind::Denoiser, to_meta(&meta));
+        add(&mut draft, &[network])?;
+        let parts = BTreeMap::from([(Role::DENOISER, draft.into_manifest()), (Role::TEXT, text)]);
+        parts::publish_model(cx, FEATURE_DIFFUSION, meta.format, &parts)
+    }
+
+    fn discord(&mut self, cx: &mut dyn AttemptContext) -> Result<Digest, StageError> {
+        let (digest, _, tokenizer) = self.tokenizer_input(cx)?;
+        let found = sizes::unet(self.file)?;
+        let config = sizes::of_unet(&found, (self.heads, HEAD))?;
+        if (config.features, config.token_dim) != (tokenizer.features, tokenizer.code_dim) {
+            return Err(found.refuse(format!(
+                "it expects {} features and codes of width {}, but `tokenizer` has {} and {}; use the tokenizer that \
+                 it was trained with",
+                config.features, config.token_dim, tokenizer.features, tokenizer.code_dim
+            )));
+        }
+        let projection = match config.projection {
+            Projection::Stack => FlowProjection::Stack,
+            Projection::Repeat => FlowProjection::Repeat,
+            Projection::Transposed => FlowProjection::Transposed,
+            Projection::Upsample => {
+                return Err(found.refuse("its projection is not supported; expected stack, repeat or transposed"));
+            }
+        };
+        let meta = FlowMeta {
+            format: tokenizer.format,
+            features: config.features,
+            code_dim: config.token_dim,
+            backbone: FlowBackbone::Unet,
+            prediction: FlowPrediction::Velocity,
+            network: FlowNetwork {
+                width: config.width,
+                condition: config.condition_dim,
+                layers: config.blocks,
+                heads: self.heads,
+                attention: config.attention.is_some(),
+                projection,
+                ..FlowNetwork::default()
+            },
+            solver: self.settings.solver.into(),
+            steps: self.settings.solver_steps,
+            fits: Parts::from([(Role::TOKENIZER, digest)]),
+        };
+        let Backbone::Unet(network) = meta.field(&mut Init::shapes(&self.device)).backbone else {
+            return Err(StageError::Fault("expected a U-Net".into()));
+        };
+        let entries = layout(&network);
+        let taken = found.take(&entries, &str::to_owned)?;
+        let network = self.taken(entries, taken);
+        let mut draft = Draft::new(cx, ArtifactKind::FlowDecoder, to_meta(&meta));
+        add(&mut draft, &[network])?;
+        draft.finish(cx)
+    }
+}

@@ -1,0 +1,7 @@
+//! The kinds `model.*`: models made from parts.
+
+mod decoder;
+
+runners! {
+    Plain: ModelDecoder;
+}

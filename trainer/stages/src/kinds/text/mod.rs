@@ -1,0 +1,7 @@
+//! The kinds `text.*`: captions.
+
+mod embed;
+
+runners! {
+    Map: TextEmbed;
+}

@@ -1,0 +1,5 @@
+//! Running stages outside a worker: to verify a result, and to estimate the cost of a pipeline.
+
+pub mod estimate;
+mod solo;
+pub mod verify;
