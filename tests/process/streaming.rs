@@ -8,7 +8,7 @@ use std::os::unix::fs::PermissionsExt;
 use std::process::Stdio;
 use std::time::Duration;
 
-use cluster_tests::documented::{shell_lines, words};
+use cluster_tests::documented::{run_by, words};
 use cluster_tests::{Bench, Running, Said, wait_for};
 use nix::sys::signal::Signal;
 use serde_json::{Value, json};
@@ -124,7 +124,7 @@ fn follows_a_path(bench: &Bench) {
     let root = Bench::repository();
     fs::create_dir_all(bench.path().join("docs")).expect("a folder");
     std::os::unix::fs::symlink(root.join("docs/examples"), bench.path().join("docs/examples")).expect("a link");
-    let lines = shell_lines(&root.join("README.md"), Some("<!-- run by tests/process/streaming.rs -->"));
+    let lines = run_by(&root, "tests/process/streaming.rs");
     assert!(lines.len() >= 2, "{lines:?}");
     for line in lines {
         let words = words(&line);
