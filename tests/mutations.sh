@@ -15,9 +15,11 @@ log=$copy/mutation.log
 wanted=("$@")
 missed=0
 
-# mutation NAME FILE PERL CRATES: PERL changes FILE, and a test of one of CRATES must fail; the first failure ends the search.
+# mutation NAME FILE PERL TESTS: PERL changes FILE, and one of TESTS must fail; the first failure ends the search. An element of
+# TESTS is CRATE, CRATE:PROGRAM or CRATE:PROGRAM:FILTER, where PROGRAM is `lib` or a file of the crate's tests. Programs that are
+# not named are neither linked nor run.
 mutation() {
-    local name=$1 file=$2 change=$3 crates=$4 crate
+    local name=$1 file=$2 change=$3 tests=$4 begun=$SECONDS test crate program filter programs
     if [ ${#wanted[@]} -gt 0 ] && [[ ! " ${wanted[*]} " == *" $name "* ]]; then return; fi
     perl -0pi -e "$change" "$file"
     if git diff --quiet; then
@@ -25,10 +27,19 @@ mutation() {
         missed=1
         return
     fi
-    for crate in $crates; do
-        if cargo test --quiet --locked -p "$crate" --lib --tests >"$log" 2>&1; then continue; fi
+    for test in $tests; do
+        crate=${test%%:*} program=${test#*:}
+        [ "$crate" != "$test" ] || program=
+        filter=${program#*:} program=${program%%:*}
+        [ "$filter" != "$program" ] || filter=
+        case $program in
+            '') programs=(--lib --tests) ;;
+            lib) programs=(--lib) ;;
+            *) programs=(--test "$program") ;;
+        esac
+        if cargo test --quiet --locked -p "$crate" "${programs[@]}" -- ${filter:+"$filter"} >"$log" 2>&1; then continue; fi
         if grep -q '^test result: FAILED' "$log"; then
-            echo "$name: $(grep -E '^    [a-z_:0-9]+$' "$log" | sort -u | tr -s ' \n' ' ')"
+            echo "$name ($((SECONDS - begun)) s): $(grep -E '^    [a-z_:0-9]+$' "$log" | sort -u | tr -s ' \n' ' ')"
         else
             echo "$name: does not compile"
             tail -20 "$log"
@@ -52,68 +63,74 @@ mutation no-sync-of-its-folder registry/src/blob/fs.rs 's/folder\.disk\.sync_dir
 mutation no-sync-of-the-operating-system registry/src/blob/disk.rs 's/(fn sync\(&mut self\) -> io::Result<\(\)> \{\s+)self\.sync_all\(\)/$1Ok(())/' registry
 mutation grace-0 registry/src/retention.rs 's/60 \* 60 \* 1000/0/' "registry coordinator"
 mutation no-touch registry/src/blob/store.rs 's/let touched = self\.backend\(\)\.touch\(digest\)\?;/let touched = stat;/' registry
-mutation constant-nonce worker/src/gang/handshake.rs 's/getrandom::fill\(&mut bytes\)/getrandom::fill(&mut bytes[..0])/' worker
-mutation token-over-plain-http trainer/access/src/connection.rs 's/ && !server\.is_local\(\)/ \&\& server.is_local()/' access
-mutation pipe-as-token-file trainer/access/src/file.rs 's/if file\.metadata\(\)\?\.is_file\(\)/if true/' access
-mutation lock-follows-links registry/src/blob/disk.rs 's/OFlag::O_NOFOLLOW \| //' registry
-mutation gang-in-the-clear worker/src/gang/seal.rs 's/Ok\(stream\.local_addr\(\)\?\.ip\(\)\.to_canonical\(\) != .*\)$/Ok(stream.local_addr().is_err())/m' worker
-mutation nonce-that-repeats worker/src/gang/seal.rs 's/bytes\[4\.\.\]\.copy_from_slice\(&number\.to_le_bytes\(\)\);/let _ = number; bytes[4] = 1;/' worker
-mutation every-queued-run-is-visited trainer/coordinator/src/decide/schedule.rs 's/(let prepared = )(prepared_gangs)/cx.state.visits += cx.state.runs.size() as u64;\n    $1$2/' coordinator
-mutation a-rank-is-not-brought-up-to-date trainer/coordinator/src/state/apply.rs 's/(concerned\.append\(&mut self\.concerned\(fact\)\);)/$1\n        concerned.clear();/' coordinator
-mutation parts-of-a-given-up-snapshot-count registry/src/sqlite/apply.rs 's/run\(conn, sqlx::query\(given_up\)\.bind\(int\(seq\)\)\.bind\(int\(seq\)\)\)\.await\?;/let _ = given_up;/' registry
-mutation readers-take-all-connections trainer/coordinator/src/shell/listener.rs 's/own >= limits\.of_token/own > limits.most/' coordinator
-mutation no-limit-of-calls trainer/coordinator/src/shell/rate.rs 's/bucket\.left < 1\.0/bucket.left < -1.0e9/' coordinator
-mutation no-limit-of-live-runs trainer/coordinator/src/decide/runs.rs 's/if live < most \{/if live < most || most > 0 {/' coordinator
-mutation no-limit-of-a-runs-lines registry/src/sqlite/usage.rs 's/bind\(int\(log_bytes\)\)/bind(0)/' coordinator
-mutation a-refused-blob-is-tried-again worker/src/blobs.rs 's/BlobError::Unfit\(message\)/BlobError::Unavailable(message)/' worker
-mutation name-of-another-token trainer/coordinator/src/state/worker.rs 's/if own\.caller != by\.caller/if own.caller.is_empty()/' coordinator
-mutation name-of-a-live-process trainer/coordinator/src/state/worker.rs 's/if own\.secret == by\.secret =>/if !own.caller.is_empty() =>/' coordinator
-mutation name-beyond-its-pattern trainer/coordinator/src/shell/secrets.rs 's/\|names\| !names\.allow\(worker\.as_str\(\)\)/|_| false/' coordinator
-mutation poll-without-its-secret trainer/coordinator/src/shell/secrets.rs 's/if identity\.secret == Digest::of\(self\.secret\.0\.as_bytes\(\)\)/if !self.secret.0.contains("?")/' coordinator
-mutation grant-without-its-secret trainer/coordinator/src/shell/secrets.rs 's/if is\(secrets\.mac\(&\("grant", &self\.caller\.name, grant\)\), &self\.secret\.0\)/if !secrets.of_grant(&self.caller.name, grant).is_empty()/' coordinator
-mutation grant-of-every-token trainer/coordinator/src/shell/secrets.rs 's/\("grant", caller, grant\)/("grant", "", grant)/; s/\("grant", &self\.caller\.name, grant\)/("grant", "", grant)/' coordinator
-mutation receipt-of-every-process trainer/coordinator/src/shell/secrets.rs 's/\("upload", caller, &grant\.task, &grant\.worker, grant\.incarnation, digest\)/("upload", caller, grant.task.as_str().len(), digest)/' coordinator
-mutation manifest-of-foreign-blobs trainer/coordinator/src/shell/vouching.rs 's/return Ok\(Some\((next|file\.digest)\)\);/continue;/g' coordinator
-mutation mention-of-foreign-blobs trainer/coordinator/src/shell/vouching.rs 's/if leads_somewhere && seen\.insert\(other\)/if leads_somewhere \&\& seen.insert(other) \&\& queue.len() > 99/' coordinator
-mutation staged-of-everybody trainer/coordinator/src/shell/uploads.rs 's/let is_known = receipt\.is_some\(\)/let is_known = receipt.is_none()/' coordinator
-mutation worker-reads-everything trainer/coordinator/src/shell/uploads.rs 's/if !proof\.caller\.scopes\.allow\(Scope::Read\)/if proof.caller.scopes.allow(Scope::Promote)/' coordinator
-mutation poll-in-anothers-name trainer/coordinator/src/observe.rs 's/if \(&said\.grant\.worker, said\.grant\.incarnation\) != \(&worker, poll\.incarnation\)/if said.grant.worker.as_str().is_empty()/' coordinator
-mutation promotion-without-scope trainer/access/src/tokens.rs 's/if !allow\(Scope::Promote\)/if false/' "access coordinator"
-mutation protected-from-none trainer/access/src/tokens.rs 's/Some\(names\) if !names\.contains\(name\) =>/Some(_) if false =>/' access
-mutation promotion-without-a-second-look trainer/coordinator/src/shell/effects.rs 's/&& let Err\(why\) = actor_handle\.may_promote\(&owner, &alias\)/\&\& let Err::<(), String>(why) = Ok(drop(alias.clone()))/' coordinator
-mutation submission-promotes-unasked trainer/coordinator/src/shell/actor_handle.rs 's/self\.check_registrations\(&pipeline, &owner\)\.await\?;//' coordinator
-mutation runs-of-others-are-shown trainer/coordinator/src/shell/records.rs 's/self\.sees\.as_ref\(\)\.is_none_or\(\|group\| run\.owner\.group\(\) == \*group\)/run.number > 0/' coordinator
-mutation runs-of-others-are-controlled trainer/coordinator/src/shell/queries.rs 's/owner\.is_some\(\) && !caller\.controls\(owner\.as_ref\(\)\)/false/' coordinator
-mutation models-of-others-are-taken registry/src/sqlite/owners.rs 's/if !is_its_own/if false \&\& !is_its_own/' registry
-mutation revoked-and-served trainer/coordinator/src/shell/token_table.rs 's/self\.changed\.send_modify\(\|version\| \*version \+= 1\);//' coordinator
-mutation expired-and-served trainer/access/src/expiry.rs 's/now_ms >= self\.at_ms/now_ms < self.at_ms \&\& false/' "access coordinator"
-mutation refusals-one-by-one trainer/coordinator/src/shell/audit.rs 's/pending\.count\(kind, now_ms, REFUSED_MS\)/pending.line(kind.line(now_ms, now_ms, 1))/' coordinator
-mutation links-out-of-a-data-root trainer/motion/src/roots.rs 's/ResolveFlag::RESOLVE_BENEATH \| //' motion
-mutation a-root-is-no-bound trainer/motion/src/data_access.rs 's/Some\(DataPath::beneath\(Arc::clone\(root\), root\.relative\(path\)\?, path\.to_owned\(\)\)\)/Some(DataPath::local(path))/' motion
-mutation errors-quote-files trainer/protocol/src/printable.rs 's/AtomicBool::new\(false\)/AtomicBool::new(true)/' "protocol hostile"
-mutation digests-on-trust trainer/motion/src/data_access.rs 's/before\.digest != \*expected/false/' motion
-mutation changes-while-read-unseen trainer/motion/src/data_access.rs 's/Ok\(after\) if after == \*before =>/Ok(_) =>/' motion
-mutation keys-without-digests trainer/coordinator/src/state/run.rs 's/inputs\.contains_key\(&folder\.field\)/!folder.field.is_empty() || inputs.is_empty()/' coordinator
-mutation named-without-proof registry/src/proofs.rs 's/(if inner\.is_condemned\(&artifact, proven\.since\)) \{/$1 \&\& false {/' registry
-mutation named-while-removed registry/src/proofs.rs 's/ended\.is_none_or\(\|ended\| ended > since\)/ended.is_some_and(|ended| ended > since)/' registry
-mutation decided-without-proof trainer/coordinator/src/shell/actor_handle.rs 's/if artifacts\.is_empty\(\)/if artifacts.len() < 100/' coordinator
-mutation silence-is-health registry/src/blob/objects/health.rs 's/silent >= SILENCE/silent >= SILENCE * 1000/' coordinator
-mutation lease-not-asked-for-a-name registry/src/proofs.rs 's/lease\.check\(\)\.map_err/Ok(()).map_err/' registry
-mutation lease-not-asked-for-a-removal registry/src/lease.rs 's/self\.check\(\)\.map_err\(\|e\| BlobError/Ok(()).map_err(|e: NoLease| BlobError/' registry
-mutation holder-not-refused registry/src/lease.rs 's/Some\(held\) if held != first => return Ok\(Err\(held\.by\)\),/Some(held) if held != first => return Ok(Ok(())),/' registry
-mutation joiner-outvotes-holder trainer/coordinator/src/state/evidence.rs 's/\(Self::Absent \| Self::Empty \| Self::Late, Self::Holds\(_\)\) => 0/(Self::Holds(_), Self::Empty) => 0/' coordinator
-mutation one-complaint-is-enough trainer/coordinator/src/state/evidence.rs 's/let over = at\.since\(since\) >= hearing_ms;/let over = true;/' coordinator
-mutation liar-stays trainer/coordinator/src/state/evidence.rs 's/Reverse\(degree\(rank\)\)/degree(rank)/' coordinator
-mutation word-outlives-membership trainer/coordinator/src/state/apply.rs 's/drop\(words\.remove\(&member\.worker\)\)/drop(words.get(\&member.worker))/' coordinator
-mutation suspicion-never-fades trainer/coordinator/src/decide/gangs.rs 's/saturating_sub\(u32::try_from\(faded\)[^)]*\)\)/saturating_sub(u32::try_from(faded * 0).unwrap_or(0))/' coordinator
-mutation too-few-lose-their-state trainer/coordinator/src/decide/attempts.rs 's/!left\.is_empty\(\) && self\.may_hold/left.is_empty() \&\& self.may_hold/' coordinator
-mutation failing-lead-ends-the-try trainer/coordinator/src/decide/outcome.rs 's/&& self\.goes_on_without/\&\& !self.goes_on_without/' coordinator
-mutation joins-without-reaching worker/src/prepare.rs 's/for Member \{ worker, peer_address, \.\. \} in &task\.peers \{/for Member { worker, peer_address, .. } in task.peers.iter().take(0) {/' worker
-mutation only-whole-frames-count worker/src/gang/link.rs 's/if count > 0 \{/if count > 1 << 20 {/' worker
-mutation signs-behind-frames worker/src/gang/link.rs 's/writer\.sign\(sign, patience, abort\)\?;/let _ = sign;/' worker
-mutation slow-is-not-named worker/src/gang/pace.rs 's/const FAR_OVER: u32 = 3;/const FAR_OVER: u32 = 3_000_000;/' worker
-mutation finished-as-last-reported trainer/coordinator/src/view.rs 's/    progress\.done = progress\.total;\n//' coordinator
-mutation new-run-with-each-start trainer/coordinator/src/decide/runs.rs 's/&& old\.until == run\.until/\&\& false/' coordinator
-mutation paused-if-interrupted trainer/coordinator/src/state/run.rs 's/self\.parked && self\.state == RunState::Paused/false/' coordinator
-mutation every-word-is-known trainer/motion/src/vocabulary.rs 's/!self\.words\.contains_key\(&word\) && //; s/!unknown\.contains\(&word\)/false \&\& !unknown.contains(\&word)/' motion
+mutation constant-nonce worker/src/gang/handshake.rs 's/getrandom::fill\(&mut bytes\)/getrandom::fill(&mut bytes[..0])/' worker:lib:gang
+mutation token-over-plain-http trainer/access/src/connection.rs 's/ && !server\.is_local\(\)/ \&\& server.is_local()/' access:lib
+mutation pipe-as-token-file trainer/access/src/file.rs 's/if file\.metadata\(\)\?\.is_file\(\)/if true/' access:lib
+mutation lock-follows-links registry/src/blob/disk.rs 's/OFlag::O_NOFOLLOW \| //' registry:lib:lock
+mutation gang-in-the-clear worker/src/gang/seal.rs 's/Ok\(stream\.local_addr\(\)\?\.ip\(\)\.to_canonical\(\) != .*\)$/Ok(stream.local_addr().is_err())/m' worker:lib:gang
+mutation nonce-that-repeats worker/src/gang/seal.rs 's/bytes\[4\.\.\]\.copy_from_slice\(&number\.to_le_bytes\(\)\);/let _ = number; bytes[4] = 1;/' worker:lib:gang
+mutation every-queued-run-is-visited trainer/coordinator/src/decide/schedule.rs 's/(let prepared = )(prepared_gangs)/cx.state.visits += cx.state.runs.size() as u64;\n    $1$2/' coordinator:decisions:queued
+mutation a-rank-is-not-brought-up-to-date trainer/coordinator/src/state/apply.rs 's/(concerned\.append\(&mut self\.concerned\(fact\)\);)/$1\n        concerned.clear();/' coordinator:decisions
+mutation parts-of-a-given-up-snapshot-count registry/src/sqlite/apply.rs 's/run\(conn, sqlx::query\(given_up\)\.bind\(int\(seq\)\)\.bind\(int\(seq\)\)\)\.await\?;/let _ = given_up;/' registry:catalog_conformance
+mutation readers-take-all-connections trainer/coordinator/src/shell/listener.rs 's/own >= limits\.of_token/own > limits.most/' coordinator:server:limits
+mutation no-limit-of-calls trainer/coordinator/src/shell/rate.rs 's/bucket\.left < 1\.0/bucket.left < -1.0e9/' coordinator:lib:rate
+mutation no-limit-of-live-runs trainer/coordinator/src/decide/runs.rs 's/if live < most \{/if live < most || most > 0 {/' coordinator:server:limits
+mutation no-limit-of-a-runs-lines registry/src/sqlite/usage.rs 's/bind\(int\(log_bytes\)\)/bind(0)/' coordinator:server:limits
+mutation a-refused-blob-is-tried-again worker/src/blobs.rs 's/BlobError::Unfit\(message\)/BlobError::Unavailable(message)/' worker:lib:tests
+mutation name-of-another-token trainer/coordinator/src/state/worker.rs 's/if own\.caller != by\.caller/if own.caller.is_empty()/' coordinator:server:workers
+mutation name-of-a-live-process trainer/coordinator/src/state/worker.rs 's/if own\.secret == by\.secret =>/if !own.caller.is_empty() =>/' coordinator:server:workers
+mutation name-beyond-its-pattern trainer/coordinator/src/shell/secrets.rs 's/\|names\| !names\.allow\(worker\.as_str\(\)\)/|_| false/' coordinator:server:workers
+mutation poll-without-its-secret trainer/coordinator/src/shell/secrets.rs 's/if identity\.secret == Digest::of\(self\.secret\.0\.as_bytes\(\)\)/if !self.secret.0.contains("?")/' coordinator:server:workers
+mutation grant-without-its-secret trainer/coordinator/src/shell/secrets.rs 's/if is\(secrets\.mac\(&\("grant", &self\.caller\.name, grant\)\), &self\.secret\.0\)/if !secrets.of_grant(&self.caller.name, grant).is_empty()/' coordinator:server:workers
+mutation grant-of-every-token trainer/coordinator/src/shell/secrets.rs 's/\("grant", caller, grant\)/("grant", "", grant)/; s/\("grant", &self\.caller\.name, grant\)/("grant", "", grant)/' coordinator:server:workers
+mutation receipt-of-every-process trainer/coordinator/src/shell/secrets.rs 's/\("upload", caller, &grant\.task, &grant\.worker, grant\.incarnation, digest\)/("upload", caller, grant.task.as_str().len(), digest)/' coordinator:server:workers
+mutation manifest-of-foreign-blobs trainer/coordinator/src/shell/vouching.rs 's/return Ok\(Some\((next|file\.digest)\)\);/continue;/g' coordinator:server:workers
+mutation mention-of-foreign-blobs trainer/coordinator/src/shell/vouching.rs 's/if leads_somewhere && seen\.insert\(other\)/if leads_somewhere \&\& seen.insert(other) \&\& queue.len() > 99/' coordinator:server:workers
+mutation staged-of-everybody trainer/coordinator/src/shell/uploads.rs 's/let has_receipt = receipt\.is_some\(\)/let has_receipt = receipt.is_none()/' coordinator:server:workers
+mutation worker-reads-everything trainer/coordinator/src/shell/uploads.rs 's/if !proof\.caller\.scopes\.allow\(Scope::Read\)/if proof.caller.scopes.allow(Scope::Promote)/' coordinator:server:workers
+mutation poll-in-anothers-name trainer/coordinator/src/observe.rs 's/if \(&said\.grant\.worker, said\.grant\.incarnation\) != \(&worker, poll\.incarnation\)/if said.grant.worker.as_str().is_empty()/' coordinator:server:workers
+mutation promotion-without-scope trainer/access/src/tokens.rs 's/if !allow\(Scope::Promote\)/if false/' "access:lib coordinator:server:owners::promotion"
+mutation protected-from-none trainer/access/src/tokens.rs 's/Some\(names\) if !names\.contains\(name\) =>/Some(_) if false =>/' access:lib
+mutation promotion-without-a-second-look trainer/coordinator/src/shell/effects.rs 's/&& let Err\(why\) = actor_handle\.may_promote\(&owner, &alias\)/\&\& let Err::<(), String>(why) = Ok(drop(alias.clone()))/' coordinator:server:promotion
+mutation submission-promotes-unasked trainer/coordinator/src/shell/actor_handle.rs 's/self\.check_registrations\(&pipeline, &owner\)\.await\?;//' coordinator:server:promotion
+mutation runs-of-others-are-shown trainer/coordinator/src/shell/records.rs 's/self\.sees\.as_ref\(\)\.is_none_or\(\|group\| run\.owner\.group\(\) == \*group\)/run.number > 0/' coordinator:server:owners::matrix
+mutation runs-of-others-are-controlled trainer/coordinator/src/shell/queries.rs 's/owner\.is_some\(\) && !caller\.controls\(owner\.as_ref\(\)\)/false/' coordinator:server:owners::matrix
+mutation models-of-others-are-taken registry/src/sqlite/owners.rs 's/if !is_its_own/if false \&\& !is_its_own/' registry:owners
+mutation revoked-and-served trainer/coordinator/src/shell/token_table.rs 's/self\.changed\.send_modify\(\|version\| \*version \+= 1\);//' coordinator:server:owners::tokens
+mutation expired-and-served trainer/access/src/expiry.rs 's/now_ms >= self\.at_ms/now_ms < self.at_ms \&\& false/' "access:lib coordinator:server:owners::tokens"
+mutation refusals-one-by-one trainer/coordinator/src/shell/audit.rs 's/pending\.count\(kind, now_ms, REFUSED_MS\)/pending.line(kind.line(now_ms, now_ms, 1))/' coordinator:lib:audit
+mutation links-out-of-a-data-root trainer/motion/src/roots.rs 's/ResolveFlag::RESOLVE_BENEATH \| //' motion:lib:data_access
+mutation a-root-is-no-bound trainer/motion/src/data_access.rs 's/Some\(DataPath::beneath\(Arc::clone\(root\), root\.relative\(path\)\?, path\.to_owned\(\)\)\)/Some(DataPath::local(path))/' motion:lib:data_access
+mutation errors-quote-files trainer/protocol/src/printable.rs 's/AtomicBool::new\(false\)/AtomicBool::new(true)/' "protocol:lib hostile:canary"
+mutation digests-on-trust trainer/motion/src/data_access.rs 's/before\.digest != \*expected/false/' motion:lib:data_access
+mutation changes-while-read-unseen trainer/motion/src/data_access.rs 's/Ok\(after\) if after == \*before =>/Ok(_) =>/' motion:lib:data_access
+mutation keys-without-digests trainer/coordinator/src/state/run.rs 's/inputs\.contains_key\(&folder\.field\)/!folder.field.is_empty() || inputs.is_empty()/' coordinator:decisions:resolve
+mutation named-without-proof registry/src/proofs.rs 's/(if inner\.is_condemned\(&artifact, proven\.since\)) \{/$1 \&\& false {/' registry:lib:proofs
+mutation named-while-removed registry/src/proofs.rs 's/ended\.is_none_or\(\|ended\| ended > since\)/ended.is_some_and(|ended| ended > since)/' registry:lib:proofs
+mutation decided-without-proof trainer/coordinator/src/shell/actor_handle.rs 's/if artifacts\.is_empty\(\)/if artifacts.len() < 100/' "coordinator:server:http coordinator:slow_bucket"
+mutation silence-is-health registry/src/blob/objects/health.rs 's/silent >= SILENCE/silent >= SILENCE * 1000/' coordinator:slow_bucket
+mutation lease-not-asked-for-a-name registry/src/proofs.rs 's/lease\.check\(\)\.map_err/Ok(()).map_err/' registry:lease
+mutation lease-not-asked-for-a-removal registry/src/lease.rs 's/self\.check\(\)\.map_err\(\|e\| BlobError/Ok(()).map_err(|e: NoLease| BlobError/' registry:lease
+mutation holder-not-refused registry/src/lease.rs 's/Some\(held\) if held != first => return Ok\(Err\(held\.by\)\),/Some(held) if held != first => return Ok(Ok(())),/' registry:lease
+mutation joiner-outvotes-holder trainer/coordinator/src/state/evidence.rs 's/\(Self::Absent \| Self::Empty \| Self::Late, Self::Holds\(_\)\) => 0/(Self::Holds(_), Self::Empty) => 0/' coordinator:lib:evidence
+mutation one-complaint-is-enough trainer/coordinator/src/state/evidence.rs 's/let over = at\.since\(since\) >= hearing_ms;/let over = true;/' "coordinator:lib:evidence coordinator:decisions:gangs"
+mutation liar-stays trainer/coordinator/src/state/evidence.rs 's/Reverse\(degree\(rank\)\)/degree(rank)/' coordinator:lib:evidence
+mutation word-outlives-membership trainer/coordinator/src/state/apply.rs 's/drop\(words\.remove\(&member\.worker\)\)/drop(words.get(\&member.worker))/' coordinator:decisions:gangs
+mutation old-report-is-believed trainer/coordinator/src/state/evidence.rs 's/ && word\.grant\.fence == self\.task\.fence && !any_holds =>/ \&\& (any_holds || !any_holds) =>/' coordinator:lib:evidence
+mutation suspicion-never-fades trainer/coordinator/src/decide/gangs.rs 's/saturating_sub\(u32::try_from\(faded\)[^)]*\)\)/saturating_sub(u32::try_from(faded * 0).unwrap_or(0))/' coordinator:decisions:gangs
+mutation too-few-lose-their-state trainer/coordinator/src/decide/attempts.rs 's/!left\.is_empty\(\) && self\.may_hold/left.is_empty() \&\& self.may_hold/' coordinator:decisions:gangs
+mutation failing-lead-ends-the-try trainer/coordinator/src/decide/outcome.rs 's/&& self\.goes_on_without/\&\& !self.goes_on_without/' coordinator:decisions:gangs
+mutation joins-without-reaching worker/src/prepare.rs 's/for Member \{ worker, peer_address, \.\. \} in &task\.peers \{/for Member { worker, peer_address, .. } in task.peers.iter().take(0) {/' worker:lib:prepare
+mutation only-whole-frames-count worker/src/gang/link.rs 's/if count > 0 \{/if count > 1 << 20 {/' worker:lib:relay
+mutation signs-behind-frames worker/src/gang/link.rs 's/writer\.sign\(sign, patience, abort\)\?;/let _ = sign;/' worker:lib:relay
+mutation slow-is-not-named worker/src/gang/pace.rs 's/const FAR_OVER: u32 = 3;/const FAR_OVER: u32 = 3_000_000;/' worker:lib:gang
+mutation finished-as-last-reported trainer/coordinator/src/view.rs 's/    progress\.done = progress\.total;\n//' coordinator:decisions:views
+mutation new-run-with-each-start trainer/coordinator/src/decide/runs.rs 's/&& old\.until == run\.until/\&\& false/' coordinator:decisions:views
+mutation paused-if-interrupted trainer/coordinator/src/state/run.rs 's/self\.parked && self\.state == RunState::Paused/false/' coordinator:decisions:views
+mutation every-word-is-known trainer/motion/src/vocabulary.rs 's/!self\.words\.contains_key\(&word\) && //; s/!unknown\.contains\(&word\)/false \&\& !unknown.contains(\&word)/' motion:lib:vocabulary
+mutation parts-of-a-killed-process-stay registry/src/retention.rs 's/place\.ask\(BlobStore::give_up_unfinished\)/place.ask(|_| Ok::<u64, BlobError>(0))/' registry:retention:upload
+mutation upload-without-a-record registry/src/blob/objects/multipart.rs 's/store\.put\(&record, text\.into\(\)\)\.await\.map\(\|_\| \(\)\)/Ok(drop(text))/' registry:conformance:parts_that
+mutation held-until-the-restart registry/src/store.rs 's/self\.order\(Order::Hold \{ task: task\.clone\(\), digest \}\)\.await\?;//' registry:retention:upload
+mutation digesting-goes-on trainer/motion/src/files.rs 's/if !go_on\(\) \{/if false \&\& !go_on() {/' motion:lib:data_access
+mutation ended-states-stay trainer/coordinator/src/decide/outcome.rs 's/(keep, )at_end: true/$1at_end: false/' coordinator:decisions:ended
 exit $missed

@@ -17,7 +17,8 @@ pub struct Report {
     pub references: u64,
     /// Descriptions of the problems.
     pub problems: Vec<String>,
-    /// Other files in the store: foreign ones, and damaged blobs that were put aside and stored again.
+    /// Other files in the store: foreign ones, damaged blobs that were put aside and stored again, and parts of uploads
+    /// that have not ended.
     #[serde(default)]
     pub notes: Vec<String>,
 }
@@ -55,14 +56,15 @@ fn check(blobs: &BlobStore, roots: &[Root]) -> Report {
         }
         Err(e) => report.problems.push(e.to_string()),
     }
-    match (blobs.strays(), blobs.aside()) {
-        (Ok(strays), Ok(aside)) => {
+    match (blobs.strays(), blobs.aside(), blobs.unfinished()) {
+        (Ok(strays), Ok(aside), Ok(unfinished)) => {
             report
                 .notes
                 .extend(strays.iter().map(|path| format!("`{path}` does not belong to the store and is left alone")));
             report.notes.extend(aside.iter().map(|path| format!("`{path}` is a damaged blob that was put aside")));
+            report.notes.extend(unfinished);
         }
-        (Err(e), _) | (_, Err(e)) => report.problems.push(e.to_string()),
+        (Err(e), _, _) | (_, Err(e), _) | (_, _, Err(e)) => report.problems.push(e.to_string()),
     }
     for root in roots {
         report.references += 1;

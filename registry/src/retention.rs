@@ -1,18 +1,19 @@
 //! Garbage collection: marks from roots, then removes unmarked blobs that are old enough.
 //!
 //! Roots with a row are every version (and thus every alias), every stage result, every checkpoint that was not pruned,
-//! every shard of a run that may need it, and every pin. Roots without a row are uploads of held tasks and blobs about
-//! to be named ([`BlobStore::held`]). From a root the mark follows the manifest's files, the digests in its `meta`, and
-//! the lineage.
+//! every shard of a run that may need it, and every pin. Further roots are uploads of held tasks ([`Store::hold`]) and
+//! blobs about to be named ([`BlobStore::held`]). From a root the mark follows the manifest's files, the digests in its
+//! `meta`, and the lineage.
 //!
-//! A blob within its grace period is never collected, because the row that names it may follow. A power loss may delete
-//! the record of a held task's uploads. While a run is under way, blobs from before the store was opened therefore have
-//! at least the usual grace period.
+//! A blob within its grace period is never collected, because the row that names it may follow. While a run is under
+//! way, blobs from before the store was opened have at least the usual grace period.
 //!
 //! Writes continue meanwhile. Marking reads one moment of the database; from just before it the writer records the
 //! names in new rows (`proofs`). Blobs are condemned in batches in the writer and then removed beside it. A root with
 //! an unreadable manifest stops the collection, because its references are unknown. So does a database or blob folder
 //! that no longer belongs to the store.
+//!
+//! In a bucket, a collection also ends the uploads in parts that killed processes left.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
@@ -46,16 +47,22 @@ pub struct Plan {
     pub kept: u64,
     /// Deleted shards of finished runs, by task.
     pub forget_shards: Vec<TaskId>,
+    /// Number of uploads in parts that ended processes left in a bucket.
+    #[serde(default)]
+    pub uploads: u64,
 }
 
 impl ReadStore {
     /// Returns the plan that [`Store::gc`] would carry out.
     pub async fn gc_plan(&self, grace_ms: i64) -> Result<Plan, QueryError> {
-        let rows = Rows::from(self.needs().await?);
+        let rows = Rows::of(self).await?;
         let ages = Ages { now_ms: clock::now_ms(), grace_ms, opened_ms: self.opened_ms(), live: rows.live };
         let (plan, candidates) = plan(&BlobCalls::of(self), &rows, &ages).await?;
         let bytes = candidates.iter().map(|entry| entry.bytes).sum();
-        Ok(Plan { remove: candidates.iter().map(|entry| entry.digest).collect(), bytes, ..plan })
+        let unfinished = BlobCalls::of(self).ask(BlobStore::unfinished).await;
+        let uploads = unfinished.map_err(|e| QueryError::Blob(e.to_string()))?.len() as u64;
+        let remove = candidates.iter().map(|entry| entry.digest).collect();
+        Ok(Plan { remove, bytes, uploads, ..plan })
     }
 }
 
@@ -69,7 +76,7 @@ impl Store {
         crate::reserve::release_if_full(self.dir());
         let _recording = NameRecording(Arc::clone(self.proofs()));
         let forgotten = self.begin_collection().await?;
-        let rows = Rows::from(self.needs().await?);
+        let rows = Rows::of(self).await?;
         let ages = Ages { now_ms: clock::now_ms(), grace_ms, opened_ms: self.opened_ms(), live: rows.live };
         let place = BlobCalls::of(self);
         let plan = match plan(&place, &rows, &ages).await {
@@ -77,7 +84,10 @@ impl Store {
             Err(e) => Err(e.into()),
         };
         crate::reserve::keep(self.dir());
-        Ok(Plan { forget_shards: forgotten, ..plan? })
+        let plan = plan?;
+        let uploads = place.ask(BlobStore::give_up_unfinished).await;
+        let uploads = uploads.map_err(|e| WriteError::Storage(e.to_string()))?;
+        Ok(Plan { forget_shards: forgotten, uploads, ..plan })
     }
 
     /// Removes the planned blobs, except blobs that were put again or named since.
@@ -158,8 +168,18 @@ pub(crate) struct Rows {
     parents: HashMap<Digest, Vec<Digest>>,
     /// Tasks whose shards are deleted.
     forget_shards: Vec<TaskId>,
+    /// Blobs that held tasks have stored.
+    held: BTreeSet<Digest>,
     /// True while a run is under way.
     live: bool,
+}
+
+impl Rows {
+    async fn of(store: &ReadStore) -> Result<Self, QueryError> {
+        let needs = store.needs().await?;
+        let held = store.held().await?.into_values().flatten().collect();
+        Ok(Self { held, ..Self::from(needs) })
+    }
 }
 
 impl From<Needs> for Rows {
@@ -167,7 +187,8 @@ impl From<Needs> for Rows {
         let forgotten: BTreeSet<&TaskId> = needs.done_shards.iter().collect();
         let stays = |root: &&Root| root.shard.as_ref().is_none_or(|task| !forgotten.contains(task));
         let roots = needs.roots.iter().filter(stays).map(|root| (root.digest, root.what.clone())).collect();
-        Self { roots, parents: needs.parents, forget_shards: needs.done_shards, live: needs.live }
+        let (parents, forget_shards, live) = (needs.parents, needs.done_shards, needs.live);
+        Self { roots, parents, forget_shards, held: BTreeSet::new(), live }
     }
 }
 
@@ -258,7 +279,11 @@ async fn plan(place: &BlobCalls, rows: &Rows, ages: &Ages) -> Result<(Plan, Vec<
     let is_damaged = |blobs: &BlobStore, digest: &Digest| {
         matches!(blobs.manifest(*digest), Err(ManifestError::Blob(BlobError::Corrupt { .. })))
     };
-    let held = move |blobs: &BlobStore| blobs.held().into_iter().partition(|digest| is_damaged(blobs, digest));
+    let of_rows = rows.held.clone();
+    let held = move |blobs: &BlobStore| {
+        let held: BTreeSet<Digest> = blobs.held().into_iter().chain(of_rows).collect();
+        held.into_iter().partition(|digest| is_damaged(blobs, digest))
+    };
     let (damaged, held): (Vec<Digest>, Vec<Digest>) = place.ask(held).await;
     mark(place, rows, is_there, held, &mut marked).await?;
     marked.extend(damaged);

@@ -3,7 +3,7 @@
 //! Values by key, checkpoints and blobs stay shared. A caller needs a stage's key or a blob's digest to read them, and
 //! both follow from the content alone (docs/threat-model.md).
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 use std::sync::Arc;
 
@@ -208,6 +208,10 @@ impl Records for ScopedRecords {
             }
         }
         Ok(nodes)
+    }
+
+    async fn held(&self) -> Result<BTreeMap<TaskId, BTreeSet<Digest>>> {
+        self.all.held().await
     }
 
     async fn needs(&self) -> Result<Needs> {

@@ -19,7 +19,7 @@ use std::io;
 use std::os::unix::fs::{DirBuilderExt, MetadataExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use checkpoint::BlobError;
 use protocol::stage::Keep;
@@ -107,7 +107,7 @@ impl ReadStore {
         // Read before the database, because the witness and the marker never exceed the committed state.
         let inspection = Inspection::of(&dir, &RequestedPlace::Remembered, false).await?;
         let id = sqlite::check_to_read(&dir, &inspection.found, closed.is_some()).await?;
-        let blobs = BlobStore::beside(inspection.blobs, &inspection.location.verified());
+        let blobs = BlobStore::over(inspection.blobs);
         let records = Arc::new(SqliteRecords::new(sqlite::open_readers(&dir, closed.is_some())));
         let opened_ms = clock::now_ms();
         Ok(Self(Arc::new(Reading {
@@ -301,10 +301,14 @@ impl Store {
         }
         let witness = Witness::begin(&dir, &stored).map_err(|e| io(&dir, e))?;
         reserve::keep(&dir);
+        remove_files_of_earlier_builds(&dir).map_err(|e| io(&dir, e))?;
         let session = Session { conn, epoch: stored.epoch, witness };
         let proofs = Arc::new(Proofs::new(lease.as_ref().map(Lease::checked)));
         let writer = Writer::start(session, Arc::clone(&proofs), Arc::clone(&lock)).map_err(|e| io(&dir, e))?;
         let records = Arc::new(SqliteRecords::new(sqlite::open_readers(&dir, false)));
+        for (task, held) in records.held().await.map_err(|e| io(&dir, io::Error::other(e)))? {
+            held.into_iter().for_each(|digest| blobs.hold(&task, digest));
+        }
         let catalog = Box::new(SqliteCatalog { writer, records: Arc::clone(&records) });
         let opened_ms = clock::now_ms();
         let read =
@@ -389,6 +393,26 @@ impl Store {
         self.order(Order::Pin { digest, reason: None }).await.map(|_| ())
     }
 
+    /// Keeps a blob that a held task is about to store until [`Self::let_go`], also after a restart.
+    pub async fn hold(&self, task: &TaskId, digest: Digest) -> Result<(), WriteError> {
+        if !self.blobs().has_stored(task, digest) {
+            self.order(Order::Hold { task: task.clone(), digest }).await?;
+            self.blobs().hold(task, digest);
+        }
+        Ok(())
+    }
+
+    /// Keeps the blobs of tasks that are not held no longer. Deletes uploads without a request for `idle`, usually
+    /// [`crate::blob::IDLE`].
+    pub async fn let_go(&self, idle: Duration, is_held: impl Fn(&TaskId) -> bool + Send) -> Result<(), WriteError> {
+        let over = self.blobs().let_go(idle, is_held);
+        if over.is_empty() {
+            return Ok(());
+        }
+        // If this fails, the next process reads the rows and deletes them.
+        self.order(Order::LetGo(over)).await.map(|_| ())
+    }
+
     /// Deletes an ended run. The next [`Self::gc`] removes its blobs.
     pub async fn forget(&self, run: &RunId) -> Result<Forgotten, WriteError> {
         match self.order(Order::Forget(run.clone())).await? {
@@ -447,6 +471,17 @@ fn close_to_others(dir: &Path) -> io::Result<()> {
     let mode = metadata.permissions().mode();
     if mode & 0o007 != 0 && metadata.uid() == nix::unistd::geteuid().as_raw() {
         fs::set_permissions(dir, fs::Permissions::from_mode(mode & !0o077))?;
+    }
+    Ok(())
+}
+
+/// Removes the lists of blobs that earlier builds kept beside the database. Rows and memory replace them.
+fn remove_files_of_earlier_builds(dir: &Path) -> io::Result<()> {
+    for name in ["blobs/held", "blobs/touched"] {
+        match fs::remove_file(dir.join(name)) {
+            Err(e) if e.kind() != io::ErrorKind::NotFound => return Err(e),
+            _ => {}
+        }
     }
     Ok(())
 }

@@ -96,6 +96,7 @@ conformance![
     gates_are_judged_on_what_is_stored,
     lineage_goes_back_to_the_beginning,
     needs_name_every_row_that_names_a_blob,
+    blobs_are_held_until_their_task_is_let_go,
     a_collection_begins_by_forgetting_the_shards_of_what_is_done,
     a_copy_is_of_one_moment,
 ];
@@ -640,6 +641,22 @@ async fn needs_name_every_row_that_names_a_blob(place: &impl Place) {
     opened.catalog().commit(Order::Pin { digest: pinned, reason: None }).await.unwrap();
     assert_eq!(opened.records().needs().await.unwrap().roots.len(), 4);
     assert!(opened.records().problems().await.unwrap().is_empty());
+}
+
+async fn blobs_are_held_until_their_task_is_let_go(place: &impl Place) {
+    let opened = place.open().await;
+    let [one, other] = ["one", "other"].map(|text| Digest::of(text.as_bytes()));
+    let [first, second] = ["r/a", "r/b"].map(TaskId::new);
+    for (task, digest) in [(&first, one), (&first, other), (&second, one), (&second, one)] {
+        opened.catalog().commit(Order::Hold { task: task.clone(), digest }).await.unwrap();
+    }
+    drop(opened);
+    let opened = place.open().await;
+    let both = BTreeSet::from([one, other]);
+    let all = BTreeMap::from([(first.clone(), both), (second.clone(), BTreeSet::from([one]))]);
+    assert_eq!(opened.records().held().await.unwrap(), all);
+    opened.catalog().commit(Order::LetGo(vec![first, TaskId::new("r/none")])).await.unwrap();
+    assert_eq!(opened.records().held().await.unwrap(), BTreeMap::from([(second, BTreeSet::from([one]))]));
 }
 
 async fn a_collection_begins_by_forgetting_the_shards_of_what_is_done(place: &impl Place) {

@@ -3,12 +3,13 @@
 
 mod common;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use common::{artifact, fence, grant, metrics, open, result, rows};
 use protocol::stage::{Keep, Mode};
 use protocol::{ArtifactKind, Digest, Manifest, TaskId};
-use registry::{Store, Write, WriteError};
+use registry::testing::slow::SlowBucket;
+use registry::{BlobStore, Store, Write, WriteError};
 use serde_json::json;
 
 #[tokio::test]
@@ -163,7 +164,7 @@ async fn what_no_row_names_yet_stays_as_long_as_somebody_may_name_it() {
     let garbage = store.blobs().put(b"garbage").unwrap();
     let bundle = Manifest::new(ArtifactKind::Model, json!({"vae": uploaded})).to_bytes();
     // Only the manifest is held; the blobs that it lists are needed as well.
-    store.blobs().hold(&"r/s".into(), uploaded);
+    store.hold(&"r/s".into(), uploaded).await.unwrap();
     let protected = store.blobs().protect(Digest::of(&bundle));
     let again = store.blobs().protect(Digest::of(&bundle));
     let bundle = store.blobs().put(&bundle).unwrap();
@@ -175,10 +176,54 @@ async fn what_no_row_names_yet_stays_as_long_as_somebody_may_name_it() {
     assert_eq!(store.gc(-1000).await.unwrap().remove, [garbage]);
     assert!(store.blobs().complete_manifest(uploaded).is_ok() && store.blobs().exists(bundle).unwrap());
 
-    store.blobs().let_go(registry::blob::IDLE, |_| false);
+    store.let_go(registry::blob::IDLE, |_| false).await.unwrap();
     assert!(store.gc(-1000).await.unwrap().remove.is_empty(), "the bundle needs it");
     drop(protected);
     assert_eq!(store.gc(-1000).await.unwrap().remove.len(), 3);
+}
+
+/// Rows name the uploads of held tasks, so that a process with nothing but the catalog and the blobs knows them.
+#[tokio::test]
+async fn uploads_of_held_tasks_are_known_to_the_next_process() {
+    let (dir, bucket) = (tempfile::tempdir().unwrap(), SlowBucket::default());
+    let store = common::open_over(dir.path(), bucket.place("p", dir.path())).await;
+    let [uploaded, other] = ["uploaded", "of another task"].map(|text| store.blobs().put(text.as_bytes()).unwrap());
+    store.hold(&"r/s".into(), uploaded).await.unwrap();
+    store.hold(&"r/t".into(), other).await.unwrap();
+    drop(store);
+    let others = std::fs::read_dir(dir.path().join("blobs")).into_iter().flatten().flatten();
+    let others: Vec<_> = others.map(|file| file.file_name()).filter(|name| name != "verified").collect();
+    assert!(others.is_empty(), "files of this folder alone: {others:?}");
+
+    let store = common::open_over(dir.path(), bucket.place("p", dir.path())).await;
+    assert!(store.blobs().has_stored(&"r/s".into(), uploaded));
+    store.let_go(registry::blob::IDLE, |task| task.as_str() == "r/s").await.unwrap();
+    assert_eq!(store.gc(-1000).await.unwrap().remove, [other]);
+    assert_eq!(store.held().await.unwrap(), BTreeMap::from([(TaskId::new("r/s"), BTreeSet::from([uploaded]))]));
+}
+
+/// A collection ends the uploads in parts of processes that are gone, a plan counts them, and a check lists them.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_collection_ends_the_uploads_that_a_killed_process_left() {
+    let (dir, bucket) = (tempfile::tempdir().unwrap(), SlowBucket::default());
+    let store = common::open_over(dir.path(), bucket.place("p", dir.path())).await;
+    // Another process's upload. Its requests are slow until its record is there, and then wait for this test.
+    let (elsewhere, line) = (tempfile::tempdir().unwrap(), bucket.of_another());
+    let blobs = BlobStore::over(line.place("p", elsewhere.path()));
+    line.delay(std::time::Duration::from_millis(500));
+    let sending = std::thread::spawn(move || blobs.put(&vec![7; 9 << 20]));
+    let listed = async || store.fsck().await.unwrap().notes;
+    while listed().await.is_empty() {
+        tokio::time::sleep(std::time::Duration::from_millis(20)).await;
+    }
+    line.silence(true);
+    assert!(listed().await[0].contains("an upload in parts to `s3://slow/p/sha256/"), "{:?}", listed().await);
+    assert_eq!(store.gc_plan(0).await.unwrap().uploads, 1);
+    assert_eq!(store.gc(0).await.unwrap().uploads, 1);
+    assert!(listed().await.is_empty() && store.gc(0).await.unwrap().uploads == 0);
+    // It finds its upload ended, like a process that lost the lease.
+    line.silence(false);
+    assert!(sending.join().unwrap().is_err());
 }
 
 /// The writer of a blob has time to name it, even if collections run in between.

@@ -96,6 +96,12 @@ impl Bucket {
         self.dir.path().join(NAME)
     }
 
+    /// The number of parts of uploads that have not ended.
+    pub fn parts(&self) -> usize {
+        let files = std::fs::read_dir(self.dir.path()).expect("the server's folder").flatten();
+        files.filter(|file| file.file_name().to_string_lossy().contains(".part-")).count()
+    }
+
     /// Cuts a connection once, after `bytes` more bytes have arrived over all connections.
     pub fn cut_after(&self, bytes: u64) {
         self.line.until_cut.store(bytes, Ordering::SeqCst);

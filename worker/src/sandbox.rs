@@ -138,6 +138,7 @@ fn rule(
 mod tests {
     use std::fs;
     use std::io::ErrorKind;
+    use std::net::{TcpListener, TcpStream};
     use std::process::Command;
 
     use super::*;
@@ -153,6 +154,7 @@ mod tests {
         }
         std::os::unix::fs::symlink(at("other/file"), at("data/link")).unwrap();
         let sandbox = Sandbox { read: vec![at("data")], write: vec![at("cache")] };
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         let denied =
             |result: std::io::Result<()>| result.map_err(|error| error.kind()) == Err(ErrorKind::PermissionDenied);
         let closed = || {
@@ -172,6 +174,10 @@ mod tests {
             }
             assert!(denied(fs::write(at("data/file"), "changed")), "a data root is only read");
             assert!(denied(fs::remove_file(at("data/file"))), "a data root is only read");
+            assert!(
+                TcpStream::connect(listener.local_addr().unwrap()).is_ok(),
+                "units and containers limit the network"
+            );
             assert!(denied(Command::new("/bin/sh").arg("-c").arg("true").status().map(drop)), "no program is started");
             std::thread::scope(|scope| {
                 let later = scope.spawn(|| fs::read(at("other/file")).map(drop));

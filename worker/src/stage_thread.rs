@@ -77,7 +77,10 @@ fn attempt(held: &Arc<ActiveAssignment>, bench: &Bench) {
         Role::Shard { index, of } => part(Part::Shard { index: index as usize, of: of as usize }, &mut context),
         Role::Merge { shards } => part(Part::Merge { shards }, &mut context),
         Role::Member { .. } => bench.kinds.gang(&mut context).map(Done::Stage),
-        Role::Resolve => external::digests(&context).map(Done::Resolved),
+        Role::Resolve => match external::digests(&context) {
+            Err(StageError::Interrupted) => Ok(Done::Stage(Outcome::Yielded { at: 0 })),
+            found => found.map(Done::Resolved),
+        },
     });
     let caught = stage_limits::within(&bench.limits, held, &bench.client, || panic::catch_unwind(stage));
     let result = caught.unwrap_or_else(|payload| Err(StageError::Fault(panic_message(&*payload))));

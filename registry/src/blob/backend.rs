@@ -59,6 +59,15 @@ pub trait Backend: Send + Sync + fmt::Debug {
     fn strays(&self) -> Result<Vec<String>, BlobError>;
     /// Lists the blobs that were put aside.
     fn aside(&self) -> Result<Vec<String>, BlobError>;
+    /// Describes uploads in parts that have not ended and belong to no call of this process.
+    fn unfinished(&self) -> Result<Vec<String>, BlobError> {
+        Ok(Vec::new())
+    }
+    /// Ends the uploads that [`Self::unfinished`] lists, deletes their parts and returns their number. Only for the
+    /// holder of the blobs.
+    fn give_up_unfinished(&self) -> Result<u64, BlobError> {
+        Ok(0)
+    }
     /// Describes the marker's location for messages.
     fn marker_place(&self) -> String;
     /// Reads the marker: a line of text beside the blobs that names the store they belong to.

@@ -71,8 +71,8 @@ pub(super) struct Uploads {
 }
 
 impl Uploads {
-    pub(super) fn new(held: Holds) -> Self {
-        Self { begun: Mutex::default(), held: Mutex::new(held), protected: Mutex::default(), since: Instant::now() }
+    pub(super) fn new() -> Self {
+        Self { begun: Mutex::default(), held: Mutex::default(), protected: Mutex::default(), since: Instant::now() }
     }
 }
 

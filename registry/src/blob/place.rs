@@ -98,7 +98,7 @@ impl Location {
     pub(crate) fn to_read(&self) -> io::Result<Arc<dyn Backend>> {
         Ok(match self {
             Self::Folder(root) => Arc::new(Folder::to_read(root)),
-            Self::Objects(remote, dir) => Arc::new(Objects::to_read(Arc::clone(remote), dir)?),
+            Self::Objects(remote, dir) => Arc::new(Objects::to_read(Arc::clone(remote), dir)),
             Self::Given(blobs, _) => Arc::clone(blobs),
         })
     }

@@ -12,14 +12,10 @@ use protocol::digest::Hasher;
 use super::backend::{Backend, Entry, Problem, Stat};
 use super::begun::{Upload, Uploads};
 use super::fs::Folder;
-use super::holds::Holds;
 use super::known::{Finding, Findings, Known};
 use super::memory::Memory;
 use super::reader::{Reader, read_error};
 use super::seen::Seen;
-
-/// File that records the blobs of held tasks.
-const HELD: &str = "held";
 
 /// Content-addressed bytes over a [`Backend`]. Clones share it.
 #[derive(Debug, Clone)]
@@ -56,21 +52,15 @@ impl BlobStore {
 
     /// Makes a store over a backend that is chosen at run time.
     pub fn over(backend: Arc<dyn Backend>) -> Self {
-        Self::with(backend, Known::default(), Holds::default())
+        Self::with(backend, Known::default())
     }
 
-    /// Makes a store over a backend with two files: `verified` records verified blobs, and `held` beside it the blobs
-    /// of held tasks. Only for the holder of the store's lock.
+    /// Makes a store over a backend with a file that records verified blobs. Only for the holder of the store's lock.
     pub fn remembering(backend: Arc<dyn Backend>, verified: &Path) -> Self {
-        Self::with(backend, Known::read(verified), Holds::keep(&verified.with_file_name(HELD)))
+        Self::with(backend, Known::read(verified))
     }
 
-    /// Makes a store for reading beside the holder of the store's lock, whose files are at `verified`.
-    pub fn beside(backend: Arc<dyn Backend>, verified: &Path) -> Self {
-        Self::with(backend, Known::default(), Holds::of_others(&verified.with_file_name(HELD)))
-    }
-
-    fn with(backend: Arc<dyn Backend>, known: Known, held: Holds) -> Self {
+    fn with(backend: Arc<dyn Backend>, known: Known) -> Self {
         Self(Arc::new(Shared {
             backend,
             removals: std::array::from_fn(|_| RwLock::default()),
@@ -78,7 +68,7 @@ impl BlobStore {
             known: Arc::new(Findings::new(known)),
             seen: Seen::default(),
             permit: OnceLock::new(),
-            uploads: Uploads::new(held),
+            uploads: Uploads::new(),
         }))
     }
 
@@ -90,7 +80,7 @@ impl BlobStore {
 
     /// Opens the blobs of the store in a folder for reading only; another process may hold its lock.
     pub fn folder_to_read(dir: &Path) -> Self {
-        Self::beside(Arc::new(Folder::to_read(dir)), &dir.join("blobs/verified"))
+        Self::new(Folder::to_read(dir))
     }
 
     /// Makes a store in memory for tests.
@@ -314,6 +304,17 @@ impl BlobStore {
     /// Lists the files among the blobs that are not the store's. They are never touched.
     pub fn strays(&self) -> Result<Vec<String>, BlobError> {
         self.backend().strays()
+    }
+
+    /// Describes uploads in parts that have not ended, without this process's own.
+    pub fn unfinished(&self) -> Result<Vec<String>, BlobError> {
+        self.backend().unfinished()
+    }
+
+    /// Ends the uploads that [`Self::unfinished`] lists and returns their number.
+    pub(crate) fn give_up_unfinished(&self) -> Result<u64, BlobError> {
+        self.may_remove()?;
+        self.backend().give_up_unfinished()
     }
 
     /// Lists the damaged blobs that were put aside.

@@ -3,7 +3,7 @@
 //! An interrupted upload keeps its bytes. Its owner asks for their number and continues from there, even after another
 //! process has opened the store. The bytes belong to one worker's hold on one task and block no other upload. They are
 //! deleted when the hold ends, or after [`IDLE`] without a request. A stored blob is recorded for its task until the
-//! task is released. Collection therefore keeps it however late a row names it ([`Holds`]).
+//! task is released. Collection therefore keeps it however late a row names it (`holds`).
 
 use std::collections::{BTreeSet, HashMap};
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -149,7 +149,8 @@ impl BlobStore {
         }
     }
 
-    /// Records that a held task has stored a blob. The blob is kept until [`Self::let_go`].
+    /// Keeps a blob that a held task has stored until [`Self::let_go`], in this process. [`crate::Store::hold`] also
+    /// keeps it for later ones.
     pub fn hold(&self, task: &TaskId, digest: Digest) {
         lock(&self.uploads().held).hold(task, digest);
     }
@@ -174,10 +175,10 @@ impl BlobStore {
         held
     }
 
-    /// Releases the blobs of tasks that are no longer held. Deletes uploads without a request for `idle`, usually
-    /// [`IDLE`].
-    pub fn let_go(&self, idle: Duration, is_held: impl Fn(&TaskId) -> bool) {
-        lock(&self.uploads().held).let_go(&is_held);
+    /// Releases the blobs of tasks that are no longer held, and returns these tasks. Deletes uploads without a request
+    /// for `idle`, usually [`IDLE`].
+    pub fn let_go(&self, idle: Duration, is_held: impl Fn(&TaskId) -> bool) -> Vec<TaskId> {
+        let released = lock(&self.uploads().held).let_go(&is_held);
         let mut all = lock(&self.uploads().begun);
         // An upload that a request is writing to ends with that request.
         let rests = |begun: &Begun| begun.upload.is_some() || begun.waits;
@@ -187,13 +188,14 @@ impl BlobStore {
             self.discard(&mut all, &place);
         }
         if self.uploads().since.elapsed() < idle {
-            return;
+            return released;
         }
         // No request has asked for the other uploads of an earlier process.
         let known: BTreeSet<String> = all.keys().map(name).collect();
         if let Err(error) = self.backend().unstage_but(&known) {
             tracing::warn!(%error, "cannot delete the staged bytes of old uploads");
         }
+        released
     }
 }
 
@@ -237,6 +239,11 @@ impl Arriving {
             self.upload = None;
         }
         written
+    }
+
+    /// Returns true if all bytes have arrived.
+    pub fn is_complete(&self) -> bool {
+        self.upload.as_ref().is_some_and(Upload::is_complete)
     }
 
     /// Returns the number of bytes that have arrived.

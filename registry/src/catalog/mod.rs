@@ -20,7 +20,7 @@
 
 mod rows;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Debug;
 use std::path::Path;
 use std::sync::Arc;
@@ -176,6 +176,9 @@ pub trait Records: Debug + Send + Sync {
     /// Returns those of `blobs` that are known to be stored, with their lengths.
     async fn present(&self, blobs: &[Digest]) -> Result<BTreeMap<Digest, u64>>;
 
+    /// Returns the blobs that held tasks have stored and that are to be kept although no row may name them yet.
+    async fn held(&self) -> Result<BTreeMap<TaskId, BTreeSet<Digest>>>;
+
     /// Returns the blobs that rows need.
     async fn needs(&self) -> Result<Needs>;
 
@@ -225,6 +228,10 @@ pub enum Order {
         /// Reason of the pin; `None` removes the pin.
         reason: Option<String>,
     },
+    /// Keeps a blob for a held task, which is about to store it.
+    Hold { task: TaskId, digest: Digest },
+    /// Keeps the blobs of these tasks no longer.
+    LetGo(Vec<TaskId>),
     /// Deletes an ended run.
     Forget(RunId),
     /// Deletes unreferenced data of a run that ended before a time.

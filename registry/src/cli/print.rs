@@ -237,7 +237,12 @@ fn removed(dry_run: bool, plan: &Plan) -> String {
     let verb = if dry_run { "would remove" } else { "removed" };
     let fresh = if plan.fresh == 0 { String::new() } else { format!(", {} within their grace period", plan.fresh) };
     let (count, bytes, kept) = (plan.remove.len(), size(plan.bytes), plan.kept);
-    text + &format!("{verb} {count} blobs ({bytes}); {kept} are needed{fresh}\n")
+    let uploads = match plan.uploads {
+        0 => String::new(),
+        1 => ", the parts of 1 unfinished upload".to_owned(),
+        uploads => format!(", the parts of {uploads} unfinished uploads"),
+    };
+    text + &format!("{verb} {count} blobs ({bytes}){uploads}; {kept} are needed{fresh}\n")
 }
 
 fn forgotten(runs: &[(RunId, Forgotten)]) -> String {

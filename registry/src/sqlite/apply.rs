@@ -31,6 +31,8 @@ pub(super) async fn apply(
     writes: &[Write],
 ) -> Result<()> {
     let mut fences = Fences::read(conn, writes).await?;
+    // One time for the end of a run and of its last stage, in whatever order their rows come.
+    let now = clock::now_ms();
     let (mut decisions, mut shards) = (Vec::new(), BTreeMap::new());
     for write in writes {
         if let Some(grant) = write.grant() {
@@ -48,17 +50,17 @@ pub(super) async fn apply(
             Write::ModelOwner { model, owner } => owners::claim(conn, model, owner).await?,
             Write::RunState { run: of, state } => {
                 let set = sqlx::query("UPDATE runs SET state = ?, updated_ms = ? WHERE run = ?");
-                run(conn, set.bind(state).bind(clock::now_ms()).bind(of.as_str())).await?;
+                run(conn, set.bind(state).bind(now).bind(of.as_str())).await?;
             }
             Write::RunEnded { run: of, state, view, archive } => {
                 let set = sqlx::query("UPDATE runs SET state = ?, updated_ms = ?, view = ?, archive = ? WHERE run = ?");
-                let set = set.bind(state).bind(clock::now_ms()).bind(view).bind(archive);
+                let set = set.bind(state).bind(now).bind(view).bind(archive);
                 run(conn, set.bind(of.as_str())).await?;
             }
             Write::Archive { key, run: of, stage, execution } => {
                 set_archive(conn, *key, of.as_str(), stage.as_str(), execution.as_deref()).await?;
             }
-            Write::History(entries) => history::add(conn, entries).await?,
+            Write::History(entries) => history::add(conn, entries, now).await?,
             Write::Metrics { grant, rows } => recording.add(conn, grant, rows).await?,
             Write::Logs { grant, first, lines } => logs::add(conn, grant, *first, lines).await?,
             Write::Checkpoint { grant, step, manifest, metrics } => {

@@ -11,11 +11,10 @@ use sqlx::{QueryBuilder, Row, Sqlite, SqliteConnection};
 use super::statement::{insert, int, json, run};
 use crate::catalog::{HistoryQuery, HistoryRow};
 use crate::history::{HistoryEntry, HistoryKind};
-use crate::{QueryError, WriteError, clock};
+use crate::{QueryError, WriteError};
 
-/// Adds what happened now.
-pub(super) async fn add(conn: &mut SqliteConnection, entries: &[HistoryEntry]) -> Result<(), WriteError> {
-    let now = clock::now_ms();
+/// Adds what happened at `now`, in milliseconds since 1970.
+pub(super) async fn add(conn: &mut SqliteConnection, entries: &[HistoryEntry], now: i64) -> Result<(), WriteError> {
     let values = |row: &mut Separated<'_, Sqlite, &'static str>, entry: &HistoryEntry| {
         row.push_bind(now).push_bind(entry.kind.name());
         row.push_bind(entry.run.as_ref().map(|run| run.as_str().to_owned()));

@@ -198,7 +198,7 @@ async fn set_alias(
     let (model_name, why) = (Some(model.clone()), format!("@{alias} is version {to}: {reason}"));
     let entry =
         HistoryEntry { model: model_name, actor: Some(actor.to_owned()), why: Some(why), ..HistoryEntry::new(kind) };
-    history::add(conn, &[entry]).await?;
+    history::add(conn, &[entry], clock::now_ms()).await?;
     Ok(Promotion {
         id: row.get(0),
         at_ms,

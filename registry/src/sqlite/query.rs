@@ -1,6 +1,6 @@
 //! Queries in SQL over read-only connections.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 use async_trait::async_trait;
@@ -260,6 +260,15 @@ impl Records for SqliteRecords {
         let find = "SELECT digest, bytes FROM blobs WHERE digest IN (SELECT value FROM json_each(?))";
         let rows = sqlx::query(find).bind(json(&blobs)).fetch_all(&mut *conn).await?;
         rows.iter().map(|row| Ok((digest(row, "digest")?, row.try_get::<i64, _>("bytes")?.unsigned_abs()))).collect()
+    }
+
+    async fn held(&self) -> Result<BTreeMap<TaskId, BTreeSet<Digest>>> {
+        let mut conn = self.connection().await?;
+        let mut held: BTreeMap<TaskId, BTreeSet<Digest>> = BTreeMap::new();
+        for row in sqlx::query("SELECT task, digest FROM held_blobs").fetch_all(&mut *conn).await? {
+            held.entry(TaskId::new(row.try_get::<String, _>(0)?)).or_default().insert(digest(&row, "digest")?);
+        }
+        Ok(held)
     }
 
     async fn needs(&self) -> Result<Needs> {

@@ -56,6 +56,18 @@ pub(super) async fn pin(
     run(conn, sqlx::query(set).bind(name).bind(reason).bind(clock::now_ms())).await.map(|_| ())
 }
 
+/// Records that a held task stores a blob.
+pub(super) async fn hold(conn: &mut SqliteConnection, task: &TaskId, digest: Digest) -> Result<(), WriteError> {
+    let hold = "INSERT OR IGNORE INTO held_blobs (task, digest) VALUES (?, ?)";
+    run(conn, sqlx::query(hold).bind(task.as_str()).bind(digest.to_string())).await.map(|_| ())
+}
+
+/// Deletes the records of tasks that are no longer held.
+pub(super) async fn let_go(conn: &mut SqliteConnection, tasks: &[TaskId]) -> Result<(), WriteError> {
+    let let_go = "DELETE FROM held_blobs WHERE task IN (SELECT value FROM json_each(?))";
+    run(conn, sqlx::query(let_go).bind(json(&tasks))).await.map(|_| ())
+}
+
 /// Deletes the records of blobs that no row has named since the collection began, and returns these blobs.
 pub(super) async fn condemn(
     conn: &mut SqliteConnection,

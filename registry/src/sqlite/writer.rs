@@ -187,6 +187,8 @@ async fn run(
         Order::Pin { digest, reason } => {
             retention::pin(conn, proofs, *digest, reason.as_deref()).await.map(|()| Done::Nothing)
         }
+        Order::Hold { task, digest } => retention::hold(conn, task, *digest).await.map(|()| Done::Nothing),
+        Order::LetGo(tasks) => retention::let_go(conn, tasks).await.map(|()| Done::Nothing),
         Order::Forget(run) => forget::forget(conn, run).await.map(Done::Forgotten),
         Order::ForgetLeftovers { run, before_ms } => {
             forget::forget_leftovers(conn, run, *before_ms).await.map(Done::Forgotten)

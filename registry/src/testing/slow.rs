@@ -10,10 +10,11 @@ use async_trait::async_trait;
 use futures::stream::BoxStream;
 use futures::{FutureExt as _, StreamExt as _};
 use object_store::memory::InMemory;
+use object_store::multipart::{MultipartStore, PartId};
 use object_store::path::Path;
 use object_store::{
-    CopyOptions, GetOptions, GetResult, ListResult, MultipartUpload, ObjectMeta, ObjectStore, PutMultipartOptions,
-    PutOptions, PutPayload, PutResult, Result,
+    CopyOptions, GetOptions, GetResult, ListResult, MultipartId, MultipartUpload, ObjectMeta, ObjectStore,
+    PutMultipartOptions, PutOptions, PutPayload, PutResult, Result,
 };
 use tokio::sync::watch;
 
@@ -142,5 +143,28 @@ impl ObjectStore for SlowBucket {
     async fn copy_opts(&self, from: &Path, to: &Path, options: CopyOptions) -> Result<()> {
         self.pass().await;
         self.0.objects.copy_opts(from, to, options).await
+    }
+}
+
+#[async_trait]
+impl MultipartStore for SlowBucket {
+    async fn create_multipart(&self, path: &Path) -> Result<MultipartId> {
+        self.pass().await;
+        self.0.objects.create_multipart(path).await
+    }
+
+    async fn put_part(&self, path: &Path, id: &MultipartId, number: usize, part: PutPayload) -> Result<PartId> {
+        self.pass().await;
+        self.0.objects.put_part(path, id, number, part).await
+    }
+
+    async fn complete_multipart(&self, path: &Path, id: &MultipartId, parts: Vec<PartId>) -> Result<PutResult> {
+        self.pass().await;
+        self.0.objects.complete_multipart(path, id, parts).await
+    }
+
+    async fn abort_multipart(&self, path: &Path, id: &MultipartId) -> Result<()> {
+        self.pass().await;
+        self.0.objects.abort_multipart(path, id).await
     }
 }

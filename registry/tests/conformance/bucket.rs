@@ -6,15 +6,15 @@ use std::time::Duration;
 use checkpoint::{BlobError, Blobs};
 use cluster_tests::bucket::{Bucket, KEY, NAME, SECRET};
 use object_store::aws::{AmazonS3Builder, S3ConditionalPut};
-use object_store::{BackoffConfig, ObjectStore, RetryConfig};
+use object_store::{BackoffConfig, RetryConfig};
 use protocol::Digest;
-use registry::blob::objects::{Objects, Remote};
+use registry::blob::objects::{Bucket as AnyBucket, Objects, Remote};
 use registry::blob::{Backend, BlobStore};
 
 use super::{common, objects};
 
 /// A client like that of `Remote::connect`, except for its credentials and a retry time of one second.
-fn client(bucket: &Bucket, name: &str, secret: &str) -> Arc<dyn ObjectStore> {
+fn client(bucket: &Bucket, name: &str, secret: &str) -> Arc<dyn AnyBucket> {
     let _ = rustls::crypto::ring::default_provider().install_default();
     let backoff = BackoffConfig { max_backoff: Duration::from_millis(200), ..BackoffConfig::default() };
     let retry = RetryConfig { backoff, max_retries: 4, retry_timeout: Duration::from_secs(1) };
@@ -25,7 +25,7 @@ fn client(bucket: &Bucket, name: &str, secret: &str) -> Arc<dyn ObjectStore> {
 }
 
 /// Opens the blobs at a prefix through a client, with a separate store folder.
-fn open(store: Arc<dyn ObjectStore>) -> (tempfile::TempDir, Objects) {
+fn open(store: Arc<dyn AnyBucket>) -> (tempfile::TempDir, Objects) {
     let dir = tempfile::tempdir().unwrap();
     let remote = Remote::over(&Bucket::url("p"), store).unwrap();
     let objects = Objects::open(Arc::new(remote), dir.path()).unwrap();
@@ -143,4 +143,36 @@ fn an_upload_in_parts_that_is_given_up_leaves_nothing_and_goes_on_from_here() {
     assert!(store.take_up(&grant, digest, total, total).unwrap().finish().unwrap());
     assert!(store.get(digest).unwrap() == bytes);
     assert_eq!(std::fs::read_dir(dir.path().join("staging")).unwrap().count(), 0, "it is not kept twice");
+}
+
+/// A process that is gone leaves the parts of its upload, as the server's absence here does. A process with another
+/// folder lists and ends the upload, and leaves its own alone.
+#[test]
+fn parts_that_a_killed_process_left_are_listed_and_removed() {
+    let bucket = Bucket::start();
+    let (_dir, place) = open(client(&bucket, NAME, SECRET));
+    let (store, bytes) = (BlobStore::new(place), bytes(20 << 20));
+    bucket.cut_after(9 << 20);
+    std::thread::scope(|scope| {
+        let sending = scope.spawn(|| store.put(&bytes));
+        while bucket.cuts() == 0 && !sending.is_finished() {
+            std::thread::yield_now();
+        }
+        bucket.close();
+        sending.join().unwrap().unwrap_err();
+    });
+    bucket.open();
+    assert!(bucket.parts() > 0, "the server kept a part");
+
+    let (_other, place) = open(client(&bucket, NAME, SECRET));
+    let left = place.unfinished().unwrap();
+    let name = format!("s3://{NAME}/p/sha256/{}", &Digest::of(&bytes).hex()[..2]);
+    assert!(left.len() == 1 && left[0].contains(&name), "{left:?}");
+    assert_eq!((place.give_up_unfinished().unwrap(), bucket.parts()), (1, 0));
+    assert!(place.unfinished().unwrap().is_empty() && place.list().unwrap().is_empty());
+
+    // An upload that succeeds leaves neither parts nor a record.
+    let digest = store.put(&bytes).unwrap();
+    assert_eq!((place.give_up_unfinished().unwrap(), bucket.parts()), (0, 0));
+    assert!(store.get(digest).unwrap() == bytes);
 }

@@ -67,6 +67,9 @@ pub enum AccessError {
     /// It cannot be digested.
     #[error("{0}")]
     Unreadable(String),
+    /// The caller has stopped the reading.
+    #[error("reading was stopped")]
+    Interrupted,
 }
 
 /// The data roots of a process, and the digests of the files that it read.
@@ -133,36 +136,48 @@ impl DataAccess {
         Ok(if first.exists() { first } else { candidates.find(DataPath::exists).unwrap_or(first) })
     }
 
-    fn fingerprint(&self, folder: &ExternalFolder, path: &DataPath) -> Result<Fingerprint, AccessError> {
-        let unreadable = |what: String| AccessError::Unreadable(what);
-        match folder.format {
-            Some(format) => {
-                folder_fingerprint(path, format, &self.hashes).map_err(|error| unreadable(error.to_string()))
+    fn fingerprint(
+        &self,
+        folder: &ExternalFolder,
+        path: &DataPath,
+        go_on: &dyn Fn() -> bool,
+    ) -> Result<Fingerprint, AccessError> {
+        let found = match folder.format {
+            Some(format) => folder_fingerprint(path, format, &self.hashes, go_on).map_err(|error| error.to_string()),
+            None => {
+                files_fingerprint(path, &self.hashes, go_on).map_err(|error| format!("{}: {error}", path.display()))
             }
-            None => files_fingerprint(path, &self.hashes)
-                .map_err(|error| unreadable(format!("{}: {error}", path.display()))),
+        };
+        match found {
+            Err(_) if !go_on() => Err(AccessError::Interrupted),
+            found => found.map_err(AccessError::Unreadable),
         }
     }
 
     /// The digest of what `folder` names, for a stage that came without one.
     ///
     /// # Errors
-    /// If it may not or cannot be read.
-    pub fn digest(&self, folder: &ExternalFolder) -> Result<Digest, AccessError> {
-        Ok(self.fingerprint(folder, &self.find(&folder.path)?)?.digest)
+    /// If it may not or cannot be read, or `go_on` returns false.
+    pub fn digest(&self, folder: &ExternalFolder, go_on: &dyn Fn() -> bool) -> Result<Digest, AccessError> {
+        Ok(self.fingerprint(folder, &self.find(&folder.path)?, go_on)?.digest)
     }
 
     /// Opens what `folder` names, whose content must have the digest `expected`.
     ///
     /// # Errors
-    /// If it may not or cannot be read, or is something else.
-    pub fn open(&self, folder: ExternalFolder, expected: Option<&Digest>) -> Result<Opened, AccessError> {
+    /// If it may not or cannot be read, is something else, or `go_on` returns false.
+    pub fn open(
+        &self,
+        folder: ExternalFolder,
+        expected: Option<&Digest>,
+        go_on: &dyn Fn() -> bool,
+    ) -> Result<Opened, AccessError> {
         let path = self.find(&folder.path)?;
         if !self.verifies {
             return Ok(Opened { folder, path, before: None });
         }
         let Some(expected) = expected else { return Err(AccessError::Unresolved { path: folder.path }) };
-        let before = self.fingerprint(&folder, &path)?;
+        let before = self.fingerprint(&folder, &path, go_on)?;
         if before.digest != *expected {
             let (machine, found) = (self.machine.clone(), before.digest);
             return Err(AccessError::Differs { path: folder.path, machine, found, expected: *expected });
@@ -173,11 +188,12 @@ impl DataAccess {
     /// Refuses content that changed since it was opened.
     ///
     /// # Errors
-    /// If it did.
-    pub fn expect_unchanged(&self, opened: &Opened) -> Result<(), AccessError> {
+    /// If it did, or `go_on` returns false.
+    pub fn expect_unchanged(&self, opened: &Opened, go_on: &dyn Fn() -> bool) -> Result<(), AccessError> {
         let Some(before) = &opened.before else { return Ok(()) };
-        match self.fingerprint(&opened.folder, &opened.path) {
+        match self.fingerprint(&opened.folder, &opened.path, go_on) {
             Ok(after) if after == *before => Ok(()),
+            Err(AccessError::Interrupted) => Err(AccessError::Interrupted),
             Ok(_) | Err(_) => {
                 Err(AccessError::Changed { path: opened.folder.path.clone(), machine: self.machine.clone() })
             }
@@ -203,6 +219,10 @@ mod tests {
 
     use super::*;
 
+    fn always() -> bool {
+        true
+    }
+
     fn folder_of(path: &Path) -> ExternalFolder {
         let path = path.display().to_string();
         ExternalFolder { field: "path".into(), path, format: None, files: &[], origin: "" }
@@ -220,9 +240,13 @@ mod tests {
         fs::write(at("root/set/a"), "in").unwrap();
         fs::write(at("secret"), "out").unwrap();
         let access = beneath(&at("root"));
-        assert_eq!(access.digest(&folder_of(&at("root/set/a"))).unwrap(), Digest::of(b"in"));
-        assert_eq!(access.digest(&folder_of(Path::new("set/a"))).unwrap(), Digest::of(b"in"), "relative to the root");
-        let refused = |path: &Path| access.digest(&folder_of(path)).unwrap_err().to_string();
+        assert_eq!(access.digest(&folder_of(&at("root/set/a")), &always).unwrap(), Digest::of(b"in"));
+        assert_eq!(
+            access.digest(&folder_of(Path::new("set/a")), &always).unwrap(),
+            Digest::of(b"in"),
+            "relative to the root"
+        );
+        let refused = |path: &Path| access.digest(&folder_of(path), &always).unwrap_err().to_string();
         for outside in [at("secret"), at("rootless"), "/etc/passwd".into(), "/proc/self/environ".into()] {
             let said = refused(&outside);
             assert!(said.contains("is not below a data root"), "{said}");
@@ -232,7 +256,7 @@ mod tests {
             assert!(said.contains("is outside the data root"), "{said}");
         }
         let none = DataAccess::beneath(vec![], "here");
-        let said = none.digest(&folder_of(&at("root/set/a"))).unwrap_err().to_string();
+        let said = none.digest(&folder_of(&at("root/set/a")), &always).unwrap_err().to_string();
         assert!(said.contains("has no data root") && said.contains("--data-root DIR"), "{said}");
     }
 
@@ -258,7 +282,7 @@ mod tests {
             let said = path.read(9).unwrap_err().to_string();
             assert!(said.contains("is outside the data root"), "{said}");
             assert!(path.has_entry() && !path.exists() && !path.is_folder());
-            assert!(path.hold().is_err() && path.digest().is_err());
+            assert!(path.hold().is_err() && path.digest(&always).is_err());
         }
         let said = opened("root/set").tree().unwrap_err().to_string();
         assert!(said.contains("is outside the data root"), "{said}");
@@ -276,11 +300,15 @@ mod tests {
         fs::create_dir(&set).unwrap();
         fs::write(set.join("a"), "one").unwrap();
         let access = beneath(place.path());
-        let digest = access.digest(&folder_of(&set)).unwrap();
-        let opened = access.open(folder_of(&set), Some(&digest)).unwrap();
-        access.expect_unchanged(&opened).unwrap();
+        let digest = access.digest(&folder_of(&set), &always).unwrap();
+        let opened = access.open(folder_of(&set), Some(&digest), &always).unwrap();
+        access.expect_unchanged(&opened, &always).unwrap();
+        // Files of any size are digested no further once the caller stops.
+        let never = || false;
+        assert!(matches!(access.open(folder_of(&set), Some(&digest), &never), Err(AccessError::Interrupted)));
+        assert!(matches!(access.expect_unchanged(&opened, &never), Err(AccessError::Interrupted)));
         let other = Digest::of(b"other");
-        let said = access.open(folder_of(&set), Some(&other)).unwrap_err().to_string();
+        let said = access.open(folder_of(&set), Some(&other), &always).unwrap_err().to_string();
         for part in [
             &*set.display().to_string(),
             "`here`",
@@ -290,22 +318,22 @@ mod tests {
         ] {
             assert!(said.contains(part), "{part}: {said}");
         }
-        assert!(matches!(access.open(folder_of(&set), None), Err(AccessError::Unresolved { .. })));
+        assert!(matches!(access.open(folder_of(&set), None, &always), Err(AccessError::Unresolved { .. })));
         // The same content in another file: it was exchanged meanwhile.
         fs::write(set.join("b"), "one").unwrap();
         fs::rename(set.join("b"), set.join("a")).unwrap();
-        assert!(matches!(access.expect_unchanged(&opened), Err(AccessError::Changed { .. })));
+        assert!(matches!(access.expect_unchanged(&opened, &always), Err(AccessError::Changed { .. })));
         // Another content.
-        let opened = access.open(folder_of(&set), Some(&digest)).unwrap();
+        let opened = access.open(folder_of(&set), Some(&digest), &always).unwrap();
         fs::write(set.join("a"), "two").unwrap();
-        assert!(matches!(access.expect_unchanged(&opened), Err(AccessError::Changed { .. })));
+        assert!(matches!(access.expect_unchanged(&opened, &always), Err(AccessError::Changed { .. })));
         fs::write(set.join("a"), "one").unwrap();
-        let opened = access.open(folder_of(&set), Some(&digest)).unwrap();
+        let opened = access.open(folder_of(&set), Some(&digest), &always).unwrap();
         fs::remove_file(set.join("a")).unwrap();
-        assert!(matches!(access.expect_unchanged(&opened), Err(AccessError::Changed { .. })));
+        assert!(matches!(access.expect_unchanged(&opened, &always), Err(AccessError::Changed { .. })));
         fs::write(set.join("a"), "one").unwrap();
-        let opened = access.open(folder_of(&set), Some(&digest)).unwrap();
+        let opened = access.open(folder_of(&set), Some(&digest), &always).unwrap();
         fs::write(set.join("b"), "more").unwrap();
-        assert!(matches!(access.expect_unchanged(&opened), Err(AccessError::Changed { .. })));
+        assert!(matches!(access.expect_unchanged(&opened, &always), Err(AccessError::Changed { .. })));
     }
 }

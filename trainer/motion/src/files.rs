@@ -114,11 +114,17 @@ impl DataPath {
     ///
     /// # Errors
     /// If the path is something else; the message says what, without the path.
-    pub(crate) fn digest(&self) -> io::Result<(Digest, Stamp)> {
+    ///
+    /// # Errors
+    /// The obstacle; [`io::ErrorKind::Interrupted`] once `go_on` returns false.
+    pub(crate) fn digest(&self, go_on: &dyn Fn() -> bool) -> io::Result<(Digest, Stamp)> {
         let (mut file, found) = self.open_with_metadata()?;
         let mut hasher = Sha256::new();
         let mut part = vec![0; 256 << 10];
         loop {
+            if !go_on() {
+                return Err(io::ErrorKind::Interrupted.into());
+            }
             match file.read(&mut part)? {
                 0 => return Ok((Digest::from_bytes(hasher.finalize().into()), Stamp::of(&found))),
                 count => hasher.update(&part[..count]),
@@ -325,7 +331,7 @@ mod tests {
             ("zero", "is a device"),
             ("loop", "symbolic link"),
         ] {
-            for said in [path(name).read(10).unwrap_err(), path(name).digest().unwrap_err()] {
+            for said in [path(name).read(10).unwrap_err(), path(name).digest(&|| true).unwrap_err()] {
                 assert!(said.to_string().contains(part), "{name}: {said}");
             }
         }
@@ -333,7 +339,7 @@ mod tests {
         symlink(at("file"), at("to a file")).unwrap();
         assert_eq!(path("to a file").read(10).unwrap(), b"0123456789");
         assert!(path("file").read(9).unwrap_err().to_string().contains("more than 9 bytes"));
-        assert_eq!(path("file").digest().unwrap().0, Digest::of(b"0123456789"));
+        assert_eq!(path("file").digest(&|| true).unwrap().0, Digest::of(b"0123456789"));
         assert_eq!(path("none").read(9).unwrap_err().kind(), io::ErrorKind::NotFound);
     }
 

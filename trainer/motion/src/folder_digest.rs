@@ -30,7 +30,7 @@ pub struct Hashes {
 }
 
 impl Hashes {
-    fn digest(&self, file: &DataPath, stamps: &mut Vec<Stamp>) -> io::Result<Digest> {
+    fn digest(&self, file: &DataPath, stamps: &mut Vec<Stamp>, go_on: &dyn Fn() -> bool) -> io::Result<Digest> {
         let found = file.stamp()?;
         let known = self.known.lock().unwrap_or_else(PoisonError::into_inner).get(&found.file()).copied();
         if let Some((stamp, digest)) = known
@@ -40,7 +40,7 @@ impl Hashes {
             return Ok(digest);
         }
         let now = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_secs());
-        let (digest, stamp) = file.digest()?;
+        let (digest, stamp) = file.digest(go_on)?;
         if stamp.is_older(SETTLED_SECONDS, i64::try_from(now).unwrap_or(i64::MAX)) {
             self.known.lock().unwrap_or_else(PoisonError::into_inner).insert(stamp.file(), (stamp, digest));
         }
@@ -60,11 +60,16 @@ pub struct Fingerprint {
 
 /// Digest of the content of folder `path`, or all missing and unreadable files together.
 pub fn folder_digest(path: &DataPath, format: DataFormat) -> Result<Digest, OpenError> {
-    folder_fingerprint(path, format, &Hashes::default()).map(|found| found.digest)
+    folder_fingerprint(path, format, &Hashes::default(), &|| true).map(|found| found.digest)
 }
 
-/// [`folder_digest`] with the files' stamps.
-pub fn folder_fingerprint(path: &DataPath, format: DataFormat, hashes: &Hashes) -> Result<Fingerprint, OpenError> {
+/// [`folder_digest`] with the files' stamps. Fails soon after `go_on` returns false.
+pub fn folder_fingerprint(
+    path: &DataPath,
+    format: DataFormat,
+    hashes: &Hashes,
+    go_on: &dyn Fn() -> bool,
+) -> Result<Fingerprint, OpenError> {
     let (mut problems, mut stamps) = (vec![], vec![]);
     if !path.is_folder() {
         let what = if path.exists() { "is not a folder" } else { "no such folder" };
@@ -91,7 +96,7 @@ pub fn folder_fingerprint(path: &DataPath, format: DataFormat, hashes: &Hashes) 
     }
     for name in ["Mean.npy", "Std.npy"] {
         let file = path.join(name);
-        problems.extend(add(&mut listing, name, &file, true, hashes.digest(&file, &mut stamps)));
+        problems.extend(add(&mut listing, name, &file, true, hashes.digest(&file, &mut stamps, go_on)));
     }
     for id in &ids {
         if !is_clip_id(id) {
@@ -101,7 +106,7 @@ pub fn folder_fingerprint(path: &DataPath, format: DataFormat, hashes: &Hashes) 
         }
         for name in [format!("new_joint_vecs/{id}.npy"), format!("texts/{id}.txt")] {
             let file = path.join(&name);
-            problems.extend(add(&mut listing, &name, &file, false, hashes.digest(&file, &mut stamps)));
+            problems.extend(add(&mut listing, &name, &file, false, hashes.digest(&file, &mut stamps, go_on)));
         }
         if problems.len() > MANY_PROBLEMS {
             break;
@@ -119,17 +124,17 @@ pub fn folder_fingerprint(path: &DataPath, format: DataFormat, hashes: &Hashes) 
 /// # Errors
 /// The obstacle, with its path.
 pub fn files_digest(path: &DataPath) -> io::Result<Digest> {
-    files_fingerprint(path, &Hashes::default()).map(|found| found.digest)
+    files_fingerprint(path, &Hashes::default(), &|| true).map(|found| found.digest)
 }
 
-/// [`files_digest`] with the files' stamps.
+/// [`files_digest`] with the files' stamps. Fails soon after `go_on` returns false.
 ///
 /// # Errors
 /// As there.
-pub fn files_fingerprint(path: &DataPath, hashes: &Hashes) -> io::Result<Fingerprint> {
+pub fn files_fingerprint(path: &DataPath, hashes: &Hashes, go_on: &dyn Fn() -> bool) -> io::Result<Fingerprint> {
     let mut stamps = vec![];
     if !path.is_folder() {
-        let digest = hashes.digest(path, &mut stamps)?;
+        let digest = hashes.digest(path, &mut stamps, go_on)?;
         return Ok(Fingerprint { digest, stamps });
     }
     let mut listing = "stride/files/1\n".to_owned();
@@ -137,7 +142,7 @@ pub fn files_fingerprint(path: &DataPath, hashes: &Hashes) -> io::Result<Fingerp
         let shown = file.shown();
         let name = shown.strip_prefix(path.shown()).unwrap_or(shown).to_string_lossy().replace('\\', "/");
         let named = |error: io::Error| io::Error::new(error.kind(), format!("{}: {error}", file.display()));
-        let digest = hashes.digest(&file, &mut stamps).map_err(named)?.hex();
+        let digest = hashes.digest(&file, &mut stamps, go_on).map_err(named)?.hex();
         writeln!(listing, "{name}\0{digest}").expect("a string takes all that is written");
     }
     Ok(Fingerprint { digest: Digest::of(listing.as_bytes()), stamps })

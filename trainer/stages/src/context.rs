@@ -60,6 +60,17 @@ pub enum StageError {
     /// An internal fault.
     #[error("{0}")]
     Fault(String),
+    /// The grant has ended or a stop was requested. [`yielded`] turns it into an outcome.
+    #[error("the stage was stopped")]
+    Interrupted,
+}
+
+/// Turns an interrupted attempt into one that yielded at its beginning.
+pub fn yielded(result: Result<Outcome, StageError>) -> Result<Outcome, StageError> {
+    match result {
+        Err(StageError::Interrupted) => Ok(Outcome::Yielded { at: 0 }),
+        result => result,
+    }
 }
 
 impl StageError {
@@ -73,7 +84,9 @@ impl StageError {
             Self::Context(ContextError::Corrupt(_)) => FailureClass::Storage,
             Self::Context(ContextError::Damaged(_)) => FailureClass::Damaged,
             Self::Fault(_) | Self::Context(ContextError::Fault(_)) => FailureClass::Fault,
-            Self::Context(ContextError::GrantEnded(_) | ContextError::Unavailable(_)) => FailureClass::Infrastructure,
+            Self::Interrupted | Self::Context(ContextError::GrantEnded(_) | ContextError::Unavailable(_)) => {
+                FailureClass::Infrastructure
+            }
         }
     }
 }

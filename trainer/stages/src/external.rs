@@ -34,20 +34,23 @@ impl Given {
 /// Opens all that the settings of the task name, has it read, and refuses what changed meanwhile.
 ///
 /// # Errors
-/// If something may not be read, is not what the stage expects, or `read` fails.
+/// If something may not be read, is not what the stage expects, or `read` fails; [`StageError::Interrupted`] if the grant
+/// ends or a stop is requested before all was digested.
 pub fn read<C: AttemptContext + ?Sized, T>(
     cx: &mut C,
     read: impl FnOnce(&mut C, &Given) -> Result<T, StageError>,
 ) -> Result<T, StageError> {
     let access = cx.data();
     let task = cx.task();
+    let go_on = || !cx.interrupted();
     let mut given = Given(BTreeMap::new());
     for folder in task.settings.folders() {
         let expected = task.inputs.get(&folder.field);
-        given.0.insert(folder.field.clone(), access.open(folder, expected).map_err(refusal)?);
+        given.0.insert(folder.field.clone(), access.open(folder, expected, &go_on).map_err(refusal)?);
     }
     let value = read(cx, &given)?;
-    given.0.values().try_for_each(|opened| access.expect_unchanged(opened)).map_err(refusal)?;
+    let go_on = || !cx.interrupted();
+    given.0.values().try_for_each(|opened| access.expect_unchanged(opened, &go_on)).map_err(refusal)?;
     Ok(value)
 }
 
@@ -58,7 +61,9 @@ pub fn read<C: AttemptContext + ?Sized, T>(
 pub fn digests(cx: &dyn AttemptContext) -> Result<BTreeMap<String, Digest>, StageError> {
     let access = cx.data();
     let folders = cx.task().settings.folders().into_iter();
-    folders.map(|folder| Ok((folder.field.clone(), access.digest(&folder).map_err(refusal)?))).collect()
+    folders
+        .map(|folder| Ok((folder.field.clone(), access.digest(&folder, &|| !cx.interrupted()).map_err(refusal)?)))
+        .collect()
 }
 
 fn refusal(error: AccessError) -> StageError {
@@ -68,6 +73,7 @@ fn refusal(error: AccessError) -> StageError {
         | AccessError::Outside { .. }
         | AccessError::Differs { .. }
         | AccessError::Unreadable(_) => StageError::Input(text),
+        AccessError::Interrupted => StageError::Interrupted,
         // Another try finds it settled, or different.
         AccessError::Changed { .. } | AccessError::Unresolved { .. } => StageError::Fault(text),
     }

@@ -8,9 +8,9 @@ use std::time::Duration;
 
 use protocol::Seed;
 use protocol::message::StageTask;
-use protocol::stage::{Backend, CheckpointPolicy, DataFormat, DataOpen, DataSynthetic, StageSettings};
+use protocol::stage::{Backend, CheckpointPolicy, DataFeatures, DataFormat, DataOpen, DataSynthetic, StageSettings};
 use stage_lab::{MemoryAttempt, MemoryBlobs};
-use stages::context::Outcome;
+use stages::context::{Outcome, Part, StageError};
 
 fn attempt(settings: StageSettings) -> MemoryAttempt {
     let task = StageTask {
@@ -51,4 +51,18 @@ fn a_folder_is_given_up_while_it_is_read() {
     attempt.stop_switch().store(true, Ordering::Relaxed);
     assert_eq!(stages::kinds::run_alone(&mut attempt).unwrap(), Outcome::Yielded { at: 0 });
     assert!(attempt.told.log.is_empty(), "nothing was read: {:?}", attempt.told.log);
+}
+
+/// A stage may name a folder of any size. Digesting it stops too, before it is read and for a submission without digests.
+#[test]
+fn digesting_and_reading_recordings_stop_on_request() {
+    let folder = tempfile::tempdir().unwrap();
+    mocap::sample::write_bvh_folder(folder.path(), 2, Seed(3)).unwrap();
+    let path = folder.path().to_string_lossy().into_owned();
+    let mut attempt = attempt(StageSettings::DataFeatures(DataFeatures { path, ..DataFeatures::default() }));
+    assert_eq!(stages::external::digests(&attempt).unwrap().len(), 1);
+    attempt.stop_switch().store(true, Ordering::Relaxed);
+    assert!(matches!(stages::external::digests(&attempt), Err(StageError::Interrupted)));
+    let part = Part::Shard { index: 0, of: 1 };
+    assert_eq!(stages::kinds::run_part(&mut attempt, part).unwrap(), Outcome::Yielded { at: 0 });
 }

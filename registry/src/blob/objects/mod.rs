@@ -4,19 +4,19 @@
 //! PREFIX/IDENTITY           the store that the blobs belong to
 //! PREFIX/sha256/ab/cdef...  a blob
 //! PREFIX/quarantine/...     damaged blobs that were put aside
+//! PREFIX/uploads/...        uploads in parts that have not ended
 //! ```
 //!
-//! The store's folder keeps the database, the lock, arriving blobs, and the time of each blob's last put
-//! (`blobs/touched`). A blob is sent when all of it has arrived and hashes to its name. A small blob is sent by a put
-//! that fails if the name is taken; a large one in parts that appear as one object at the end. That end cannot be
-//! conditional on every server and need not be, because equal names mean equal bytes. A failed part is sent again by
-//! itself. Parts of an abandoned upload occupy space until the bucket's own rule removes them.
+//! The store's folder keeps the database, the lock and arriving blobs. A blob is sent when all of it has arrived and
+//! hashes to its name. A small blob is sent by a put that fails if the name is taken; a large one in parts
+//! (`multipart`). The time of an object cannot be set, so this process remembers the times of its own puts. For older
+//! objects the server's time counts; the blobs of a held task are protected by rows, not by their age.
 
 mod health;
+mod multipart;
 mod remote;
-mod touched;
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeSet, HashMap};
 use std::fs::OpenOptions;
 use std::io::{self, Cursor, Read};
 use std::path::Path as FilePath;
@@ -27,26 +27,19 @@ use checkpoint::BlobError;
 use fail::fail_point;
 use futures::TryStreamExt as _;
 use object_store::path::Path;
-use object_store::{
-    Error, MultipartUpload, ObjectMeta, ObjectStore, ObjectStoreExt as _, PutMode, PutOptions, PutPayload,
-    UpdateVersion,
-};
+use object_store::{Error, ObjectMeta, ObjectStoreExt as _, PutMode, PutOptions, PutPayload, UpdateVersion};
 use protocol::Digest;
 use tokio::sync::Semaphore;
-use tokio::task::JoinSet;
 
-pub use self::remote::Remote;
 pub(super) use self::remote::check_url;
+pub use self::remote::{Bucket, Remote};
 
-use self::remote::LOCAL;
-use self::touched::Touched;
+use self::multipart::{Multipart, PART_BYTES, kib, local, read_part};
 use super::disk::{Os, regular};
 use super::staging::{Part, Staging};
 use super::{Backend, Entry, Problem, Staged, Stat};
 use crate::clock;
 
-/// Bytes sent in one request. With the limit of 10,000 parts an object may have 80 GB.
-const PART_BYTES: usize = 8 << 20;
 /// Number of parts under way at once, over all blobs, or as many bytes of small ones. Bounds the memory for sending.
 const PARTS: usize = 4;
 /// Bytes of the first request of a read, or more if the reader asks for more. Each further request doubles, up to
@@ -64,7 +57,9 @@ pub struct Objects(Arc<Inner>);
 struct Inner {
     remote: Arc<Remote>,
     staging: Staging,
-    touched: Mutex<Touched>,
+    /// Times of this process's puts, in milliseconds since 1970.
+    puts: Mutex<HashMap<Digest, i64>>,
+    multipart: Multipart,
     /// Free room for requests under way, in KiB.
     parts: Arc<Semaphore>,
 }
@@ -72,26 +67,26 @@ struct Inner {
 impl Objects {
     /// Opens the blobs of the store in `dir`. Only for the holder of the store's lock.
     pub fn open(remote: Arc<Remote>, dir: &FilePath) -> io::Result<Self> {
-        let blobs = dir.join("blobs");
-        std::fs::create_dir_all(&blobs)?;
+        std::fs::create_dir_all(dir.join("blobs"))?;
         let staging = Staging::open(dir.join("staging"), Arc::new(Os))?;
-        Ok(Self::with(remote, staging, Touched::open(&blobs.join("touched"))?))
+        Ok(Self::with(remote, staging))
     }
 
     /// Opens the blobs read-only: creates and clears nothing.
-    pub fn to_read(remote: Arc<Remote>, dir: &FilePath) -> io::Result<Self> {
+    pub fn to_read(remote: Arc<Remote>, dir: &FilePath) -> Self {
         let staging = Staging::to_read(dir.join("staging"), Arc::new(Os));
-        Ok(Self::with(remote, staging, Touched::read(&dir.join("blobs/touched"))?))
+        Self::with(remote, staging)
     }
 
-    fn with(remote: Arc<Remote>, staging: Staging, touched: Touched) -> Self {
+    fn with(remote: Arc<Remote>, staging: Staging) -> Self {
         let parts = Arc::new(Semaphore::new((PARTS * PART_BYTES) >> 10));
-        Self(Arc::new(Inner { remote, staging, touched: Mutex::new(touched), parts }))
+        let multipart = Multipart::new(Arc::clone(&remote), Arc::clone(&parts));
+        Self(Arc::new(Inner { remote, staging, puts: Mutex::default(), multipart, parts }))
     }
 }
 
 impl Inner {
-    fn store(&self) -> Arc<dyn ObjectStore> {
+    fn store(&self) -> Arc<dyn Bucket> {
         Arc::clone(&self.remote.store)
     }
 
@@ -112,16 +107,15 @@ impl Inner {
     }
 
     fn put_ms(&self, digest: Digest, meta: &ObjectMeta) -> i64 {
-        self.touched().at(digest).unwrap_or_else(|| meta.last_modified.timestamp_millis())
+        self.puts().get(&digest).copied().unwrap_or_else(|| meta.last_modified.timestamp_millis())
     }
 
-    fn touched(&self) -> MutexGuard<'_, Touched> {
-        self.touched.lock().unwrap_or_else(PoisonError::into_inner)
+    fn puts(&self) -> MutexGuard<'_, HashMap<Digest, i64>> {
+        self.puts.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    fn note(&self, digest: Digest) -> Result<(), BlobError> {
-        let failed = |e| BlobError::Storage(format!("cannot record the time of blob {digest} in `blobs/touched`: {e}"));
-        self.touched().note(digest).map_err(failed)
+    fn note(&self, digest: Digest) {
+        self.puts().insert(digest, clock::now_ms());
     }
 
     fn list(&self, folder: &str) -> Result<Vec<ObjectMeta>, BlobError> {
@@ -135,15 +129,8 @@ impl Inner {
     fn send(&self, path: &Path, bytes: u64, mut source: impl Read + Send + 'static) -> Result<bool, Error> {
         let (store, path, parts) = (self.store(), path.clone(), Arc::clone(&self.parts));
         if bytes > PART_BYTES as u64 {
-            return self.remote.wait_long(async move {
-                let mut upload = store.put_multipart(&path).await?;
-                let sent = send_parts(&mut *upload, parts, source).await;
-                if sent.is_err() {
-                    // The first error matters more than one of the abort.
-                    let _ = upload.abort().await;
-                }
-                sent.map(|()| true)
-            });
+            let multipart = self.multipart.clone();
+            return self.remote.wait_long(async move { multipart.send(path, source).await.map(|()| true) });
         }
         let whole = read_part(&mut source).map_err(local)?;
         let put = self.remote.wait_long(async move {
@@ -182,52 +169,6 @@ impl Inner {
             Err(e) => Err(self.remote.error("read", &path, &e)),
         }
     }
-}
-
-/// Returns the room that bytes take among those under way, in KiB.
-fn kib(bytes: usize) -> u32 {
-    u32::try_from(bytes.div_ceil(1 << 10).max(1)).unwrap_or(u32::MAX)
-}
-
-fn local(source: io::Error) -> Error {
-    Error::Generic { store: LOCAL, source: source.into() }
-}
-
-async fn send_parts(
-    upload: &mut dyn MultipartUpload,
-    slots: Arc<Semaphore>,
-    mut source: impl Read + Send + 'static,
-) -> Result<(), Error> {
-    let mut under_way = JoinSet::new();
-    loop {
-        let slot =
-            Arc::clone(&slots).acquire_many_owned(kib(PART_BYTES)).await.map_err(|e| local(io::Error::other(e)))?;
-        let (read, next) = tokio::task::spawn_blocking(move || (read_part(&mut source), source)).await?;
-        source = next;
-        let part = read.map_err(local)?;
-        if part.is_empty() {
-            break;
-        }
-        let put = upload.put_part(PutPayload::from(part));
-        under_way.spawn(async move {
-            let put = put.await;
-            drop(slot);
-            put
-        });
-        while let Some(done) = under_way.try_join_next() {
-            done??;
-        }
-    }
-    while let Some(done) = under_way.join_next().await {
-        done??;
-    }
-    upload.complete().await.map(|_| ())
-}
-
-fn read_part(source: &mut impl Read) -> io::Result<Vec<u8>> {
-    let mut bytes = Vec::new();
-    source.take(PART_BYTES as u64).read_to_end(&mut bytes)?;
-    Ok(bytes)
 }
 
 impl Backend for Objects {
@@ -272,7 +213,7 @@ impl Backend for Objects {
     }
 
     fn touch(&self, digest: Digest) -> Result<Stat, BlobError> {
-        self.0.note(digest)?;
+        self.0.note(digest);
         self.stat(digest)?.ok_or(BlobError::NotFound(digest))
     }
 
@@ -285,7 +226,7 @@ impl Backend for Objects {
             tokio::time::timeout(REMOVAL, store.delete(&wanted)).await.unwrap_or_else(|_| Err(late()))
         };
         match self.0.remote.wait(removing) {
-            Ok(()) | Err(Error::NotFound { .. }) => self.0.touched().forget(digest),
+            Ok(()) | Err(Error::NotFound { .. }) => drop(self.0.puts().remove(&digest)),
             Err(e) => return Err(self.0.remote.error("remove", &path, &e)),
         }
         Ok(())
@@ -329,6 +270,14 @@ impl Backend for Objects {
 
     fn aside(&self) -> Result<Vec<String>, BlobError> {
         Ok(self.0.list("quarantine")?.iter().map(|meta| self.0.remote.shown(&meta.location)).collect())
+    }
+
+    fn unfinished(&self) -> Result<Vec<String>, BlobError> {
+        self.0.multipart.unfinished()
+    }
+
+    fn give_up_unfinished(&self) -> Result<u64, BlobError> {
+        self.0.multipart.give_up()
     }
 
     fn problem(&self) -> Option<Problem> {
@@ -393,7 +342,7 @@ impl Staged for StagedObject {
         }
         // Recorded first: a collection that sees the object must see that it is young, even if the server's clock
         // differs.
-        self.objects.note(digest)?;
+        self.objects.note(digest);
         let path = self.objects.remote.blob(digest);
         let sent = self.objects.send(&path, bytes, file).map_err(|e| self.objects.remote.error("write", &path, &e));
         fail_point!("blob::after_rename");

@@ -9,6 +9,7 @@ use checkpoint::BlobError;
 use object_store::aws::{AmazonS3Builder, AmazonS3ConfigKey, S3ConditionalPut};
 use object_store::azure::{AzureConfigKey, MicrosoftAzureBuilder};
 use object_store::gcp::{GoogleCloudStorageBuilder, GoogleConfigKey};
+use object_store::multipart::MultipartStore;
 use object_store::path::Path;
 use object_store::{BackoffConfig, ClientConfigKey, Error, ObjectStore, RetryConfig};
 use protocol::Digest;
@@ -86,13 +87,18 @@ pub(in crate::blob) fn check_url(url: &str) -> Result<(), String> {
     split(url).map(|_| ())
 }
 
+/// An object store that names its uploads in parts, so that another process can end them.
+pub trait Bucket: ObjectStore + MultipartStore {}
+
+impl<S: ObjectStore + MultipartStore> Bucket for S {}
+
 /// A prefix in a bucket, with its own runtime for requests, so that calls may block in any thread.
 pub struct Remote {
     url: String,
     kind: &'static Kind,
     bucket: String,
     prefix: String,
-    pub(super) store: Arc<dyn ObjectStore>,
+    pub(super) store: Arc<dyn Bucket>,
     health: Health,
     /// `None` only while it is dropped.
     runtime: Option<Runtime>,
@@ -128,7 +134,7 @@ impl Remote {
             retry_timeout: RETRY,
         };
         let (connect, request) = (ClientConfigKey::ConnectTimeout, ClientConfigKey::Timeout);
-        let store: Arc<dyn ObjectStore> = match kind.scheme {
+        let store: Arc<dyn Bucket> = match kind.scheme {
             "s3" => Arc::new(
                 AmazonS3Builder::from_env()
                     .with_bucket_name(bucket)
@@ -162,7 +168,7 @@ impl Remote {
     }
 
     /// Makes the place that `url` names, over any object store.
-    pub fn over(url: &str, store: Arc<dyn ObjectStore>) -> Result<Self, BlobError> {
+    pub fn over(url: &str, store: Arc<dyn Bucket>) -> Result<Self, BlobError> {
         let wrong =
             |message: &dyn fmt::Display| BlobError::Storage(format!("`{url}` is not a place for blobs: {message}"));
         let (kind, bucket, prefix) = split(url).map_err(|e| wrong(&e))?;

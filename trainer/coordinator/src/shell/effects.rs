@@ -184,10 +184,12 @@ fn bundles(blobs: &BlobStore, candidates: &[Candidate]) -> Result<(Vec<Digest>, 
 }
 
 /// Releases uploads of tasks that are no longer held.
-pub(crate) fn let_go(actor_handle: &ActorHandle) {
+pub(crate) async fn let_go(actor_handle: &ActorHandle) {
     let state = actor_handle.state();
     let is_held = |task: &TaskId| state.task(task).is_ok_and(|(_, task)| !task.holders().is_empty());
-    actor_handle.store.blobs().let_go(IDLE, is_held);
+    if let Err(error) = actor_handle.store.let_go(IDLE, is_held).await {
+        tracing::warn!(%error, "the uploads of ended tasks stay until the next start");
+    }
 }
 
 /// Runs the timer until the coordinator stops. It does not wait for a tick to be handled, which may take as long as the
@@ -217,8 +219,8 @@ pub(crate) async fn tick(actor_handle: Arc<ActorHandle>, every_ms: u64, mut stop
         if collected.elapsed() > COLLECT_EVERY {
             collected = tokio::time::Instant::now();
             let actor_handle = Arc::clone(&actor_handle);
-            let_go(&actor_handle);
             tokio::spawn(async move {
+                let_go(&actor_handle).await;
                 if let Err(error) = actor_handle.store.gc(registry::retention::GRACE_MS).await {
                     tracing::warn!(%error, "garbage collection failed");
                 }

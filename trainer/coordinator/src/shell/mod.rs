@@ -182,7 +182,7 @@ impl Coordinator {
         let (actor_handle, actor) =
             actor::start(store, recovered, secrets, Arc::clone(&tokens), config.allowances.clone());
         actor_handle.decide(Event::Started { alone: config.alone, park: config.park }).await?;
-        effects::let_go(&actor_handle);
+        effects::let_go(&actor_handle).await;
         let (stop, stopped) = watch::channel(false);
         let tick = effects::tick(actor_handle.clone(), config.policy.tick_ms, stopped.clone());
         let clock = actor_handle.spawn("the clock", tick);
@@ -341,7 +341,7 @@ impl Handle {
             // It does not matter how the task ended.
             let _ = task.await;
         }
-        effects::let_go(&self.actor_handle);
+        effects::let_go(&self.actor_handle).await;
         actor::snapshot(&self.actor_handle, &self.actor_handle.state()).await;
     }
 }

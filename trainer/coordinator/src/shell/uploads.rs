@@ -183,12 +183,14 @@ pub(crate) async fn staged(
     let receipt = receipt.filter(|shown| actor_handle.secrets.is_receipt(&proof.caller.name, &grant, digest, shown));
     let roots = actor_handle.state().read_by(&grant.task)?;
     let (blobs, reach) = (actor_handle.store.blobs().clone(), Arc::clone(&actor_handle.reach));
-    let looked = ask(&actor_handle.store, move || -> Result<_, Failure> {
-        // The existence of other blobs is not revealed: the worker either has their bytes or has no use for them.
-        let is_known = receipt.is_some() || reach.includes(&blobs, &roots, digest)?;
-        if is_known {
-            blobs.hold(&grant.task, digest);
-        }
+    let has_receipt = receipt.is_some();
+    let (store, looked) = (&actor_handle.store, blobs.clone());
+    // The existence of other blobs is not revealed: the worker either has their bytes or has no use for them.
+    let is_known = has_receipt || ask(store, move || reach.includes(&looked, &roots, digest)).await?;
+    if is_known {
+        store.hold(&grant.task, digest).await?;
+    }
+    let looked = ask(store, move || -> Result<_, Failure> {
         let stored = is_known && blobs.reuse(digest)?;
         let receipt = receipt.filter(|_| stored);
         Ok(Json(BlobStored { digest, stored, staged: blobs.staged(&grant, digest)?, receipt }))
@@ -221,8 +223,14 @@ pub(crate) async fn put_blob(
     let (store, blobs) = (&actor_handle.store, actor_handle.store.blobs().clone());
     let receipt = actor_handle.secrets.receipt(&proof.caller.name, &grant, digest);
     let stored = async {
+        let task = grant.task.clone();
         let arriving = ask(store, move || blobs.take_up(&grant, digest, offset, bytes)).await?;
-        let (stored, staged) = receive(store, arriving, body).await?;
+        let arriving = receive(store, arriving, body).await?;
+        let staged = arriving.written();
+        if arriving.is_complete() {
+            store.hold(&task, digest).await.map_err(unheld)?;
+        }
+        let stored = ask(store, move || arriving.finish()).await.map_err(ResumeError::Blob)?;
         Ok(Json(BlobStored { digest, stored, staged, receipt: stored.then_some(receipt) }))
     };
     stored.await.map_err(|error: Unstored| {
@@ -233,8 +241,16 @@ pub(crate) async fn put_blob(
     })
 }
 
-/// Receives a body; returns whether the blob is complete, and the number of bytes received.
-async fn receive(store: &Store, mut arriving: Arriving, body: Body) -> Result<(bool, u64), Unstored> {
+/// The error of an upload that could not be recorded. Its bytes stay for the worker's next request.
+fn unheld(error: WriteError) -> ResumeError {
+    ResumeError::Blob(match error {
+        WriteError::Storage(message) => BlobError::Storage(message),
+        error => BlobError::Unavailable(error.to_string()),
+    })
+}
+
+/// Appends a body to an upload.
+async fn receive(store: &Store, mut arriving: Arriving, body: Body) -> Result<Arriving, Unstored> {
     let mut body = body.into_data_stream();
     let mut ended = false;
     while !ended {
@@ -264,9 +280,7 @@ async fn receive(store: &Store, mut arriving: Arriving, body: Body) -> Result<(b
         .await
         .map_err(ResumeError::Blob)?;
     }
-    let staged = arriving.written();
-    let stored = ask(store, move || arriving.finish()).await.map_err(ResumeError::Blob)?;
-    Ok((stored, staged))
+    Ok(arriving)
 }
 
 /// The reason why a blob was not stored.

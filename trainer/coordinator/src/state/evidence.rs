@@ -390,6 +390,22 @@ mod tests {
     }
 
     #[test]
+    fn a_silent_members_report_of_no_state_counts_only_in_its_generation_and_beside_no_holder() {
+        let members: &[(_, &[usize], _)] = &[(None, &[], false), (None, &[0], true)];
+        assert_eq!(judged(members).1, Some(vec![0]));
+        let (task, mut words) = gang(members);
+        let verdict = |words: &Words, members: usize| {
+            let complaints = Complaints::of(words, &task, true);
+            ranks(complaints.verdict(Millis(10_000 + HEARING_MS), HEARING_MS, &vec![0; members]))
+        };
+        words.get_mut(&WorkerId::from("w0")).expect("a member").grant.fence = Fence(6);
+        assert_eq!(verdict(&words, 2), Some(vec![1]), "it may have had the state since then");
+        // A silent holder may have given its state to the silent member.
+        let members: &[(_, &[usize], _)] = &[(None, &[], false), (None, &[0], true), (Some(3), &[], false)];
+        assert_eq!(judged(members).1, Some(vec![1]));
+    }
+
+    #[test]
     fn a_complaint_weighs_on_its_author_unless_others_share_it() {
         let (task, words) = gang(&[(Some(8), &[1], true), (Some(8), &[], true)]);
         let complaints = Complaints::of(&words, &task, true);

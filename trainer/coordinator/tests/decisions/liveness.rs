@@ -1,7 +1,7 @@
 //! Progress despite failures, and limits of remembered data, for the pure half with a virtual clock.
 
 use coordinator::state::execution::ExecutionState;
-use coordinator::{Control, Event, Observation, Policy, State, journal, refused_for_good};
+use coordinator::{Control, Effect, Event, Observation, Policy, State, journal, refused_for_good};
 use protocol::message::{
     Assignment, CommitCheckpoint, FailureClass, ReportOutcome, Role, RunState, StageState, TaskOutcome,
 };
@@ -94,6 +94,24 @@ fn p15_a_task_that_makes_progress_survives_any_number_of_losses() {
         coordinator.tick();
     }
     assert_eq!(coordinator.run_state(&run), RunState::Failed);
+}
+
+/// No attempt resumes a stage whose value is stored, so its checkpoints go with the report of the value.
+#[test]
+fn an_ended_stage_keeps_no_training_state() {
+    let mut coordinator = PureCoordinator::new(Policy::default());
+    let (run, _) = gang_of_three(&mut coordinator);
+    let assignment = coordinator.assignment("a").expect("it trains");
+    for step in 1..=3 {
+        save(&mut coordinator, &assignment, step, &format!("step {step}"));
+    }
+    let grant = assignment.grant.clone();
+    let (task, outcome) =
+        (grant.task.clone(), TaskOutcome::Finished { output: Digest::of(b"vae"), metrics: Default::default() });
+    let effects = coordinator.happen(Event::Outcome { report: ReportOutcome { grant, outcome } }).expect("taken");
+    let prunes = |effect: &Effect| matches!(effect, Effect::Prune { task: of, at_end: true, .. } if *of == task);
+    assert_eq!(coordinator.run_state(&run), RunState::Finished);
+    assert_eq!(effects.iter().filter(|effect| prunes(effect)).count(), 1, "{effects:?}");
 }
 
 fn members(coordinator: &PureCoordinator, name: &str) -> Vec<WorkerId> {

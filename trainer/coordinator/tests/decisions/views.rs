@@ -116,3 +116,15 @@ fn a_run_that_a_user_paused_stays_paused() {
     assert_ne!(again, run);
     assert_eq!(coordinator.run_state(&run), RunState::Paused);
 }
+
+/// Runs share what has one key. Pausing a run pauses no run of another owner with the same stage.
+#[test]
+fn a_paused_run_shows_that_another_run_computes_its_stage() {
+    let mut coordinator = PureCoordinator::new(Policy::default());
+    let [paused, other] = [0, 1].map(|_| coordinator.submit("dataset", WorkerRange::default()));
+    coordinator.control(&paused, Control::Pause).expect("paused");
+    coordinator.join("a");
+    let shown = |run: &RunId| (coordinator.run_state(run), stage(&coordinator, run, "dataset").state);
+    assert_eq!(shown(&paused), (RunState::Paused, StageState::Running));
+    assert_eq!(shown(&other), (RunState::Running, StageState::Running));
+}

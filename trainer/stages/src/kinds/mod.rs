@@ -6,7 +6,7 @@
 use protocol::Digest;
 use protocol::stage::{Split, StageSettings};
 
-use crate::context::{AttemptContext, GangContext, Outcome, Part, StageError};
+use crate::context::{AttemptContext, GangContext, Outcome, Part, StageError, yielded};
 
 /// Generates `runner` of a family from the list of its kinds.
 macro_rules! runners {
@@ -54,7 +54,7 @@ fn runner(settings: &StageSettings) -> Option<Stage<'_>> {
 pub fn run_alone(cx: &mut dyn AttemptContext) -> Result<Outcome, StageError> {
     let settings = cx.task().settings.clone();
     match runner(&settings) {
-        Some(Stage::Plain(stage)) => stage.run(cx),
+        Some(Stage::Plain(stage)) => yielded(stage.run(cx)),
         _ => Err(misplaced(&settings, "by one worker alone")),
     }
 }
@@ -63,8 +63,8 @@ pub fn run_alone(cx: &mut dyn AttemptContext) -> Result<Outcome, StageError> {
 pub fn run_part(cx: &mut dyn AttemptContext, part: Part) -> Result<Outcome, StageError> {
     let settings = cx.task().settings.clone();
     match (runner(&settings), part) {
-        (Some(Stage::Map(stage)), Part::Shard { index, of }) => stage.shard(cx, index, of),
-        (Some(Stage::Map(stage)), Part::Merge { shards }) => stage.merge(cx, &shards),
+        (Some(Stage::Map(stage)), Part::Shard { index, of }) => yielded(stage.shard(cx, index, of)),
+        (Some(Stage::Map(stage)), Part::Merge { shards }) => yielded(stage.merge(cx, &shards)),
         _ => Err(misplaced(&settings, "in shards")),
     }
 }
@@ -73,7 +73,7 @@ pub fn run_part(cx: &mut dyn AttemptContext, part: Part) -> Result<Outcome, Stag
 pub fn run_gang(cx: &mut dyn GangContext) -> Result<Outcome, StageError> {
     let settings = cx.task().settings.clone();
     match runner(&settings) {
-        Some(Stage::Gang(stage)) => stage.run(cx),
+        Some(Stage::Gang(stage)) => yielded(stage.run(cx)),
         _ => Err(misplaced(&settings, "by a gang")),
     }
 }

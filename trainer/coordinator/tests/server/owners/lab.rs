@@ -142,8 +142,11 @@ impl Lab {
         let mut config = Config { alone: false, park: false, ..Config::embedded() };
         config.tokens = tokens(&lines(as_they_are))?;
         config.policy.poll_ms = poll_ms;
-        // The worker of this test is silent for long periods.
+        // The worker of this test is silent for long periods. It keeps its task after a pause or cancellation by the
+        // owner too. Otherwise it would take the other project's task when the grace period ends, or the same stage of
+        // another run of equal inputs, which even a paused run shows as running.
         config.policy.lease_ms = 3_600_000;
+        config.policy.grace_ms = 3_600_000;
         let handle = Coordinator::start(store.clone(), config).await?;
         let client = |kind: &Kind| -> TestResult<(String, Server)> {
             let token = secret(kind.name).parse()?;
