@@ -33,6 +33,12 @@ pub struct File {
 /// Written by the server in the place of the folder's name.
 const FOLDER: &str = "FOLDER";
 
+/// The viewer of motions as a module that exports `mount`, for pages of other crates.
+pub const VIEWER: &str = include_str!("../static/viewer.js");
+
+/// Its style.
+pub const VIEWER_STYLE: &str = include_str!("../static/viewer.css");
+
 /// The addresses at which the page itself is shown: each is a view. What stands behind the last slash is the page's to read.
 pub const VIEWS: [&str; 7] = ["/", "/runs", "/runs/{*rest}", "/models", "/models/{*rest}", "/workers", "/store"];
 
@@ -43,7 +49,7 @@ macro_rules! files {
 }
 
 /// Everything that lies in `static` but licences.
-static FILES: [(&str, &[u8]); 25] = files![
+static FILES: [(&str, &[u8]); 27] = files![
     "index.html",
     "icon.svg",
     "style.css",
@@ -58,6 +64,8 @@ static FILES: [(&str, &[u8]); 25] = files![
     "graph.js",
     "log.js",
     "rates.js",
+    "viewer.js",
+    "viewer.css",
     "views/now.js",
     "views/runs.js",
     "views/run.js",
