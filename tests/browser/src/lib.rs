@@ -9,6 +9,7 @@ use std::fs::{File, OpenOptions};
 use std::io::{Read as _, Write as _};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
+use std::sync::OnceLock;
 use std::sync::mpsc::{Receiver, channel};
 use std::time::{Duration, Instant};
 
@@ -18,6 +19,10 @@ pub use base64::decoded;
 
 /// Time limit for an answer of the browser, and for a condition to hold.
 pub const PATIENCE: Duration = Duration::from_secs(90);
+
+/// Says that a test checks pages for accessibility only with axe-core.
+pub const AXE_MISSING: &str =
+    "no axe-core here to check pages with; `npm install axe-core`, and set STRIDE_AXE to its axe.min.js";
 
 /// Says that a test needs a browser.
 pub const MISSING: &str = "no Chromium here to show pages in; `apt-get install chromium`, or set STRIDE_BROWSER";
@@ -34,6 +39,20 @@ pub fn program() -> Option<PathBuf> {
     let folders: Vec<PathBuf> = std::env::var_os("PATH").iter().flat_map(std::env::split_paths).collect();
     let names = ["chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome"];
     names.iter().flat_map(|name| folders.iter().map(move |folder| folder.join(name))).find(|path| path.is_file())
+}
+
+/// The script of axe-core, if `STRIDE_AXE` names it. It checks a page for accessibility.
+///
+/// # Panics
+///
+/// If the file does not read.
+#[must_use]
+pub fn axe() -> Option<&'static str> {
+    static AXE: OnceLock<Option<String>> = OnceLock::new();
+    let read = || {
+        std::env::var_os("STRIDE_AXE").map(|path| std::fs::read_to_string(path).expect("STRIDE_AXE names axe.min.js"))
+    };
+    AXE.get_or_init(read).as_deref()
 }
 
 /// Size of a window in pixels.
@@ -198,6 +217,15 @@ impl Browser {
                 panic!("`{expression}` never holds; the page shows {text}");
             }
         }
+    }
+
+    /// What axe-core finds wrong with the page: the rule, the number of elements and the first of them. Empty without axe-core.
+    pub fn inaccessible(&mut self) -> Vec<String> {
+        let Some(axe) = axe() else { return Vec::new() };
+        self.evaluate(&format!("{axe};1"));
+        let found = "axe.run(document, {resultTypes: ['violations']}).then(({violations}) => violations.map(({id, nodes}) => \
+                     `${id} (${nodes.length}): ${nodes[0].html.slice(0, 200)}`))";
+        serde_json::from_value(self.evaluate(found)).expect("a list of texts")
     }
 
     /// Presses a key.

@@ -22,7 +22,7 @@ use serde_json::{Value, json};
 
 use crate::body::{Body, Side};
 
-const SCRIPT: &str = include_str!("html/viewer.js");
+const START: &str = include_str!("html/page.js");
 const STYLE: &str = include_str!("html/page.css");
 const CONTROLS: &str = include_str!("html/controls.html");
 
@@ -127,41 +127,31 @@ impl Page<'_> {
         if count > MOST_PANELS || coordinates > MOST_COORDINATES {
             return Err(PageError::TooMuch { panels: count, coordinates });
         }
-        let mut bodies: Vec<&Body> = Vec::new();
-        let mut motions = Vec::with_capacity(count);
-        for (i, panel) in panels().enumerate() {
-            let known = bodies.iter().position(|body| *body == panel.body);
-            let body = known.unwrap_or_else(|| {
-                bodies.push(panel.body);
-                bodies.len() - 1
-            });
-            motions.push(motion(i + 1, panel, body)?);
-        }
-        let data = json!({"bodies": bodies.into_iter().map(describe).collect::<Vec<_>>(), "motions": motions});
+        let data = packed(panels())?;
         // Every `<` is escaped, so that nothing in the block can end it.
         let data = data.to_string().replace('<', "\\u003c");
         self.head(&mut out)?;
         self.figures(&mut out)?;
         out.write_all(CONTROLS.as_bytes())?;
         writeln!(out, "<script type=\"application/json\" id=\"motions\">{data}</script>")?;
-        writeln!(out, "<script>{SCRIPT}</script>\n</body>\n</html>")?;
+        writeln!(out, "<script type=\"module\">{}</script>\n</body>\n</html>", script())?;
         out.flush()?;
         Ok(())
     }
 
     fn head(&self, out: &mut impl Write) -> io::Result<()> {
         let digest = |text: &str| BASE64.encode(Digest::of(text.as_bytes()).as_bytes());
-        let title = text(&self.title);
+        let (title, style, script) = (text(&self.title), style(), script());
         write!(
             out,
             "<!DOCTYPE html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n\
              <meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; script-src 'sha256-{}'; style-src 'sha256-{}'; \
              img-src data:; base-uri 'none'; form-action 'none'\">\n\
              <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n<meta name=\"color-scheme\" content=\"light dark\">\n\
-             <link rel=\"icon\" href=\"data:,\">\n<title>{title}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n\
+             <link rel=\"icon\" href=\"data:,\">\n<title>{title}</title>\n<style>{style}</style>\n</head>\n<body class=\"viewer\">\n\
              <header><h1 dir=\"auto\">{title}</h1></header>\n",
-            digest(SCRIPT),
-            digest(STYLE),
+            digest(&script),
+            digest(&style),
         )
     }
 
@@ -183,7 +173,7 @@ impl Page<'_> {
                     out,
                     "<figure><figcaption id=\"c{number}\"><span dir=\"auto\">{caption}</span><small dir=\"auto\">{note}</small>\
                      <small>{frames} frames at {fps} fps</small></figcaption>\
-                     <canvas tabindex=\"0\" role=\"img\" aria-labelledby=\"c{number}\"></canvas></figure>"
+                     <canvas class=\"figure\" tabindex=\"0\" role=\"img\" aria-labelledby=\"c{number}\"></canvas></figure>"
                 )?;
                 number += 1;
             }
@@ -191,6 +181,34 @@ impl Page<'_> {
         }
         writeln!(out, "</main>")
     }
+}
+
+/// Motions as the viewer reads them, without their captions.
+///
+/// # Errors
+/// If joints are no motion, or too far away.
+pub fn packed<'a>(panels: impl IntoIterator<Item = &'a Panel<'a>>) -> Result<Value, PageError> {
+    let mut bodies: Vec<&Body> = Vec::new();
+    let mut motions = Vec::new();
+    for (i, panel) in panels.into_iter().enumerate() {
+        let known = bodies.iter().position(|body| *body == panel.body);
+        let body = known.unwrap_or_else(|| {
+            bodies.push(panel.body);
+            bodies.len() - 1
+        });
+        motions.push(motion(i + 1, panel, body)?);
+    }
+    Ok(json!({"bodies": bodies.into_iter().map(describe).collect::<Vec<_>>(), "motions": motions}))
+}
+
+/// The viewer, and the lines that start it here.
+fn script() -> String {
+    format!("{}{START}", page::VIEWER)
+}
+
+/// The style of the page and of the viewer's figures.
+fn style() -> String {
+    format!("{STYLE}{}", page::VIEWER_STYLE)
 }
 
 /// Escapes untrusted text for an element.

@@ -20,7 +20,7 @@ const WINDOW: [usize; 2] = [900, 1200];
 fn picture(browser: &mut Browser, seconds: f64) -> Vec<u8> {
     browser.evaluate(&format!("location.hash = '#t={seconds}'"));
     // The address changes first, and the page is notified.
-    browser.until(&format!("document.getElementById('clock').textContent.startsWith('{seconds:.2} of ')"));
+    browser.until(&format!("document.querySelector('.clock').textContent.startsWith('{seconds:.2} of ')"));
     browser.evaluate(DRAWN);
     let mut reader = png::Decoder::new(Cursor::new(browser.screenshot())).read_info().expect("a PNG");
     let mut pixels = vec![0; reader.output_buffer_size().expect("a small picture")];
@@ -62,9 +62,9 @@ fn a_figure_moves_and_nothing_else_does() {
     let mut browser = Browser::start(&program, folder.path());
     let url = format!("file://{}#t=0.5", file.display());
     browser.open(&url, Window { width: WINDOW[0], height: WINDOW[1], mobile: false });
-    let canvases = browser.places("canvas");
+    let canvases = browser.places("canvas.figure");
     let [moves, stands] = canvases[..] else { panic!("two figures, not {canvases:?}") };
-    let controls = browser.places("#time, #clock");
+    let controls = browser.places(".time, .clock, .strip");
     assert!(controls.iter().all(|place| place[3] <= WINDOW[1] as f64), "all is in the window: {controls:?}");
     // The first picture may show a button that is still being drawn.
     picture(&mut browser, 1.0);
@@ -79,9 +79,10 @@ fn a_figure_moves_and_nothing_else_does() {
         let (x, y) = ((at % WINDOW[0]) as f64, (at / WINDOW[0]) as f64);
         match a == b {
             true => {}
+            // The strip of a figure begins where the figure ends.
+            false if controls.iter().any(|place| within(*place, x, y)) => in_controls += 1,
             false if within(moves, x, y) => in_figure += 1,
             false if within(stands, x, y) => in_still += 1,
-            false if controls.iter().any(|place| within(*place, x, y)) => in_controls += 1,
             false => elsewhere.push((x, y)),
         }
     }
@@ -96,9 +97,9 @@ fn a_figure_moves_and_nothing_else_does() {
     assert!(colours.len() > 20, "{} colours", colours.len());
 
     let clock = |browser: &mut Browser| {
-        browser.evaluate(&format!("{DRAWN}.then(() => document.getElementById('clock').textContent)"))
+        browser.evaluate(&format!("{DRAWN}.then(() => document.querySelector('.clock').textContent)"))
     };
-    browser.evaluate("document.getElementById('play').click()");
+    browser.evaluate("document.querySelector('.play').click()");
     let (before, since) = (clock(&mut browser), Instant::now());
     while clock(&mut browser) == before {
         assert!(since.elapsed() < PATIENCE, "it plays");

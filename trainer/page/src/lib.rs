@@ -33,8 +33,15 @@ pub struct File {
 /// Written by the server in the place of the folder's name.
 const FOLDER: &str = "FOLDER";
 
+/// The viewer of motions as a module that exports `mount`, for pages of other crates.
+pub const VIEWER: &str = include_str!("../static/viewer.js");
+
+/// Its style.
+pub const VIEWER_STYLE: &str = include_str!("../static/viewer.css");
+
 /// The addresses at which the page itself is shown: each is a view. What stands behind the last slash is the page's to read.
-pub const VIEWS: [&str; 7] = ["/", "/runs", "/runs/{*rest}", "/models", "/models/{*rest}", "/workers", "/store"];
+pub const VIEWS: [&str; 8] =
+    ["/", "/runs", "/runs/{*rest}", "/compare", "/models", "/models/{*rest}", "/workers", "/store"];
 
 macro_rules! files {
     ($($name:literal),* $(,)?) => {
@@ -43,7 +50,7 @@ macro_rules! files {
 }
 
 /// Everything that lies in `static` but licences.
-static FILES: [(&str, &[u8]); 25] = files![
+static FILES: [(&str, &[u8]); 33] = files![
     "index.html",
     "icon.svg",
     "style.css",
@@ -58,10 +65,18 @@ static FILES: [(&str, &[u8]); 25] = files![
     "graph.js",
     "log.js",
     "rates.js",
+    "viewer.js",
+    "viewer.css",
+    "settings.js",
+    "history.js",
+    "lanes.js",
+    "marks.js",
+    "sweep.js",
     "views/now.js",
     "views/runs.js",
     "views/run.js",
     "views/stage.js",
+    "views/compare.js",
     "views/models.js",
     "views/workers.js",
     "views/store.js",

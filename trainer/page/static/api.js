@@ -70,6 +70,24 @@ export async function blob(digest, signal) {
   return (await send("GET", `/v1/blobs/${digest}`, { signal })).arrayBuffer();
 }
 
+/** A part of a blob. @param {string} digest @param {number} from @param {number} bytes @param {AbortSignal} [signal] @returns {Promise<ArrayBuffer>} */
+export async function part(digest, from, bytes, signal) {
+  const answer = await send("GET", `/v1/blobs/${digest}`, { signal, headers: { range: `bytes=${from}-` } });
+  const reader = answer.body?.getReader();
+  const found = new Uint8Array(bytes);
+  let have = 0;
+  while (reader && have < bytes) {
+    const { done, value } = await reader.read();
+    if (done || !value) break;
+    found.set(value.subarray(0, bytes - have), have);
+    have += value.length;
+  }
+  // The rest of the blob is not wanted.
+  await reader?.cancel();
+  if (have < bytes) throw new CallError(0, "away", "The server does not answer.", null);
+  return found.buffer;
+}
+
 /** Buys a session for a token, or for a link's key. @param {"Bearer" | "Key"} scheme @param {string} word @returns {Promise<Who>} */
 export async function signIn(scheme, word) {
   return (await send("POST", "/v1/session", { headers: { authorization: `${scheme} ${word}` } })).json();

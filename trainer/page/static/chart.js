@@ -1,25 +1,41 @@
 //! Curves: fetched, smoothed and drawn.
+//!
+//! A bucket's least and most are a band around its mean, so that no value is lost however many one pixel stands for. A part that is
+//! marked with the mouse is fetched again, in buckets of its own.
 
 import { get } from "./api.js";
-import { grouped, number, plain } from "./format.js";
+import { date, grouped, number, plain } from "./format.js";
 import uPlot from "./vendor/uPlot.esm.js";
 
 /** Points that a chart asks for: about two a pixel. */
 const POINTS = 800;
 
+/** What is asked for: runs, a stage, keys, the axis, and the part of it. @typedef {{runs: string[], stage?: string | null, keys?: string[], axis?: Axis, from?: number, to?: number, points?: number}} Asked */
+/** @typedef {"step" | "time" | "hours"} Axis */
+/** @typedef {Curve & {run: string, stage: string, key: string}} Series */
+/** @typedef {{label: string, curve: Curve, line?: number}} Line */
+/** @typedef {{log?: boolean, smooth?: boolean, axis?: Axis, ticks?: number[]}} Look */
+
+/** @param {Asked} asked @param {AbortSignal} [signal] @returns {Promise<Series[]>} */
+export async function series(asked, signal) {
+  const query = new URLSearchParams({ buckets: String(asked.points ?? POINTS) });
+  for (const run of asked.runs) query.append("run", run);
+  for (const key of asked.keys ?? []) query.append("key", key);
+  if (asked.stage) query.set("stage", asked.stage);
+  if (asked.axis && asked.axis !== "step") query.set("x", asked.axis);
+  if (asked.from !== undefined) query.set("from", String(asked.from));
+  if (asked.to !== undefined) query.set("to", String(asked.to));
+  return (await get(`/v1/metrics?${query}`, signal)).series;
+}
+
 /** The curves of a run, or of one stage of it, by stage and key. @param {string} run @param {string | null} stage @param {AbortSignal} signal @param {number} [points] @returns {Promise<Map<string, Map<string, Curve>>>} */
 export async function curves(run, stage, signal, points = POINTS) {
-  const query = new URLSearchParams({ run, buckets: String(points) });
-  if (stage) query.set("stage", stage);
-  const answer = /** @type {{series: {stage: string, key: string, total: number, x: number[], mean: (number | null)[], nan: number[]}[]}} */ (
-    await get(`/v1/metrics?${query}`, signal)
-  );
   /** @type {Map<string, Map<string, Curve>>} */
   const found = new Map();
-  for (const { stage: name, key, total, x, mean, nan } of answer.series) {
-    const keys = found.get(name) ?? new Map();
-    keys.set(key, { total, x, mean, nan });
-    found.set(name, keys);
+  for (const curve of await series({ runs: [run], stage, points }, signal)) {
+    const keys = found.get(curve.stage) ?? new Map();
+    keys.set(curve.key, curve);
+    found.set(curve.stage, keys);
   }
   return found;
 }
@@ -73,26 +89,41 @@ export function inWords(key, curve) {
 /** @param {string} name */
 const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 
+/** Colours of lines; behind the last one they begin again with dashes. */
+export const COLOURS = 8;
+const DASHES = [[], [7, 4], [2, 3]];
+
 /** Charts whose cursors go together. */
 const together = uPlot.sync("stride");
 
-/** One chart, with an element that stays the same while its curve grows. */
+/** @param {unknown} _ @param {number | null | undefined} at */
+const value = (_, at) => (at === null || at === undefined ? "–" : number(at));
+
+/** One chart, with an element that stays the same while its curves grow. */
 export class Chart {
-  /** @param {string} key @param {number} height */
-  constructor(key, height = 190) {
-    this.key = key;
+  /** @param {number} height @param {(from: number, to: number) => Promise<Line[]>} [finer] fetches a part of the lines */
+  constructor(height = 190, finer) {
     this.height = height;
+    this.finer = finer;
     this.element = document.createElement("div");
     this.element.className = "plot";
     /** @type {uPlot | null} */
     this.plot = null;
-    /** @type {Curve | null} */
-    this.curve = null;
-    this.log = false;
-    this.averaged = false;
+    /** @type {Line[]} */
+    this.lines = [];
+    /** A part that was marked, in finer buckets. @type {Line[] | null} */
+    this.part = null;
+    /** @type {Look} */
+    this.look = {};
+    this.made = "";
     this.again = () => this.make();
     this.watch = new ResizeObserver(() => this.fit());
     this.watch.observe(this.element);
+    this.element.addEventListener("dblclick", () => {
+      if (!this.part) return;
+      this.part = null;
+      this.update();
+    });
     addEventListener("stride-colours", this.again);
   }
 
@@ -110,71 +141,150 @@ export class Chart {
     else this.make();
   }
 
-  /** @param {Curve} curve @param {boolean} log @param {boolean} smooth */
-  show(curve, log, smooth) {
-    const averaged = smooth && isRough(curve.mean);
-    const anew = log !== this.log || averaged !== this.averaged || !this.curve;
-    const same = !anew && this.curve?.total === curve.total && this.curve.x.length === curve.x.length;
-    [this.curve, this.log, this.averaged] = [curve, log, averaged];
-    if (anew) this.make();
-    else if (!same) this.plot?.setData(this.data());
+  /** @param {Line[]} lines @param {Look} look */
+  show(lines, look) {
+    const seen = (/** @type {Line[]} */ all) => all.map(({ curve }) => `${curve.total}/${curve.x.length}`).join();
+    const same = seen(lines) === seen(this.lines) && look.ticks?.length === this.look.ticks?.length;
+    if (look.axis !== this.look.axis) this.part = null;
+    [this.lines, this.look] = [lines, look];
+    if (this.shape() !== this.made) this.make();
+    else if (!same && !this.part) this.update();
+  }
+
+  shown() {
+    return this.part ?? this.lines;
+  }
+
+  /** Everything but the numbers: with the same shape a plot can go on. */
+  shape() {
+    const lines = this.shown().map((line) => [line.label, line.line, this.isAveraged(line), this.hasBand(line)]);
+    return JSON.stringify([lines, this.look.log ?? false, this.look.axis ?? "step"]);
+  }
+
+  /** @param {Line} line */
+  isAveraged(line) {
+    return Boolean(this.look.smooth) && isRough(line.curve.mean);
+  }
+
+  /** A band says something where a bucket has several values. Of many lines the bands would hide each other. @param {Line} line */
+  hasBand(line) {
+    return this.shown().length <= 2 && (line.curve.count ?? []).some((count) => count > 1);
+  }
+
+  update() {
+    if (this.shape() !== this.made) this.make();
+    else this.plot?.setData(this.data());
   }
 
   /** @returns {(number | null)[][]} */
   data() {
-    const curve = this.curve ?? { x: [], mean: [], total: 0 };
-    const usable = (/** @type {number | null} */ value) => (value === null || !Number.isFinite(value) || (this.log && value <= 0) ? null : value);
-    const raw = curve.mean.map(usable);
-    return this.averaged ? [curve.x, raw, smoothed(raw, weightFor(raw.length))] : [curve.x, raw];
+    const usable = (/** @type {number | null | undefined} */ at) => (at === null || at === undefined || !Number.isFinite(at) || (this.look.log && at <= 0) ? null : at);
+    const tables = this.shown().map((line) => {
+      const { x, mean, min, max } = line.curve;
+      const raw = mean.map(usable);
+      /** @type {(number | null)[][]} */
+      const table = [x];
+      if (this.hasBand(line)) table.push((max ?? mean).map(usable), (min ?? mean).map(usable));
+      table.push(raw);
+      if (this.isAveraged(line)) table.push(smoothed(raw, weightFor(raw.length)));
+      return table;
+    });
+    if (tables.length === 0) return [[]];
+    return tables.length === 1 ? tables[0] ?? [[]] : uPlot.join(tables);
   }
 
   make() {
     const width = this.element.clientWidth;
-    if (width === 0 || !this.curve) return;
+    if (width === 0 || this.shown().length === 0) return;
     this.plot?.destroy();
-    const [line, faint, dim, grid] = [colour("--line-1"), colour("--line-1-faint"), colour("--dim"), colour("--edge")];
-    const axis = { stroke: dim, grid: { stroke: grid, width: 1 }, ticks: { stroke: grid, width: 1, size: 4 }, font: "11px system-ui, sans-serif" };
-    const value = (/** @type {unknown} */ _, /** @type {number | null} */ at) => (at === null || at === undefined ? "–" : number(at));
-    const raw = { label: plain(this.key), stroke: this.averaged ? faint : line, width: this.averaged ? 1 : 1.5, points: { show: this.curve.x.length < 40, size: 4, fill: line }, value, spanGaps: true };
-    const series = [{ label: "step", value: (/** @type {unknown} */ _, /** @type {number | null} */ at) => (at === null || at === undefined ? "–" : grouped(at)) }, raw];
-    if (this.averaged) series.push({ label: "smooth", stroke: line, width: 1.8, points: { show: false, size: 0, fill: line }, value, spanGaps: true });
+    this.made = this.shape();
+    const { log, axis = "step" } = this.look;
+    const [dim, grid] = [colour("--dim"), colour("--edge")];
+    const drawn = { stroke: dim, grid: { stroke: grid, width: 1 }, ticks: { stroke: grid, width: 1, size: 4 }, font: "11px system-ui, sans-serif" };
+    const x = (/** @type {unknown} */ _, /** @type {number | null} */ at) => (at === null || at === undefined ? "–" : axis === "step" ? grouped(Math.round(at)) : axis === "time" ? date(at) : `${number(at)} h`);
+    /** @type {object[]} */
+    const columns = [{ label: axis, value: x }];
+    /** @type {object[]} */
+    const bands = [];
+    const many = this.shown().length > 1;
+    for (const [place, line] of this.shown().entries()) {
+      const at = line.line ?? place;
+      const name = `--line-${(at % COLOURS) + 1}`;
+      const dash = DASHES[Math.floor(at / COLOURS) % DASHES.length];
+      const [full, averaged] = [colour(name), this.isAveraged(line)];
+      const label = plain(line.label);
+      const common = { spanGaps: true, value };
+      if (this.hasBand(line)) {
+        const edge = { ...common, stroke: "transparent", width: 0, points: { show: false } };
+        bands.push({ series: [columns.length, columns.length + 1], fill: `${full}2e` });
+        columns.push({ ...edge, label: many ? `${label} most` : "most" }, { ...edge, label: many ? `${label} least` : "least" });
+      }
+      columns.push({ ...common, label, dash, stroke: averaged ? `${full}59` : full, width: averaged ? 1 : 1.5, points: { show: line.curve.x.length < 40, size: 4, fill: full } });
+      if (averaged) columns.push({ ...common, label: many ? `${label} smooth` : "smooth", dash, stroke: full, width: 1.8, points: { show: false } });
+    }
     this.plot = new uPlot(
       {
         width,
         height: this.height,
-        series,
-        scales: { x: { time: false }, y: { distr: this.log ? 3 : 1 } },
+        ms: 1,
+        series: columns,
+        bands,
+        scales: { x: { time: axis === "time" }, y: { distr: log ? 3 : 1 } },
         axes: [
-          { ...axis, size: 26, values: (/** @type {unknown} */ _, /** @type {number[]} */ at) => at.map(steps) },
-          { ...axis, size: 52, values: (/** @type {unknown} */ _, /** @type {(number | null)[]} */ at) => at.map((tick) => (tick === null ? "" : number(tick))) },
+          axis === "step" ? { ...drawn, size: 26, values: (/** @type {unknown} */ _, /** @type {number[]} */ at) => at.map(steps) } : { ...drawn, size: axis === "time" ? 40 : 26 },
+          { ...drawn, size: 52, values: (/** @type {unknown} */ _, /** @type {(number | null)[]} */ at) => at.map((tick) => (tick === null ? "" : number(tick))) },
         ],
         cursor: { sync: { key: together.key }, drag: { x: true, y: false }, points: { size: 6 } },
-        legend: { live: true },
-        hooks: { draw: [(/** @type {any} */ plot) => this.mark(plot)] },
+        legend: { live: true, show: !many },
+        hooks: { draw: [(/** @type {any} */ plot) => this.mark(plot)], setSelect: [(/** @type {any} */ plot) => void this.refine(plot)] },
       },
       this.data(),
       this.element,
     );
   }
 
-  /** A red tick where a value was no number. @param {any} plot */
+  /** Fetches the marked part. @param {any} plot */
+  async refine(plot) {
+    const { left, width } = plot.select;
+    if (width < 4 || !this.finer) return;
+    const part = await this.finer(plot.posToVal(left, "x"), plot.posToVal(left + width, "x")).catch(() => null);
+    if (!part || this.plot !== plot || !part.some((line) => line.curve.x.length > 1)) return;
+    this.part = part;
+    this.update();
+  }
+
+  /** Red ticks above where a value was no number, small marks below where a checkpoint was saved. @param {any} plot */
   mark(plot) {
-    const curve = this.curve;
-    const hasNan = (/** @type {number} */ at) => (curve?.nan?.[at] ?? 0) > 0;
-    if (!curve || !curve.x.some((_, at) => hasNan(at))) return;
     const { ctx, bbox } = plot;
+    const place = (/** @type {number} */ at) => {
+      const x = plot.valToPos(at, "x", true);
+      return x < bbox.left || x > bbox.left + bbox.width ? null : x;
+    };
     ctx.save();
     ctx.strokeStyle = colour("--bad");
     ctx.lineWidth = 2;
-    curve.x.forEach((_, at) => {
-      if (!hasNan(at)) return;
-      const x = plot.valToPos(curve.x[at], "x", true);
-      if (x < bbox.left || x > bbox.left + bbox.width) return;
+    for (const { curve } of this.shown()) {
+      curve.nan?.forEach((count, at) => {
+        const x = count > 0 ? place(curve.x[at] ?? NaN) : null;
+        if (x === null) return;
+        ctx.beginPath();
+        ctx.moveTo(x, bbox.top);
+        ctx.lineTo(x, bbox.top + 10);
+        ctx.stroke();
+      });
+    }
+    ctx.fillStyle = colour("--good");
+    const size = 4 * devicePixelRatio;
+    for (const tick of this.look.ticks ?? []) {
+      const x = place(tick);
+      if (x === null) continue;
+      const y = bbox.top + bbox.height;
       ctx.beginPath();
-      ctx.moveTo(x, bbox.top);
-      ctx.lineTo(x, bbox.top + 10);
-      ctx.stroke();
-    });
+      ctx.moveTo(x, y - 1.6 * size);
+      ctx.lineTo(x + size, y);
+      ctx.lineTo(x - size, y);
+      ctx.fill();
+    }
     ctx.restore();
   }
 }

@@ -3,6 +3,7 @@
 import { duration } from "./format.js";
 import { isDone, pace, share, sign, tone } from "./parts.js";
 import { address } from "./router.js";
+import { inWords } from "./settings.js";
 import { svg, html } from "./vendor/lit-html.js";
 
 const [WIDTH, HEIGHT, GAP_X, GAP_Y, EDGE] = [152, 58, 34, 14, 4];
@@ -57,8 +58,8 @@ export function edgesOf(stages) {
 /** @param {string} text @param {number} most */
 const cut = (text, most) => (text.length > most ? `${text.slice(0, most - 1)}…` : text);
 
-/** @param {Run} run @param {Stage[]} stages */
-export function graph(run, stages) {
+/** @param {Run} run @param {Stage[]} stages @param {Map<string, import("./settings.js").Why>} why */
+export function graph(run, stages, why) {
   const all = columns(stages);
   const tallest = Math.max(1, ...all.map((column) => column.length));
   const [width, height] = [all.length * (WIDTH + GAP_X) - GAP_X + 2 * EDGE, tallest * (HEIGHT + GAP_Y) - GAP_Y + 2 * EDGE];
@@ -80,11 +81,12 @@ export function graph(run, stages) {
   );
   const node = (/** @type {Stage} */ stage) => {
     const [x, y] = places.get(stage.name) ?? [0, 0];
-    const below = stage.state === "running" && stage.progress.total > 0 ? pace(stage, undefined) : isDone(stage) && stage.wall_s > 0 ? `${stage.state} · ${duration(stage.wall_s)}` : stage.state;
+    const reason = inWords(why.get(stage.name), stage);
+    const below = stage.state === "cached" && reason ? reason : stage.state === "running" && stage.progress.total > 0 ? pace(stage, undefined) : isDone(stage) && stage.wall_s > 0 ? `${stage.state} · ${duration(stage.wall_s)}` : stage.state;
     return svg`<a href=${address("runs", run.run, stage.name)} class=${`node ${tone(stage.state)}`}>
       <rect class="box" x=${x} y=${y} width=${WIDTH} height=${HEIGHT} rx="8"></rect>
       <rect class="edge-mark" x=${x} y=${y + 8} width="3" height=${HEIGHT - 16}></rect>
-      <title>${stage.name}, ${stage.kind}</title>
+      <title>${`${stage.name}, ${stage.kind}${reason ? `: ${reason}` : ""}`}</title>
       <text class="name" x=${x + 14} y=${y + 22}>${sign(stage.state)} ${cut(stage.name, 15)}</text>
       <text class="kind" x=${x + 14} y=${y + 40}>${cut(below, 23)}</text>
       ${stage.state === "running" ? svg`<rect class="track" x=${x + 14} y=${y + 47} width=${WIDTH - 28} height="3" rx="1.5"></rect><rect class="done" x=${x + 14} y=${y + 47} width=${(WIDTH - 28) * share(stage.progress)} height="3" rx="1.5"></rect>` : ""}

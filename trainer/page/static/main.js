@@ -5,6 +5,7 @@ import { icon } from "./parts.js";
 import { start as startRouter, go, words } from "./router.js";
 import { currentWho, setWho } from "./session.js";
 import { html, nothing, render } from "./vendor/lit-html.js";
+import { compare } from "./views/compare.js";
 import { login } from "./views/login.js";
 import { model, models } from "./views/models.js";
 import { now } from "./views/now.js";
@@ -40,6 +41,7 @@ function viewAt(at, context) {
   if (first === "runs" && second === undefined) return runs(context);
   if (first === "runs" && second !== undefined && third !== undefined) return stage(context, second, third);
   if (first === "runs" && second !== undefined) return run(context, second);
+  if (first === "compare") return compare(context);
   if (first === "models" && second === undefined) return models(context);
   if (first === "models" && second !== undefined) return model(context, second);
   if (first === "workers") return workers(context);
@@ -59,7 +61,7 @@ const PLACES = [
 function draw() {
   const who = currentWho();
   if (!who || !view) return;
-  const at = `/${words()[0] ?? ""}`;
+  const at = words()[0] === "compare" ? "/runs" : `/${words()[0] ?? ""}`;
   document.title = `${view.title} · Stride`;
   /** @param {[string, string, string]} place */
   const link = ([href, text, name]) =>

@@ -6,17 +6,25 @@ interface Stage {
   name: string; kind: string; state: string; key: string | null;
   outputs: Record<string, string>; metrics: Record<string, number>; progress: Progress;
   wall_s: number; attempt: number; workers: string[]; instruction_set?: string; message: string | null;
-  wants_workers?: number; of?: string; needs?: string[];
+  wants_workers?: number; of?: string; needs?: string[]; times?: Times;
+}
+interface Times { created_ms?: number; started_ms?: number; ended_ms?: number }
+interface SettingsOfStage { stage: string; settings: Record<string, unknown>; code: number; key?: string; from?: string }
+interface RunSettings { run: string; previous: string | null; seed: number; source: string; stages: SettingsOfStage[] }
+interface Change { path: string; from: unknown; to: unknown }
+interface HistoryRow {
+  id: number; at_ms: number; kind: string; run?: string; stage?: string; task?: string; attempt?: number; step?: number;
+  worker?: string; model?: string; actor?: string; why?: string;
 }
 interface Trial { trial: number; values: Record<string, unknown>; state: string; steps: number; results: (number | null)[]; message?: string }
 interface Sweep { stage: string; search: string; metric: string; mode: string; rungs: number[]; over: boolean; spent: number; planned: number; full: number; best: number | null; trials: Trial[] }
 interface Run {
   run: string; pipeline: string; owner: Owner; state: string; interrupted: boolean; stages: Stage[];
-  sweeps?: Sweep[]; storage?: { since_ms: number; what: string };
+  sweeps?: Sweep[]; storage?: { since_ms: number; what: string }; times?: Times;
 }
 interface WorkerRow { worker: string; incarnation: number; pid: number; backend: string; instruction_set: string; state: string; task: string | null }
 interface LogLine { id: number; task: string; attempt: number; worker: string; line: number; at_ms: number; text: string }
-interface Curve { total: number; x: number[]; mean: (number | null)[]; nan?: number[]; key?: string }
+interface Curve { total: number; x: number[]; mean: (number | null)[]; min?: (number | null)[]; max?: (number | null)[]; count?: number[]; nan?: number[]; key?: string }
 interface Who { name: string; project?: string; scopes: string[]; until_ms?: number; now_ms: number; store: string; version: string }
 interface Model { model: string; metric: string | null; mode: string | null; versions: number; best: number | null; aliases: Record<string, number> }
 interface Version { model: string; version: number; artifact: string; metrics: Record<string, number>; source: Record<string, unknown> | null; created_ms: number; aliases: string[] }

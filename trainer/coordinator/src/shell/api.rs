@@ -18,7 +18,7 @@ use super::audit;
 use super::auth::{self, Gate};
 use super::failure::Failure;
 use super::route::Route;
-use super::{bundles, curves, page_files, polls, queries, scrape, session_calls, uploads};
+use super::{bundles, curves, page_files, polls, queries, scrape, session_calls, settings, uploads};
 
 /// Time limit of a call that waits only for the disk.
 const SHORT: Duration = Duration::from_secs(60);
@@ -65,6 +65,7 @@ fn table() -> Vec<Entry> {
         entry("GET",  "/v1/runs/{run}",            &[Read],         CALL,                     SHORT, queries::run),
         entry("GET",  "/v1/runs/{run}/logs",       &[Read],         CALL,                     SHORT, queries::logs),
         entry("GET",  "/v1/runs/{run}/metrics",    &[Read],         CALL,                     SHORT, queries::points),
+        entry("GET",  "/v1/runs/{run}/settings",   &[Read],         CALL,                     SHORT, settings::settings),
         entry("POST", "/v1/runs/{run}/{action}",   &[Submit],       CALL,                     SHORT, queries::control),
         entry("POST", "/v1/bundles",               &[Submit],       limits::BUNDLE_BYTES,     LONG,  bundles::import),
         entry("GET",  "/v1/session",               &[Read],         CALL,                     SHORT, session_calls::look),

@@ -251,7 +251,7 @@ impl Records {
 
     /// For each stage of this run, the run and stage under which its logs and metrics are stored. A stage computed for
     /// another run has them under that run.
-    async fn sources(
+    pub(super) async fn sources(
         &self,
         run: &RunId,
         stage: Option<&StageName>,

@@ -32,6 +32,22 @@ export function models(_) {
   return { title: "Models", every: 5000, load, render };
 }
 
+/** A gate as a light, with by how much it holds or does not. @param {string} gate @param {boolean | null} holds @param {number | null} value @param {number | null} bound */
+const light = (gate, holds, value, bound) => html`<li class=${holds === null ? "" : holds ? "good" : "bad"}><span aria-hidden="true">${holds === null ? "◌" : holds ? "●" : "○"}</span> <code>${plain(gate)}</code>
+  <span class="dim">${holds === null ? "is looked at when it moves" : `${holds ? "holds" : "does not hold"}: ${number(value)}${bound === null ? "" : ` against ${number(bound)}, ${number(Math.abs((value ?? NaN) - bound))} ${(value ?? 0) < bound ? "below" : "above"}`}`}</span></li>`;
+
+/** How a gate would be for a version now; those with other bounds than numbers and aliases are the server's to decide. @param {string} gate @param {Version} version @param {Version[]} all */
+function foresee(gate, version, all) {
+  const [, metric, sign, right] = /^\s*(\S+?)\s*(<=|>=|<|>)\s*(\S+)\s*$/.exec(gate) ?? [];
+  if (!metric || !sign || !right) return light(gate, null, null, null);
+  const other = all.find((known) => known.aliases.includes(right));
+  const bound = Number.isFinite(Number(right)) ? Number(right) : other?.metrics[metric];
+  const value = version.metrics[metric];
+  if (bound === undefined || value === undefined) return light(gate, null, null, null);
+  const holds = { "<=": value <= bound, ">=": value >= bound, "<": value < bound, ">": value > bound }[sign] ?? null;
+  return light(gate, holds, value, bound);
+}
+
 /** @param {Record<string, number>} all */
 const aliases = (all) => Object.entries(all).map(([alias, version]) => html`<span class="alias">${alias} <span class="dim">→ ${version}</span></span>`);
 
@@ -43,7 +59,7 @@ export function model(context, name) {
   let versions = [];
   /** @type {Promotion[]} Newest first. */
   let history = [];
-  /** @type {{version: Version, alias: string, reason: string, wrong: string | null, busy: boolean, back: boolean} | null} */
+  /** @type {{version: Version, alias: string, reason: string, gates: string, wrong: string | null, busy: boolean, back: boolean} | null} */
   let asked = null;
   /** @type {{version: number, nodes: LineageNode[]} | null} */
   let lineage = null;
@@ -58,7 +74,9 @@ export function model(context, name) {
 
   /** @param {Version} version @param {string} alias @param {boolean} back */
   function ask(version, alias, back) {
-    asked = { version, alias, reason: "", wrong: null, busy: false, back };
+    // The gates that the alias was moved with last are the ones to begin with.
+    const gates = history.find((move) => move.alias === alias && move.gates.length > 0)?.gates.map((gate) => gate.gate).join(", ") ?? "";
+    asked = { version, alias, reason: "", gates, wrong: null, busy: false, back };
     context.draw();
     const dialog = /** @type {HTMLDialogElement | null} */ (document.querySelector("dialog.promote"));
     if (dialog && !dialog.open) dialog.showModal();
@@ -70,6 +88,9 @@ export function model(context, name) {
     context.draw();
   }
 
+  /** @param {string} text */
+  const listed = (text) => text.split(/[,\n]/).map((gate) => gate.trim()).filter((gate) => gate !== "");
+
   /** @param {SubmitEvent} event */
   async function move(event) {
     event.preventDefault();
@@ -78,7 +99,7 @@ export function model(context, name) {
     const fields = new FormData(/** @type {HTMLFormElement} */ (event.currentTarget));
     const alias = String(fields.get("alias") ?? "").trim();
     const reason = String(fields.get("reason") ?? "").trim();
-    const require = String(fields.get("gates") ?? "").split(/[,\n]/).map((gate) => gate.trim()).filter((gate) => gate !== "");
+    const require = listed(String(fields.get("gates") ?? ""));
     const at = it.aliases[alias];
     // What was on the screen: whoever moved it meanwhile was faster, and is named.
     const expect = at === undefined ? "none" : String(at);
@@ -115,6 +136,11 @@ export function model(context, name) {
       doing.alias = /** @type {HTMLInputElement} */ (event.currentTarget).value.trim();
       context.draw();
     };
+    /** @param {Event} event */
+    const gated = (event) => {
+      doing.gates = /** @type {HTMLInputElement} */ (event.currentTarget).value;
+      context.draw();
+    };
     return html`<dialog class="promote" aria-labelledby="promote-title" @close=${() => { asked = null; }}>
       <form @submit=${move}>
         <h2 id="promote-title">${doing.back ? "Roll back to" : "Promote"} version ${doing.version.version}</h2>
@@ -124,7 +150,8 @@ export function model(context, name) {
         <p class="dim">${now === undefined ? "This alias does not exist yet." : html`Now version <b>${now}</b>, then version <b>${doing.version.version}</b>.`}</p>
         ${keys.length > 0 ? html`<div class="table"><table><caption class="unseen">Metrics now and then</caption><thead><tr><th scope="col">Metric</th><th scope="col" class="num">${now === undefined ? "–" : `version ${now}`}</th><th scope="col" class="num">version ${doing.version.version}</th></tr></thead>
           <tbody>${keys.map((key) => html`<tr><th scope="row">${plain(key)}</th><td class="num">${from && key in from.metrics ? number(from.metrics[key]) : "–"}</td><td class="num">${number(doing.version.metrics[key])}</td></tr>`)}</tbody></table></div>` : nothing}
-        ${doing.back ? nothing : html`<label for="gates">Gates, if you want some</label><input id="gates" name="gates" placeholder="fid <= 0.5, r_precision_top1 >= prod" autocapitalize="off" spellcheck="false">`}
+        ${doing.back ? nothing : html`<label for="gates">Gates, if you want some</label><input id="gates" name="gates" .value=${doing.gates} @input=${gated} placeholder="fid <= 0.5, r_precision_top1 >= prod" autocapitalize="off" spellcheck="false">
+          <ul class="gates">${listed(doing.gates).map((gate) => foresee(gate, doing.version, versions))}</ul>`}
         <label for="reason">Reason</label>
         <input id="reason" name="reason" .value=${doing.reason} required maxlength="500" autocomplete="off" placeholder="Why does it move?">
         ${doing.wrong ? html`<p class="wrong" role="alert">${doing.wrong}</p>` : nothing}
@@ -161,7 +188,7 @@ export function model(context, name) {
       <td class="wide">${run ? html`<a href=${address("runs", run)}>${run}</a>` : nothing}</td>
       <td class="wide dim" title=${date(version.created_ms)}>${ago(version.created_ms, serverNow())}</td>
       <td class="actions"><button type="button" aria-expanded=${lineage?.version === version.version ? "true" : "false"} @click=${() => trace(version)}>Lineage</button>
-        ${may("promote") ? html`<button type="button" class=${version.version === model.best ? "main" : ""} @click=${() => ask(version, version.aliases.includes("staging") ? "prod" : "staging", false)}>Promote</button>` : nothing}</td>
+        ${may("promote") ? html`<button type="button" class=${version.version === model.best && !version.aliases.includes("prod") ? "main" : ""} @click=${() => ask(version, version.aliases.includes("staging") ? "prod" : "staging", false)}>Promote</button>` : nothing}</td>
     </tr>${lineage?.version === version.version ? html`<tr><td colspan=${keys.length + 5}>${ancestry(lineage.nodes)}</td></tr>` : nothing}`;
   }
 
@@ -169,7 +196,7 @@ export function model(context, name) {
   const moved = (move, newest) => html`<li class="card">
     <p class="row"><b>${move.alias}</b> <span>${move.from ?? "new"} → ${move.to}</span> ${move.action === "rollback" ? badge("paused", "rolled back") : nothing}<span class="dim grow right" title=${date(move.at_ms)}>${ago(move.at_ms, serverNow())}</span></p>
     <p dir="auto">${prose(move.reason || "No reason was given.")} <span class="dim">— ${move.actor}</span></p>
-    ${move.gates.length > 0 ? html`<ul class="gates">${move.gates.map((gate) => html`<li class=${gate.holds ? "good" : "bad"}><span aria-hidden="true">${gate.holds ? "●" : "○"}</span> <code>${gate.gate}</code> <span class="dim">${gate.value === null ? "" : number(gate.value)}${gate.bound === null || gate.bound === undefined ? "" : ` against ${number(gate.bound)}`}${gate.holds ? "" : " — does not hold"}</span></li>`)}</ul>` : nothing}
+    ${move.gates.length > 0 ? html`<ul class="gates">${move.gates.map((gate) => light(gate.gate, gate.holds, gate.value, gate.bound ?? null))}</ul>` : nothing}
     ${newest && move.from && may("promote") ? html`<p class="actions"><button type="button" @click=${() => { const back = versions.find((version) => version.version === move.from); if (back) ask(back, move.alias, true); }}>Roll back to ${move.from}</button></p>` : nothing}
   </li>`;
 
@@ -185,7 +212,7 @@ export function model(context, name) {
     return html`<p class="path"><a href="/models">Models</a></p>
       <div class="row head"><h1 tabindex="-1">${it.model}</h1>${aliases(it.aliases)}</div>
       ${metric && measured.length > 2 ? html`<figure class="card over"><figcaption>${plain(metric)} <span class="dim">over ${count(measured.length, "version")}, ${it.mode === "max" ? "most" : "least"} is best</span></figcaption>${spark({ x: measured.map((version) => version.version), mean: measured.map((version) => version.metrics[metric] ?? null) }, metric)}</figure>` : nothing}
-      <section aria-labelledby="versions"><h2 id="versions">Versions</h2><div class="card table"><table class="versions"><caption class="unseen">Versions of ${it.model}, newest first</caption>
+      <section aria-labelledby="versions"><h2 id="versions">Versions</h2><div class="card table" tabindex="0" role="group" aria-label="Versions"><table class="versions"><caption class="unseen">Versions of ${it.model}, newest first</caption>
         <thead><tr><th scope="col">Version</th><th scope="col">Aliases</th>${keys.map((key, at) => html`<th scope="col" class=${at > 0 ? "num wide" : "num"} title=${plain(key)}>${plain(key)}</th>`)}<th scope="col" class="wide">Run</th><th scope="col" class="wide">Made</th><th scope="col"><span class="unseen">Actions</span></th></tr></thead>
         <tbody>${versions.map((version) => row(shown, keys, version))}</tbody></table></div></section>
       <section aria-labelledby="moves"><h2 id="moves">Moves of its aliases</h2>${history.length === 0 ? html`<p class="card dim">No alias has moved yet.</p>` : html`<ol class="moves">${history.map((move) => {

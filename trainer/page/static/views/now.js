@@ -127,7 +127,7 @@ export function now(context) {
     return html`<li class="card running">
       <div class="row"><h3><a href=${address("runs", run.run)}>${run.run}</a></h3>${badge(runState(run))}<span class="dim grow right">stage ${Math.min(all, done + 1)} of ${all}</span></div>
       ${bar(part, `${run.run}, all stages`)}
-      ${at.length === 0 ? html`<p class="dim">${reason(run) || "Between two stages."}</p>` : nothing}
+      ${at.length === 0 ? html`<p class="dim">${prose(reason(run) || "Between two stages.")}</p>` : nothing}
       ${at.slice(0, 4).map((stage) => {
         const perSecond = rates.of(run, stage);
         const curve = sparks.get(`${run.run}/${stage.name}`);

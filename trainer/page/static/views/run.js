@@ -1,15 +1,19 @@
-//! One run: if it failed why, then its stages, curves, log and products.
+//! One run: if it failed why, then its stages, curves, time line, settings, products and log.
 
 import { blob, CallError, get, post, runPath } from "../api.js";
 import { OTHERWISE, whatToDo } from "../advice.js";
-import { Chart, curves, inOrder, inWords, mainKey } from "../chart.js";
-import { count, duration, grouped, number, plain, short } from "../format.js";
+import { Chart, curves, inOrder, inWords, mainKey, series } from "../chart.js";
+import { ago, count, date, duration, grouped, number, plain, short, time } from "../format.js";
 import { graph, MOST } from "../graph.js";
+import { History, inWords as eventInWords } from "../history.js";
+import { timeLine } from "../lanes.js";
 import { Log, logLine } from "../log.js";
 import { badge, bar, command, fact, failed, firstLine, headline, isDone, isOver, joinCommand, left, mainStages, pace, prose, reached, reason, runState, share, sure } from "../parts.js";
 import { Rates } from "../rates.js";
 import { address } from "../router.js";
-import { controls } from "../session.js";
+import { controls, serverNow } from "../session.js";
+import { inText, inWords as whyInWords, reasons, settingsOf } from "../settings.js";
+import { sweepView } from "../sweep.js";
 import { html, nothing } from "../vendor/lit-html.js";
 
 /** Lines of the log around a failure. */
@@ -26,6 +30,15 @@ export function run(context, name) {
   let beats = 0;
   const rates = new Rates();
   const log = new Log(name, null, context.draw);
+  const history = new History({ run: name });
+  /** @type {RunSettings | null} */
+  let settings = null;
+  /** @type {RunSettings | null} Of the last run of the pipeline before it. */
+  let earlier = null;
+  /** Stages whose key was known when the settings were asked for. */
+  let keyed = -1;
+  /** @type {Map<string, import("../settings.js").Why>} */
+  let why = new Map();
   /** @type {Map<string, {chart: Chart, key: string, curve: Curve}>} By stage. */
   const charts = new Map();
   /** @type {LogLine[]} */
@@ -49,9 +62,30 @@ export function run(context, name) {
       aroundOf = `${broken.name}/${broken.key}`;
     }
     if (beats % CURVES_EVERY === 0 && (changed || !isOver(it) || charts.size === 0)) await look(signal);
-    if (!isOver(it) || changed) await log.load(signal);
+    if (!isOver(it) || changed) await Promise.all([log.load(signal), beats % 2 === 0 ? history.load(signal) : undefined]);
+    void compare(it, signal);
     void draw(it, signal);
     beats += 1;
+  }
+
+  /** Fetches the settings, and again once more stages have a key. @param {Run} run @param {AbortSignal} signal */
+  async function compare(run, signal) {
+    const known = run.stages.filter((stage) => stage.key).length;
+    if (known !== keyed) {
+      keyed = known;
+      try {
+        const now = await settingsOf(name, signal);
+        if (now.previous && earlier?.run !== now.previous) earlier = await settingsOf(now.previous, signal);
+        settings = now;
+      } catch (error) {
+        // What else the view shows does not wait for it.
+        keyed = -1;
+        if (!signal.aborted && !(error instanceof CallError)) throw error;
+        return;
+      }
+      queueMicrotask(context.draw);
+    }
+    if (settings) why = reasons(run, settings, earlier);
   }
 
   /** @param {AbortSignal} signal */
@@ -60,11 +94,12 @@ export function run(context, name) {
     const wanted = trained.filter((stage) => stage.state !== "waiting" && stage.state !== "skipped").slice(0, MOST_CHARTS);
     for (const stage of wanted) {
       const known = charts.get(stage.name);
-      if (known && isDone(stage) && known.curve.total > 0 && beats > 0 && known.chart.curve?.total === known.curve.total && beats % (CURVES_EVERY * 12) !== 0) continue;
+      if (known && isDone(stage) && known.curve.total > 0 && beats > 0 && known.chart.lines[0]?.curve.total === known.curve.total && beats % (CURVES_EVERY * 12) !== 0) continue;
       const keys = (await curves(name, stage.name, signal)).get(stage.name);
       const key = mainKey(keys);
       const curve = key ? keys?.get(key) : undefined;
-      if (key && curve) charts.set(stage.name, { chart: known?.chart ?? new Chart(key), key, curve });
+      const finer = (/** @type {number} */ from, /** @type {number} */ to) => series({ runs: [name], stage: stage.name, keys: [key ?? ""], from, to }).then((all) => all.map((curve) => ({ label: curve.key, curve })));
+      if (key && curve) charts.set(stage.name, { chart: known?.chart ?? new Chart(190, finer), key, curve });
     }
   }
 
@@ -168,7 +203,7 @@ export function run(context, name) {
     const { total, unit } = stage.progress;
     return html`<tr>
       <td>${badge(stage.state)}</td>
-      <th scope="row"><a href=${address("runs", run.run, stage.name)}>${stage.name}</a><span class="dim kind">${stage.kind}</span></th>
+      <th scope="row"><a href=${address("runs", run.run, stage.name)}>${stage.name}</a><span class="dim kind">${stage.kind}</span>${because(stage)}</th>
       <td class="work">${at ? html`${bar(share(stage.progress), stage.name)}<span class="num small">${pace(stage, perSecond)}</span>` : stage.state === "waiting" ? html`<span class="dim small">reads ${(stage.needs ?? []).join(", ") || "files"}</span>` : stage.message ? html`<span class="small clamp" dir="auto">${prose(firstLine(stage.message))}</span>` : isDone(stage) && total > 1 ? html`<span class="dim small">${grouped(total)} ${unit}</span>` : nothing}</td>
       <td class=${at ? "num" : "num wide"}>${at ? left(stage, perSecond) : ""}</td>
       <td class=${at ? "num wide" : "num"}>${stage.wall_s > 0 ? duration(stage.wall_s) : ""}</td>
@@ -176,9 +211,15 @@ export function run(context, name) {
     </tr>`;
   }
 
+  /** Why a stage was computed, beside the run before. @param {Stage} stage */
+  function because(stage) {
+    const words = plain(whyInWords(why.get(stage.name), stage));
+    return words === "" || !earlier ? nothing : html`<span class="because" dir="auto">${words}</span>`;
+  }
+
   function curvesOf() {
     if (charts.size === 0) return nothing;
-    for (const { chart, curve } of charts.values()) chart.show(curve, logScale, smooth);
+    for (const [stage, { chart, key, curve }] of charts) chart.show([{ label: key, curve }], { log: logScale, smooth, ticks: history.checkpoints(stage) });
     const flip = (/** @type {() => void} */ change) => () => {
       change();
       context.draw();
@@ -196,19 +237,48 @@ export function run(context, name) {
   const order = (stage) => it?.stages.findIndex((other) => other.name === stage) ?? 0;
 
   /** @param {Run} run */
-  function sweeps(run) {
-    return run.sweeps?.length
-      ? html`<section aria-labelledby="sweeps"><h2 id="sweeps">Sweeps</h2>${run.sweeps.map((sweep) => {
-          const paths = [...new Set(sweep.trials.flatMap((trial) => Object.keys(trial.values)))];
-          return html`<div class="card table"><table><caption>${sweep.stage}: ${sweep.search} by ${sweep.metric}, ${sweep.mode === "min" ? "least" : "most"} is best; ${number(sweep.spent)} of ${number(sweep.planned)} steps</caption>
-            <thead><tr><th scope="col">Trial</th><th scope="col">State</th>${paths.map((path) => html`<th scope="col">${path}</th>`)}${sweep.rungs.map((rung) => html`<th scope="col" class="num">after ${number(rung)}</th>`)}</tr></thead>
-            <tbody>${sweep.trials.map((trial) => html`<tr class=${trial.trial === sweep.best ? "best" : ""}><th scope="row">${trial.trial}${trial.trial === sweep.best ? " ★ best" : ""}</th><td>${badge(trial.state === "stopped" ? "skipped" : trial.state, trial.state)}</td>${paths.map((path) => html`<td class="num">${text(trial.values[path])}</td>`)}${sweep.rungs.map((_, at) => html`<td class="num">${at < trial.results.length ? (trial.results[at] === null ? "failed" : number(trial.results[at])) : ""}</td>`)}</tr>`)}</tbody></table></div>`;
-        })}</section>`
-      : nothing;
+  function timeOf(run) {
+    const begun = mainStages(run).filter((stage) => stage.times?.started_ms);
+    if (begun.length === 0) return nothing;
+    const now = serverNow();
+    const lanes = begun.map((stage) => {
+      const from = stage.times?.started_ms ?? now;
+      const to = stage.times?.ended_ms ?? (stage.state === "running" ? now : from);
+      const tone = { running: "run", failed: "bad", ready: "warn" }[stage.state] ?? "good";
+      const marks = history.rows.filter((row) => row.stage === stage.name && ["lost", "regrouped", "retried", "released"].includes(row.kind)).map((row) => ({ at: row.at_ms, sign: "↻", text: eventInWords(row), tone: "warn" }));
+      return { name: stage.name, bars: [{ from, to, text: stage.name, tone, href: address("runs", run.run, stage.name) }], marks };
+    });
+    const from = Math.min(...lanes.map((lane) => lane.bars[0]?.from ?? now));
+    const to = Math.max(...lanes.map((lane) => lane.bars[0]?.to ?? from));
+    const events = [...history.rows].filter((row) => row.kind !== "granted" && row.kind !== "checkpoint").reverse().slice(0, 40);
+    return html`<section aria-labelledby="times"><h2 id="times">Time line</h2><div class="card">${timeLine(lanes, [from, Math.max(to, from + 1)], `${count(lanes.length, "stage")} over ${duration((to - from) / 1000)}`)}
+      ${events.length > 0 ? html`<details class="values"><summary>What happened</summary><ol class="events">${events.map((row) => html`<li><time title=${date(row.at_ms)}>${time(row.at_ms)}</time> ${row.stage ? html`<b>${row.stage}</b> ` : nothing}${row.worker ? html`${row.worker} ` : nothing}<span dir="auto">${plain(eventInWords(row))}</span></li>`)}</ol></details>` : nothing}</div></section>`;
   }
 
-  /** @param {unknown} value */
-  const text = (value) => (typeof value === "number" ? number(value) : value === undefined ? "" : typeof value === "string" ? value : JSON.stringify(value));
+  /** Settings as a difference to the run before. @param {Run} run */
+  function settingsSection(run) {
+    if (!settings) return nothing;
+    const rows = settings.stages.flatMap((stage) => (why.get(stage.stage)?.kind === "changed" ? why.get(stage.stage)?.changes ?? [] : []).map((change) => ({ stage: stage.stage, ...change })));
+    const fresh = settings.stages.filter((stage) => why.get(stage.stage)?.kind === "new").map((stage) => stage.stage);
+    const missing = (earlier?.stages ?? []).filter((stage) => !settings?.stages.some((other) => other.stage === stage.stage)).map((stage) => stage.stage);
+    const previous = earlier;
+    return html`<section aria-labelledby="settings"><div class="row"><h2 id="settings">Settings</h2><span class="grow"></span>${previous ? html`<a class="button" href=${`/compare?run=${encodeURIComponent(run.run)}&run=${encodeURIComponent(previous.run)}`}>Compare with ${previous.run}</a>` : nothing}</div>
+      ${!previous
+        ? html`<p class="card dim">This is the first run of ${run.pipeline} here.</p>`
+        : rows.length === 0 && fresh.length === 0 && missing.length === 0
+          ? html`<p class="card dim">The same settings as <a href=${address("runs", previous.run)}>${previous.run}</a>${previous.seed === settings.seed ? "" : `, with the seed ${settings.seed} instead of ${previous.seed}`}.</p>`
+          : html`${rows.length > 0 ? html`<div class="card table" tabindex="0" role="group" aria-label="Settings that differ"><table><caption>Since <a href=${address("runs", previous.run)}>${previous.run}</a></caption><thead><tr><th scope="col">Stage</th><th scope="col">Setting</th><th scope="col">Before</th><th scope="col">Now</th></tr></thead>
+              <tbody>${rows.map((row) => html`<tr><th scope="row">${row.stage}</th><td><code>${plain(row.path)}</code></td><td class="old">${plain(inText(row.from))}</td><td class="fresh">${plain(inText(row.to))}</td></tr>`)}</tbody></table></div>` : nothing}
+            ${fresh.length > 0 ? html`<p class="dim">New since ${previous.run}: ${fresh.join(", ")}.</p>` : nothing}${missing.length > 0 ? html`<p class="dim">No more here: ${missing.join(", ")}.</p>` : nothing}`}
+      ${settings.source ? html`<details class="values"><summary>The pipeline as it was written</summary><pre class="source" tabindex="0">${plain(settings.source)}</pre></details>` : nothing}</section>`;
+  }
+
+  /** @param {Run} run */
+  function sweeps(run) {
+    return run.sweeps?.length
+      ? html`<section aria-labelledby="sweeps"><h2 id="sweeps">Sweeps</h2>${run.sweeps.map((sweep) => sweepView(run, sweep, context))}</section>`
+      : nothing;
+  }
 
   /** @param {Run} run */
   function products(run) {
@@ -218,6 +288,12 @@ export function run(context, name) {
       ${pictures.size > 0 ? html`<div class="pictures">${[...pictures].map(([title, url]) => html`<figure class="card"><a href=${url} target="_blank" rel="noopener"><img src=${url} alt=${`Drawn by ${title}`} loading="lazy"></a><figcaption class="dim">${title}</figcaption></figure>`)}</div>` : nothing}
       <div class="card table"><table><caption class="unseen">What the stages gave</caption><thead><tr><th scope="col">Stage</th><th scope="col">Output</th><th scope="col">Digest</th></tr></thead>
         <tbody>${made.flatMap((stage) => Object.entries(stage.outputs).map(([output, digest]) => html`<tr><th scope="row"><a href=${address("runs", run.run, stage.name)}>${stage.name}</a></th><td>${output}</td><td><code title=${digest}>${short(digest)}</code></td></tr>`))}</tbody></table></div></section>`;
+  }
+
+  /** Time on the clock, which is more than the work if it waited, and less if stages ran side by side. @param {Run} run */
+  function took(run) {
+    const { started_ms: from, ended_ms: to } = run.times ?? {};
+    return from ? duration(((to ?? serverNow()) - from) / 1000) : "";
   }
 
   function render() {
@@ -232,13 +308,14 @@ export function run(context, name) {
       <div class="row head"><h1 tabindex="-1">${run.run}</h1>${badge(state)}<span class="grow"></span>${buttons(run)}</div>
       ${cause(run)}${waits(run)}
       <div class="card summary">${isOver(run) ? nothing : bar(part, "All stages")}
-        <dl class="facts">${fact("Stages", `${done} of ${all}`)}${fact("Work", seconds > 0 ? duration(seconds) : "")}${fact("Pipeline", run.pipeline)}${fact("Owner", run.owner?.project ? `${run.owner.name} (${run.owner.project})` : (run.owner?.name ?? ""))}${fact("Now", isOver(run) || !reason(run) ? "" : prose(reason(run)))}</dl></div>
+        <dl class="facts">${fact("Stages", `${done} of ${all}`)}${fact("Submitted", run.times?.created_ms ? html`<span title=${date(run.times.created_ms)}>${ago(run.times.created_ms, serverNow())}</span>` : "")}${fact("Took", took(run))}${fact("Work", seconds > 0 ? duration(seconds) : "")}${fact("Pipeline", run.pipeline)}${fact("Owner", run.owner?.project ? `${run.owner.name} (${run.owner.project})` : (run.owner?.name ?? ""))}${fact("Now", isOver(run) || !reason(run) ? "" : prose(reason(run)))}</dl></div>
+      ${sweeps(run)}
       <section aria-labelledby="stages"><h2 id="stages">Stages</h2>
-        ${stages.length > 1 && stages.length <= MOST && stages.some((stage) => stage.needs?.length) ? graph(run, stages) : nothing}
+        ${stages.length > 1 && stages.length <= MOST && stages.some((stage) => stage.needs?.length) ? graph(run, stages, why) : nothing}
         <div class="card table"><table class="stages"><caption class="unseen">${count(stages.length, "stage")} of ${run.run}</caption>
           <thead><tr><th scope="col">State</th><th scope="col">Stage</th><th scope="col">Work</th><th scope="col" class="num wide">Left</th><th scope="col" class="num">Time</th><th scope="col" class="num wide">Result</th></tr></thead>
           <tbody>${stages.map((stage) => row(run, stage))}</tbody></table></div></section>
-      ${sweeps(run)}${curvesOf()}${products(run)}${log.render()}`;
+      ${curvesOf()}${settingsSection(run)}${timeOf(run)}${products(run)}${log.render()}`;
   }
 
   function close() {

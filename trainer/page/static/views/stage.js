@@ -2,12 +2,14 @@
 
 import { get, runPath } from "../api.js";
 import { OTHERWISE, whatToDo } from "../advice.js";
-import { Chart, curves, inOrder, inWords } from "../chart.js";
+import { Chart, curves, inOrder, inWords, series } from "../chart.js";
 import { count, duration, grouped, number, plain, short } from "../format.js";
+import { History } from "../history.js";
 import { Log } from "../log.js";
 import { badge, bar, command, fact, firstLine, isOver, joinCommand, left, pace, prose, share } from "../parts.js";
 import { Rates } from "../rates.js";
 import { address } from "../router.js";
+import { inWords as whyInWords, reasons, settingsOf } from "../settings.js";
 import { html, nothing } from "../vendor/lit-html.js";
 
 const CURVES_EVERY = 4;
@@ -29,6 +31,9 @@ export function stage(context, name, stageName) {
   const charts = new Map();
   let [logScale, smooth, all, words] = [false, true, false, ""];
   let finalSeen = false;
+  /** @type {History | null} */
+  let history = null;
+  let because = "";
 
   const find = () => run?.stages.find((stage) => stage.name === stageName);
 
@@ -43,15 +48,28 @@ export function stage(context, name, stageName) {
       finalSeen = !live;
     }
     if (live) finalSeen = false;
+    if (it && !history) await explain(run, it, signal);
+    else if (live && beats % CURVES_EVERY === 0) await history?.load(signal);
     if (it && (live || beats === 0 || !isOver(run))) await log.load(signal);
     beats += 1;
+  }
+
+  /** Fetches why it was computed, and what happened to it: in an earlier run if the result is from there. @param {Run} run @param {Stage} it @param {AbortSignal} signal */
+  async function explain(run, it, signal) {
+    const settings = await settingsOf(name, signal);
+    const earlier = settings.previous ? await settingsOf(settings.previous, signal) : null;
+    const why = reasons(run, settings, earlier).get(stageName);
+    because = earlier || why?.from ? plain(whyInWords(why, it)) : "";
+    history = new History({ run: why?.from ?? name });
+    await history.load(signal);
   }
 
   /** @param {string} key @param {Curve} curve */
   function chart(key, curve) {
     let shown = charts.get(key);
-    if (!shown) charts.set(key, (shown = new Chart(key, 200)));
-    shown.show(curve, logScale, smooth);
+    const finer = (/** @type {number} */ from, /** @type {number} */ to) => series({ runs: [name], stage: stageName, keys: [key], from, to }).then((all) => all.map((part) => ({ label: key, curve: part })));
+    if (!shown) charts.set(key, (shown = new Chart(200, finer)));
+    shown.show([{ label: key, curve }], { log: logScale, smooth, ticks: history?.checkpoints(stageName) ?? [] });
     const step = Math.max(1, Math.ceil(curve.x.length / ROWS));
     const rows = curve.x.map((x, at) => ({ x, y: curve.mean[at] ?? null })).filter((_, at) => at % step === 0 || at === curve.x.length - 1);
     return html`<figure class="card chart"><figcaption dir="auto">${plain(key)}</figcaption><div role="img" aria-label=${inWords(key, curve)}>${shown.element}</div>
@@ -78,7 +96,7 @@ export function stage(context, name, stageName) {
         <label class="check"><input type="checkbox" .checked=${logScale} @change=${flip(() => (logScale = !logScale))}> log scale</label></div>
       <div class="charts">${shown.map((key) => chart(key, /** @type {Curve} */ (keys.get(key))))}</div>
       ${wanted.length > shown.length ? html`<p class="center"><button type="button" @click=${flip(() => (all = true))}>${count(wanted.length - shown.length, "more curve")}</button></p>` : nothing}
-      <p class="dim small">Drag over a chart to zoom, press twice to see all of it. A red tick is a value that was no number.</p></section>`;
+      <p class="dim small">The band is the least and the most of what one pixel stands for. ${history && history.checkpoints(stageName).length > 0 ? html`<span class="good-text" aria-hidden="true">▲</span> is a checkpoint. ` : nothing}A red tick is a value that was no number. Drag over a chart to zoom, press twice to see all of it.</p></section>`;
   }
 
   /** @param {Stage} it */
@@ -107,6 +125,7 @@ export function stage(context, name, stageName) {
           ${fact("Progress", it.progress.total > 0 ? pace(it, it.state === "running" ? perSecond : undefined) : "")}
           ${fact("Left", it.state === "running" ? left(it, perSecond) : "")}
           ${fact("Time", it.wall_s > 0 ? duration(it.wall_s) : "")}
+          ${fact("Why", because)}
           ${fact("Attempt", it.attempt > 0 ? String(it.attempt) : "")}
           ${fact("Workers", it.workers.join(", "))}
           ${fact("Instruction set", it.instruction_set ?? "")}

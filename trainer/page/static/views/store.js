@@ -70,7 +70,7 @@ export function store(context) {
             <section class="card" aria-labelledby="copy"><h2 id="copy">Backup</h2><p class="dim">A copy of the store while it is in use:</p>${command("registry backup DIR", context)}</section>
           </div>
           <section aria-labelledby="audit"><h2 id="audit">Who did what</h2>
-            ${changes.length === 0 ? html`<p class="card dim">Nothing is written down yet.</p>` : html`<div class="card table"><table><caption class="unseen">The audit log, newest first</caption><thead><tr><th scope="col">When</th><th scope="col">Who</th><th scope="col">What</th><th scope="col" class="wide">Call</th><th scope="col" class="num">Answer</th><th scope="col" class="wide">From</th></tr></thead><tbody>${changes.map(row)}</tbody></table></div>`}</section>`
+            ${changes.length === 0 ? html`<p class="card dim">Nothing is written down yet.</p>` : html`<div class="card table" tabindex="0" role="group" aria-label="The audit log"><table><caption class="unseen">The audit log, newest first</caption><thead><tr><th scope="col">When</th><th scope="col">Who</th><th scope="col">What</th><th scope="col" class="wide">Call</th><th scope="col" class="num">Answer</th><th scope="col" class="wide">From</th></tr></thead><tbody>${changes.map(row)}</tbody></table></div>`}</section>`
         : html`<p class="card dim">Space, soundness and the audit log are for tokens with the scope <code>admin</code>.</p>`}`;
   }
   return { title: "Store", every: 5000, load, render };

@@ -22,16 +22,22 @@ use super::http::{start, token, tokens};
 use crate::shell::{SECRET, TestResult, offer};
 
 /// Runs if it is ever taken for markup, and turns a terminal or a line around.
-const HOSTILE: &str =
+pub(super) const HOSTILE: &str =
     "<img src=x onerror=\"window.hostile=1\"></script><script>window.hostile=1</script>\u{202e}\u{1b}[31m'\"&amp;";
-const PHONE: Window = Window { width: 360, height: 640, mobile: true };
-const DESK: Window = Window { width: 1280, height: 800, mobile: false };
+pub(super) const PHONE: Window = Window { width: 360, height: 640, mobile: true };
+pub(super) const DESK: Window = Window { width: 1280, height: 800, mobile: false };
 
-fn pipeline(name: &str) -> String {
-    format!("name: {name}\nseed: 1\ndataset: {{format: synthetic}}\nstages: {{vae: {{kind: train.vae}}}}\n")
+fn pipeline(name: &str, lr: &str) -> String {
+    format!("name: {name}\nseed: 1\ndataset: {{format: synthetic}}\nstages: {{vae: {{kind: train.vae, lr: {lr}}}}}\n")
 }
 
-async fn call<T: Serialize>(server: &Server, secret: &str, method: Method, path: &str, body: &T) -> TestResult<Value> {
+pub(super) async fn call<T: Serialize>(
+    server: &Server,
+    secret: &str,
+    method: Method,
+    path: &str,
+    body: &T,
+) -> TestResult<Value> {
     let request = server.request(method, path).header(SECRET_HEADER, secret);
     let answer = request.json(body).send().await?;
     let status = answer.status();
@@ -40,8 +46,8 @@ async fn call<T: Serialize>(server: &Server, secret: &str, method: Method, path:
     Ok(serde_json::from_str(&text).unwrap_or_default())
 }
 
-async fn submit(server: &Server, name: &str) -> TestResult<RunId> {
-    let text = pipeline(name);
+pub(super) async fn submit(server: &Server, name: &str, lr: &str) -> TestResult<RunId> {
+    let text = pipeline(name, lr);
     let pipeline = pipeline::read("p.yaml", &text, &[]).map_err(|mistakes| mistakes.to_string())?;
     let submit = Submit { pipeline: serde_json::to_value(pipeline)?, source: text, idempotency_key: None, until: None };
     let answer = call(server, SECRET, Method::POST, "/v1/runs", &submit).await?;
@@ -49,9 +55,9 @@ async fn submit(server: &Server, name: &str) -> TestResult<RunId> {
 }
 
 /// A run that a worker works on until it fails, with hostile texts wherever a worker may put one; and a run that waits.
-async fn fill(handle: &Handle, store: &Store) -> TestResult<[RunId; 2]> {
+pub(super) async fn fill(handle: &Handle, store: &Store) -> TestResult<[RunId; 2]> {
     let server = Server::new(&handle.url(), Some(handle.token().clone()), None)?;
-    let failed = submit(&server, "hostile").await?;
+    let failed = submit(&server, "hostile", "1e-4").await?;
     let join = protocol::message::Join { instruction_set: HOSTILE.into(), ..offer() };
     let joined = call(&server, SECRET, Method::POST, "/v1/workers", &join).await?;
     let joined: Joined = serde_json::from_value(joined)?;
@@ -90,11 +96,11 @@ async fn fill(handle: &Handle, store: &Store) -> TestResult<[RunId; 2]> {
         "command": "promote", "reference": "walks:1", "to": "prod", "expect": null, "require": ["fid <= 1"], "reason": HOSTILE,
     });
     call(&server, SECRET, Method::POST, "/v1/registry", &promote).await?;
-    Ok([failed, submit(&server, "waiting").await?])
+    Ok([failed, submit(&server, "waiting", "1e-4").await?])
 }
 
 /// Nothing of what others wrote became markup or ran, nothing came from elsewhere, and the browser has nothing to complain of.
-fn is_harmless(browser: &mut Browser, url: &str) {
+pub(super) fn is_harmless(browser: &mut Browser, url: &str) {
     assert_eq!(browser.evaluate("window.hostile ?? null"), Value::Null, "a text ran");
     let markup = "document.querySelectorAll('#app script, #app [onerror], #app img[src=x]').length";
     assert_eq!(browser.evaluate(markup), json!(0), "a text became markup");
@@ -108,14 +114,14 @@ fn is_harmless(browser: &mut Browser, url: &str) {
     assert!(complaints.is_empty(), "the browser complains: {complaints:?}");
 }
 
-fn keep(browser: &mut Browser, name: &str) {
+pub(super) fn keep(browser: &mut Browser, name: &str) {
     if let Some(folder) = std::env::var_os("STRIDE_SCREENSHOTS") {
         std::fs::write(std::path::Path::new(&folder).join(name), browser.screenshot()).unwrap();
     }
 }
 
 /// Waits for a view, and looks whether it fits the window and can be read without eyes.
-fn look(browser: &mut Browser, name: &str, window: Window) {
+pub(super) fn look(browser: &mut Browser, name: &str, window: Window) {
     browser.until("document.querySelector('main h1') && !document.querySelector('.skeleton')");
     let wide =
         browser.evaluate("Math.max(document.documentElement.scrollWidth, document.querySelector('main').scrollWidth)");
@@ -130,6 +136,8 @@ fn look(browser: &mut Browser, name: &str, window: Window) {
             "{name}: {what}"
         );
     }
+    let wrong = browser.inaccessible();
+    assert!(wrong.is_empty(), "{name}, {} wide: {wrong:#?}", window.width);
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -138,6 +146,9 @@ async fn a_browser_shows_hostile_texts_as_texts_and_every_view_on_a_phone() -> T
         fixtures::skip(browser::MISSING);
         return Ok(());
     };
+    if browser::axe().is_none() {
+        fixtures::skip(browser::AXE_MISSING);
+    }
     let dir = tempfile::tempdir()?;
     let store_dir = dir.path().join("store");
     let config = Config { tokens: tokens(), alone: false, park: false, ..Config::embedded() };

@@ -1,5 +1,6 @@
 //! The page: its files, sessions of browsers, and what a browser shows of runs whose every text is hostile.
 
+mod beside;
 mod files;
 mod http;
 mod in_browser;
