@@ -231,13 +231,13 @@ pub(crate) mod tests {
         open(&good).unwrap().holds(&spec(&[2]), "").unwrap();
         assert_eq!(open(&good).unwrap().holds(&spec(&[1, 2]), "").unwrap_err(), "no tensor `a` [1, 2]");
         assert!(open(&good).unwrap().holds(&spec(&[2]), "x.").is_err());
-        assert!(open(&good).unwrap().read("a", &mut [0.0; 3]).unwrap_err().contains("no tensor `a` of 3"));
+        assert!(open(&good).unwrap().read("a", &mut [0.0; 3]).unwrap_err().contains("no tensor `a` with 3"));
         let mut long = good.clone();
         long[..8].copy_from_slice(&u64::MAX.to_le_bytes());
         for (bytes, part) in [
-            (long, "its header has"),
+            (long, "declares a header of"),
             (good[..6].to_vec(), "shorter than a header"),
-            (good[..good.len() - 1].to_vec(), "take 4 bytes, and has 3"),
+            (good[..good.len() - 1].to_vec(), "tensors of 4 bytes, but has 3"),
             (file(r#"{"a":{"dtype":"F32","shape":[9],"data_offsets":[0,4]}}"#, &[0; 4]), "expected a safetensors"),
             (
                 file(r#"{"a":{"dtype":"F32","shape":[4611686018427387904,4],"data_offsets":[0,4]}}"#, &[0; 4]),

@@ -382,7 +382,7 @@ mod tests {
         let mut weights = Weights::open(&DataPath::local(folder.path())).unwrap();
         let spec = |name: &str| TensorSpec { name: name.into(), shape: vec![1] };
         let said = weights.take(&DataPath::local(folder.path()), &[spec("b")], "").unwrap_err().to_string();
-        assert!(said.contains("missing: `b` [1] (there as no float"), "{said}");
+        assert!(said.contains("missing: `b` [1] (it is not a float"), "{said}");
         let taken = weights.take(&DataPath::local(folder.path()), &[spec("a")], "x.").unwrap();
         assert_eq!(taken.keys().collect::<Vec<_>>(), ["x.a"]);
         let pieces = packed(&DataPath::local(folder.path()), &taken).unwrap().concat();
