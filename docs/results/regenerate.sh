@@ -1,20 +1,18 @@
 #!/usr/bin/env bash
 # Runs a pipeline and writes its results: NAME.json, as `trainer run -o json` prints it, and NAME.md, the template NAME.in.md filled from it and
-# from the pipeline. The text also replaces README's section of that name, if there is one.
+# from the pipeline. The book includes the text.
 #
 #   docs/results/regenerate.sh docs/results/mini.yaml --set dataset.path=PATH/TO/humanml3d-mini
 #
 # Arguments after the pipeline are those of `trainer run`. Results in the store are not computed again: a second run only writes the text.
-# TRAINER and TABLES name existing binaries; README names another file than this repository's.
+# TRAINER and TABLES name existing binaries.
 set -euo pipefail
 
 [ $# -ge 1 ] && [ -f "$1" ] || { echo "usage: $0 PIPELINE.yaml [options of trainer run]" >&2; exit 2; }
 pipeline=$(realpath "$1")
 shift
-name=$(basename "$pipeline" .yaml)
 base=${pipeline%.yaml}
 repository=$(cd "$(dirname "${BASH_SOURCE[0]}")/../.." && pwd)
-readme=${README:-$repository/README.md}
 built() { cargo build --quiet --release --locked --bin "$1" --manifest-path "$repository/Cargo.toml" && echo "$repository/target/release/$1"; }
 trainer=${TRAINER:-$(built trainer)}
 tables=${TABLES:-$(built tables)}
@@ -32,7 +30,5 @@ done
 "$trainer" run "$pipeline" "$@" -o json > "$work/run.json"
 "$tables" "$base.in.md" "$work/run.json" "$work/pipeline.json" "$work/text.md"
 cp "$work/run.json" "$base.json"
-part=()
-if grep -q "^<!-- $name: from here -->$" "$readme" 2> /dev/null; then part=("$readme" "$name"); fi
-"$tables" "$base.in.md" "$base.json" "$work/pipeline.json" "$base.md" "${part[@]}"
-echo "$base.json, $base.md${part:+, ${part[0]}}"
+mv "$work/text.md" "$base.md"
+echo "$base.json, $base.md"

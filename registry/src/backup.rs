@@ -100,7 +100,7 @@ impl Manifest {
         if manifest.format != FORMAT {
             let found = manifest.format;
             return Err(BackupError::Folder(format!(
-                "`{}` has format {found}, this build reads {FORMAT}",
+                "`{}` has format {found}; this build reads {FORMAT}",
                 path.display()
             )));
         }

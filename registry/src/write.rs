@@ -228,7 +228,7 @@ impl Write {
 /// Message about two different checkpoints of one step.
 pub fn two_states(task: &TaskId, step: u64, stored: &str, now: &str) -> String {
     format!(
-        "task `{task}` has checkpoint {stored} at step {step}, but this attempt made {now}: the same step was computed twice \
-         with different results, which is a bug"
+        "task `{task}` has checkpoint {stored} at step {step}, but this attempt made {now}: two computations of the \
+         same step differ, which is a bug"
     )
 }

@@ -97,7 +97,7 @@ fn p5_a_kill_on_another_backend_changes_no_byte() {
     wait_within(patience(), "the worker to die", || (!cluster.alive("w1")).then_some(()));
     cluster.join_by("w2", &[], &["--backend", &other()]);
     let view = cluster.wait_end_within(patience(), &id);
-    assert!(cluster.said("w2").contains("goes on from the checkpoint after step 3"), "{}", cluster.said("w2"));
+    assert!(cluster.said("w2").contains("continues from the checkpoint after step 3"), "{}", cluster.said("w2"));
     let tuned = !["flex", "ndarray"].contains(&other().as_str());
     if tuned {
         let off = off("vae", (&cluster, &id), (&undisturbed, &run_undisturbed));

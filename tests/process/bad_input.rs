@@ -55,7 +55,11 @@ fn what_is_no_pipeline_is_named_with_what_was_meant() {
     fs::create_dir(at("some")).expect("a folder");
     fs::copy(Bench::config("smoke.yaml"), at("some/smoke.yaml")).expect("copied");
     assert!(Command::new("mkfifo").arg(at("pipe")).status().expect("mkfifo runs").success());
-    refused(&bench, &["run", "empty"], &["`empty`: it is a folder; expected a file", "hint: name a pipeline's file"]);
+    refused(
+        &bench,
+        &["run", "empty"],
+        &["`empty`: it is a folder; expected a file", "hint: the folder has no pipelines; name a pipeline file"],
+    );
     refused(&bench, &["run", "some"], &["hint: name one of its pipelines: some/smoke.yaml"]);
     refused(&bench, &["run", "some/smok.yaml"], &["there is no such file", "did you mean `some/smoke.yaml`?"]);
     refused(&bench, &["run", "pipe"], &["`pipe`: it is a named pipe; expected a file"]);
@@ -98,7 +102,7 @@ fn a_command_line_that_is_probably_not_meant_is_refused_with_what_to_write() {
 fn exit_codes_have_one_meaning_each() {
     let bench = Bench::new(TRAINER);
     let help = bench.run(&["--help"]).expect_code(0).stdout;
-    for line in ["  3  a fault of this program", "  7  there is no such run, stage or model", "130  interrupted"] {
+    for line in ["  3  a bug in this program", "  7  there is no such run, stage or model", "130  interrupted"] {
         assert!(help.contains(line), "`{line}` is missing in:\n{help}");
     }
     let config = Bench::config("smoke.yaml");
@@ -133,8 +137,12 @@ stages:
 ";
     let path = bench.path().join("p.yaml");
     for (from, to, parts) in [
-        ("masked, tokenizer: tokenizer", "masked, tokenizer: other", ["p.yaml:8:", "another codebook"]),
-        ("train.discord, tokenizer: tokenizer", "train.discord, tokenizer: other", ["p.yaml:10:", "another codebook"]),
+        ("masked, tokenizer: tokenizer", "masked, tokenizer: other", ["p.yaml:8:", "their own tokenizer"]),
+        (
+            "train.discord, tokenizer: tokenizer",
+            "train.discord, tokenizer: other",
+            ["p.yaml:10:", "their own tokenizer"],
+        ),
         (
             "kind: train.discord, tokenizer: tokenizer",
             "kind: train.discord, dataset: kit, tokenizer: tokenizer",

@@ -3,7 +3,7 @@
 use std::fs;
 
 use cluster_tests::bucket::{Bucket, NAME};
-use cluster_tests::documented::{shell_lines, words};
+use cluster_tests::documented::{run_by, words};
 use cluster_tests::{Bench, Running, Said, digests, states, wait_for};
 
 const TRAINER: &str = env!("CARGO_BIN_EXE_trainer");
@@ -95,8 +95,7 @@ fn the_commands_that_are_documented() {
     let bucket = Bucket::start();
     let bench = user(&bucket);
     let smoke = format!("{} --until vae", Bench::config("smoke.yaml"));
-    let lines =
-        shell_lines(&Bench::repository().join("ops/README.md"), Some("<!-- run by tests/process/buckets.rs -->"));
+    let lines = run_by(&Bench::repository(), "tests/process/buckets.rs");
     let mut ran = 0;
     for line in lines {
         if let Some(variables) = line.strip_prefix("export ") {

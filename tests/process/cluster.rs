@@ -83,8 +83,8 @@ fn coordinator_away(down: Duration) {
         let stage = cluster.stage(&run, "vae");
         let over = stage["state"] != "running";
         // Until a worker has polled, the progress is that of the newest checkpoint.
-        let polled =
-            down.is_zero() || ["w1", "w2"].iter().all(|name| cluster.said(name).contains("the coordinator is back"));
+        let polled = down.is_zero()
+            || ["w1", "w2"].iter().all(|name| cluster.said(name).contains("the coordinator is reachable again"));
         (over || polled && stage["progress"]["done"].as_u64() > Some(0)).then_some(stage)
     });
     let (was, is) = (before["progress"]["done"].as_u64(), back["progress"]["done"].as_u64());
@@ -293,7 +293,7 @@ fn p2_a_worker_that_slept_past_its_lease_writes_nothing() {
     cluster.signal("a", Signal::SIGCONT);
     wait_for("a to learn that it has lost the stage", || {
         let said = cluster.said("a");
-        (said.contains("dropped:") || said.contains("the outcome came too late")).then_some(())
+        (said.contains("dropped:") || said.contains("the outcome arrived too late")).then_some(())
     });
     assert!(cluster.alive("a"), "it is back and waits for work");
     let view = cluster.wait_end(&run);
@@ -552,7 +552,7 @@ fn a_worker_leaves_in_time_though_the_coordinator_is_gone() {
     cluster.serve();
     cluster.join("w2");
     let view = cluster.wait_end(&run);
-    assert!(cluster.said("w2").contains("goes on from the checkpoint after step"), "{}", cluster.said("w2"));
+    assert!(cluster.said("w2").contains("continues from the checkpoint after step"), "{}", cluster.said("w2"));
     equals_reference(&cluster, &run, &view);
 }
 

@@ -1,4 +1,4 @@
-//! Runs README's cluster and the units of `ops/` unchanged except for a few replacements: our own folder for the
+//! Runs the book's cluster and the units of `ops/` unchanged except for a few replacements: our own folder for the
 //! machine's root, this machine for `coordinator`, a free port, and a smaller pipeline.
 
 use std::collections::BTreeMap;
@@ -7,7 +7,7 @@ use std::net::TcpListener;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
-use cluster_tests::documented::{self, shell_lines, words};
+use cluster_tests::documented::{self, words};
 use cluster_tests::{Bench, PATIENCE, Running, wait_for};
 
 const TRAINER: &str = env!("CARGO_BIN_EXE_trainer");
@@ -34,10 +34,9 @@ fn free_port() -> String {
     listener.local_addr().expect("bound").port().to_string()
 }
 
-/// The commands of README's "More machines", with the replacements of this test.
-fn readme(port: &str) -> Vec<String> {
-    let lines =
-        shell_lines(&Bench::repository().join("README.md"), Some("<!-- run by tests/process/documented.rs -->"));
+/// The commands of the chapter "Clusters", with the replacements of this test.
+fn cluster(port: &str) -> Vec<String> {
+    let lines = documented::run_by(&Bench::repository(), "tests/process/documented.rs");
     let smoke = Bench::config("smoke.yaml");
     let here = |line: String| {
         let line = line.replace("coordinator", "localhost").replace("7700", port);
@@ -67,7 +66,7 @@ fn has_openssl() -> bool {
 }
 
 #[test]
-fn the_cluster_of_the_readme() {
+fn the_cluster_of_the_book() {
     if !has_openssl() {
         return;
     }
@@ -76,7 +75,7 @@ fn the_cluster_of_the_readme() {
     programs(dir);
     let port = free_port();
     let (mut preamble, mut running, mut ran) = (String::new(), Vec::new(), 0);
-    for line in readme(&port) {
+    for line in cluster(&port) {
         ran += 1;
         println!("$ {line}");
         if line.starts_with("umask") || line.starts_with("export") {
@@ -126,8 +125,8 @@ fn the_units_of_systemd() {
     let bin = programs(dir);
     std::os::unix::fs::symlink(bin, root.join("usr/local/bin")).expect("a link");
     let port = free_port();
-    // Create tokens and certificate as in README, at the paths that the units use.
-    for line in readme(&port).iter().take_while(|line| !line.starts_with("trainer")) {
+    // Create tokens and certificate as in the book, at the paths that the units use.
+    for line in cluster(&port).iter().take_while(|line| !line.starts_with("trainer")) {
         let etc = root.join("etc/stride");
         let mut command = bash(dir, "umask 077", line);
         let said = Running::start({
@@ -312,7 +311,10 @@ fn a_shell_and_a_manual_get_what_they_read() {
 fn a_doctor_says_what_is_missing_and_what_to_do() {
     let bench = Bench::new(TRAINER);
     let said = bench.run(&["doctor"]).expect_code(0).stdout;
-    assert!(said.contains("warn  store    there is none in `.stride`; `trainer run PIPELINE` makes one"), "{said}");
+    assert!(
+        said.contains("warn  store    there is no store in `.stride`; `trainer run PIPELINE` creates one"),
+        "{said}"
+    );
     assert!(said.contains("ok    device   `flex`") && said.contains("  disk  "), "{said}");
     bench.run(&["run", &Bench::config("smoke.yaml"), "--until", "dataset", "--workers", "1"]).expect_code(0);
     let said = bench.run(&["doctor", "-o", "json"]).expect_code(0).json();

@@ -76,7 +76,7 @@ fn a_panic_in_the_coordinator_ends_the_command_and_the_next_goes_on() {
     command.env("STRIDE_COORDINATOR_PANIC", "20");
     let ended = Running::start(command).wait().expect_code(3);
     assert!(ended.stderr.contains("the coordinator has failed"), "{}", ended.stderr);
-    assert!(ended.stderr.contains("goes on from it"), "{}", ended.stderr);
+    assert!(ended.stderr.contains("continues from it"), "{}", ended.stderr);
     // A server's clock alone produces a batch every second.
     let mut command = bench.command(&["serve", "--bind", "127.0.0.1:0"]);
     command.env("STRIDE_COORDINATOR_PANIC", "3");

@@ -97,10 +97,10 @@ fn a_submitter_names_no_file_outside_the_data_roots() {
         (token, "is not below a data root"),
         ("/etc/passwd".into(), "is not below a data root"),
         ("/proc/self/environ".into(), "is not below a data root"),
-        (below("../secret.csv"), "leads out of the data root"),
-        ("../secret.csv".into(), "leads out of the data root"),
-        (below("link.csv"), "leads out of the data root"),
-        (below("process/environ"), "leads out of the data root"),
+        (below("../secret.csv"), "is outside the data root"),
+        ("../secret.csv".into(), "is outside the data root"),
+        (below("link.csv"), "is outside the data root"),
+        (below("process/environ"), "is outside the data root"),
     ] {
         for digests in [vec![], vec![("path", digest(&root.join("b"))), ("captions", Digest::of(b"made up"))]] {
             let said = refused(&cluster, &format!("path: b, captions: {captions}"), &digests);
@@ -108,14 +108,14 @@ fn a_submitter_names_no_file_outside_the_data_roots() {
         }
     }
     let said = refused(&cluster, "path: a", &[]);
-    assert!(said.contains("climbing.bvh: leads out of the data root"), "{said}");
+    assert!(said.contains("climbing.bvh: is outside the data root"), "{said}");
     // Every other setting that may name a file, and an unknown name of a shipped map.
     for setting in ["target", "map"] {
         let said = refused(&cluster, &format!("path: b, {setting}: {secret}.yaml"), &[]);
         assert!(said.contains("is not below a data root"), "{setting}: {said}");
     }
     let said = refused(&cluster, "path: b, map: /etc/passwd", &[]);
-    assert!(said.contains("no joint map `/etc/passwd` ships"), "{said}");
+    assert!(said.contains("no built-in joint map `/etc/passwd`"), "{said}");
     assert_eq!(with_canary(cluster.bench().path()), [PathBuf::from(&secret)], "{}", cluster.everything());
 }
 
@@ -127,7 +127,7 @@ fn no_answer_log_or_artifact_quotes_a_file() {
         (format!("{CANARY},{CANARY}\n"), "captions.csv:1:"),
         (format!("clip,caption\n000000,{CANARY}#\n"), "captions.csv:2:"),
         (format!("clip,caption,from,to\n000000,a,{CANARY},1\n"), "captions.csv:2:"),
-        (format!("{{\"000000\": {{\"{CANARY}\": 1}}}}"), "is no sentence"),
+        (format!("{{\"000000\": {{\"{CANARY}\": 1}}}}"), "is not a string"),
         (format!("[\"{CANARY}"), "at line 1 column"),
     ] {
         fs::write(&captions, text).expect("written");
@@ -155,7 +155,7 @@ fn a_worker_without_a_data_root_opens_no_file() {
     let mut cluster = Cluster::start(TRAINER);
     cluster.join_by("w1", &[], &["--data-root", ""]);
     let said = refused(&cluster, "path: /etc", &[]);
-    assert!(said.contains("opens no files") && said.contains("--data-root DIR"), "{said}");
+    assert!(said.contains("has no data root") && said.contains("--data-root DIR"), "{said}");
 }
 
 #[test]
@@ -165,7 +165,7 @@ fn a_digest_is_an_expectation_that_a_worker_verifies() {
     assert_ne!(a, b);
     // Claim the digest of one folder for the other.
     let said = refused(&cluster, "path: b", &[("path", a)]);
-    for part in ["`b` on `", &a.to_string(), &b.to_string(), "a copy that differs on another machine"] {
+    for part in ["`b` on `", &a.to_string(), &b.to_string(), "the copies on the machines differ"] {
         assert!(said.contains(part), "{part}: {said}");
     }
     // The refused run stored nothing under its key.
@@ -188,7 +188,7 @@ fn a_digest_is_an_expectation_that_a_worker_verifies() {
     let swapped = ended(&cluster, &submit(&cluster, "path: a", &[]));
     assert_eq!((swapped["state"].as_str(), output(&swapped)), (Some("cached"), output(&other)), "{swapped:#}");
     let said = refused(&cluster, "path: a, cut: false", &[("path", a)]);
-    assert!(said.contains("a copy that differs"), "{said}");
+    assert!(said.contains("the copies on the machines differ"), "{said}");
 }
 
 #[test]

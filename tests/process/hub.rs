@@ -67,5 +67,5 @@ fn an_encoder_of_the_hub_without_a_network() {
     assert!(refused.stderr.contains("tiny/clip: no `config.json`"), "{}", refused.stderr);
     pipeline(&bench, ", revision: main");
     let refused = bench.run(&["run", "p.yaml"]).expect_code(2);
-    assert!(refused.stderr.contains("`revision` is given, but `path` is the folder"), "{}", refused.stderr);
+    assert!(refused.stderr.contains("`revision` is set, but `path` is the folder"), "{}", refused.stderr);
 }

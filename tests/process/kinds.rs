@@ -142,7 +142,7 @@ fn p5_every_kind_that_trains_is_killed_after_each_of_its_steps() {
     for stage in stages.filter(|stage| trains(stage["kind"].as_str().expect("a kind"))) {
         let name = stage["name"].as_str().expect("a name");
         let went_on = |step: u32| {
-            let words = format!("goes on from the checkpoint after step {step}");
+            let words = format!("continues from the checkpoint after step {step}");
             said.lines().any(|line| line.contains(&words) && line.ends_with(&format!("/{name}")))
         };
         assert!(went_on(1) && went_on(2), "{name} was not killed twice");

@@ -1,11 +1,11 @@
-//! README's "Your own mocap" unchanged except for fewer updates, on the folder that it creates: features, a training, a
+//! The chapter "Your mocap" unchanged except for fewer updates, on the folder that it creates: features, a training, a
 //! one-step student, and its motion as GLB.
 
 use std::fs;
 use std::path::Path;
 
 use cluster_tests::Bench;
-use cluster_tests::documented::{shell_lines, words};
+use cluster_tests::documented::{run_by, words};
 
 const TRAINER: &str = env!("CARGO_BIN_EXE_trainer");
 
@@ -20,9 +20,9 @@ const FEWER: [&str; 6] = [
 ];
 
 #[test]
-fn the_recordings_of_the_readme() {
+fn the_recordings_of_the_book() {
     let bench = Bench::new(TRAINER);
-    let lines = shell_lines(&Bench::repository().join("README.md"), Some("<!-- run by tests/process/mocap.rs -->"));
+    let lines = run_by(&Bench::repository(), "tests/process/mocap.rs");
     assert_eq!(lines.len(), 5, "{lines:?}");
     let mut said = Vec::new();
     for line in &lines {

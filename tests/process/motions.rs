@@ -22,7 +22,7 @@ pub(crate) fn are_written(bench: &Bench) {
     let several = ["generate", "a person walks", "--captions", "lines.jsonl", "-n", "2", "--seconds", "2.4"];
     let files = ["-o", "m.bvh", "-o", "m.glb", "-o", "m.html", "-o", "json"];
     let said = bench.run(&[&several[..], &model, &files].concat()).expect_code(0);
-    assert!(said.stderr.contains("has no word of `走路`") && !said.stderr.contains("walks"), "{}", said.stderr);
+    assert!(said.stderr.contains("recognises no word of `走路`") && !said.stderr.contains("walks"), "{}", said.stderr);
     let rows = lines(&said);
     assert_eq!(column(&rows, "frames"), [48, 48, 44, 44, 48, 48], "a file's own length comes first");
     assert_eq!(column(&rows, "seed"), [0, 1, 0, 1, 0, 1]);
@@ -47,7 +47,7 @@ pub(crate) fn are_written(bench: &Bench) {
         bench.run(&["generate", "quantum flapdoodle", "--model", "smoke@staging", "-o", "u.npy", "-o", "json"]);
     let row = unknown.json();
     assert_eq!((&row["known"], &row["unknown_words"]), (&false.into(), &serde_json::json!(["quantum", "flapdoodle"])));
-    for part in ["never saw `quantum`, `flapdoodle`", "nearest known: \""] {
+    for part in ["`quantum`, `flapdoodle` did not occur in the training of", "nearest known: \""] {
         assert!(unknown.stderr.contains(part), "{}", unknown.stderr);
     }
     let partly = bench.run(&["generate", "a flapdoodle", "--stage", "mld", "-o", "u.npy", "-o", "json"]).json();
@@ -94,8 +94,8 @@ pub(crate) fn are_written(bench: &Bench) {
             "3 lengths for 2",
         ),
         (&["generate", "--captions", "none.txt", "--model", "smoke@staging", "-o", "x.npy"], "none.txt"),
-        (&["export", "m.html", "-o", "x.npy"], "an array, .npy, or a recording, .bvh"),
-        (&["export", "lines.jsonl", "-o", "x.npy"], "an array, .npy"),
+        (&["export", "m.html", "-o", "x.npy"], "an array (.npy) or a recording (.bvh)"),
+        (&["export", "lines.jsonl", "-o", "x.npy"], "an array (.npy)"),
         (&["export", "x.bvh", "--joint-map", "nobodys", "-o", "x.npy"], "`nobodys`"),
         (&["gallery", "-o", "g.glb"], "expected .html or .png"),
     ] {

@@ -142,7 +142,7 @@ fn a_plan_says_what_is_missing_and_what_a_run_would_take() {
         }
     }
     let table = bench.run(&["plan", &smoke]).expect_code(0).stdout;
-    assert!(table.contains("of one worker") && table.contains("made-up clips"), "{table}");
+    assert!(table.contains("with one worker") && table.contains("synthetic clips"), "{table}");
 
     // Settings that would otherwise fail hours later.
     let kit = bench.path().join("kit");
@@ -155,10 +155,10 @@ fn a_plan_says_what_is_missing_and_what_a_run_would_take() {
     let folder = format!("dataset={{format: humanml3d, path: {}}}", kit.display());
     for (sets, part) in [
         (vec!["backend=cuda"], "--features cuda"),
-        (vec!["stages.release.metric=fdi"], "gives `fdi`"),
-        (vec!["stages.release.promote.require=[fdi <= 1]"], "asks for `fdi`"),
-        (vec!["stages.mld.checkpoint={every: 4, keep: {best: 1, metric: fdi}}"], "there is: loss, gradient_norm, lr"),
-        (vec![folder.as_str()], "251 features, as `kit` has"),
+        (vec!["stages.release.metric=fdi"], "reports `fdi`"),
+        (vec!["stages.release.promote.require=[fdi <= 1]"], "needs `fdi`"),
+        (vec!["stages.mld.checkpoint={every: 4, keep: {best: 1, metric: fdi}}"], "they record loss, gradient_norm, lr"),
+        (vec![folder.as_str()], "251 features, like `kit`"),
     ] {
         for verb in ["plan", "run"] {
             let mut words = vec![verb, smoke.as_str()];

@@ -1,10 +1,10 @@
-//! Import and export of weights on the command line: README's commands, with a checkpoint of the fixtures in place of
+//! Import and export of weights on the command line: the book's commands, with a checkpoint of the fixtures in place of
 //! the released one.
 
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use cluster_tests::documented::{shell_lines, words};
+use cluster_tests::documented::{run_by, words};
 use cluster_tests::{Bench, digests};
 
 const TRAINER: &str = env!("CARGO_BIN_EXE_trainer");
@@ -42,15 +42,14 @@ fn statistics(dir: &Path) -> String {
 }
 
 #[test]
-fn weights_go_in_and_out_as_the_readme_says() {
+fn weights_go_in_and_out_as_the_book_says() {
     let Some(checkpoint) = checkpoint() else { return };
     let bench = Bench::new(TRAINER);
     let dir = bench.path();
     let file = dir.join("released.yaml");
     fs::write(&file, pipeline(&checkpoint)).expect("a test's own files");
-    let marker = "<!-- run by tests/process/released.rs -->";
     let mut reports = Vec::new();
-    for line in shell_lines(&Bench::repository().join("README.md"), Some(marker)) {
+    for line in run_by(&Bench::repository(), "tests/process/released.rs") {
         println!("$ {line}");
         let line = line.replace("configs/motionlcm-released.yaml", &file.display().to_string());
         let line = line
@@ -79,5 +78,5 @@ fn weights_go_in_and_out_as_the_readme_says() {
     let said = export(&["motionlcm.ckpt", "--layout", "motionlcm"]);
     assert!(said.code == Some(1) && said.stderr.contains("motionlcm.ckpt"), "{}", said.stderr);
     let said = export(&["momask", "--layout", "momask"]).expect_code(2);
-    assert!(said.stderr.contains("cannot hold its parts"), "{}", said.stderr);
+    assert!(said.stderr.contains("does not support the model's parts"), "{}", said.stderr);
 }

@@ -46,7 +46,7 @@ fn an_interrupted_run_says_where_and_the_same_command_continues_it() {
     assert!(status.contains(" of 20,000 steps"), "{status}");
 
     let said = interrupt(&bench, bench.spawn(&command));
-    assert!(said.stderr.contains("goes on at "), "{}", said.stderr);
+    assert!(said.stderr.contains("continues at "), "{}", said.stderr);
     assert_eq!(runs(&bench), first, "it is the same run");
     // The default is the newest run.
     let ended = bench.run(&["cancel"]).expect_code(0).stdout;

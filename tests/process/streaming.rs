@@ -8,7 +8,7 @@ use std::os::unix::fs::PermissionsExt;
 use std::process::Stdio;
 use std::time::Duration;
 
-use cluster_tests::documented::{shell_lines, words};
+use cluster_tests::documented::{run_by, words};
 use cluster_tests::{Bench, Running, Said, wait_for};
 use nix::sys::signal::Signal;
 use serde_json::{Value, json};
@@ -124,7 +124,7 @@ fn follows_a_path(bench: &Bench) {
     let root = Bench::repository();
     fs::create_dir_all(bench.path().join("docs")).expect("a folder");
     std::os::unix::fs::symlink(root.join("docs/examples"), bench.path().join("docs/examples")).expect("a link");
-    let lines = shell_lines(&root.join("README.md"), Some("<!-- run by tests/process/streaming.rs -->"));
+    let lines = run_by(&root, "tests/process/streaming.rs");
     assert!(lines.len() >= 2, "{lines:?}");
     for line in lines {
         let words = words(&line);
@@ -138,7 +138,7 @@ fn follows_a_path(bench: &Bench) {
             command.stdin(fs::File::open(bench.path().join(input)).expect("the example"));
         }
         let said = Running::start(command).wait().expect_code(0);
-        assert!(format!("{}{}", said.stdout, said.stderr).contains("12 positions told"), "{line}: {}", said.stderr);
+        assert!(format!("{}{}", said.stdout, said.stderr).contains("12 target positions"), "{line}: {}", said.stderr);
         if input.is_some() {
             let rows = frames(&said);
             let mut sentences: Vec<&Value> = rows.iter().map(|row| &row["sentence"]).collect();
@@ -159,9 +159,9 @@ fn mistakes(bench: &Bench) {
     };
     for (rows, more, wanted) in [
         ("0,pelvis,0,1,0\n3,pelvis,0,1,2\n", &["--frames", "40"][..], "3.00 s is outside the motion"),
-        ("0,tail,0,1,0\n", &[], "`tail` is no joint of a skeleton of 22 joints"),
+        ("0,tail,0,1,0\n", &[], "`tail` is not a joint of a skeleton with 22 joints"),
         ("0,pelvis,0,1,0\n0.1,pelvis,0,1,1.5\n", &[], "15.0 m/s"),
-        ("0,pelvis,4,1,0\n", &[], "begins at x = 0.00"),
+        ("0,pelvis,4,1,0\n", &[], "starts at x = 0.00"),
     ] {
         path(rows);
         let draw = ["generate", "walks", "--control", "path.csv", "-o", "w.npy"];
@@ -176,17 +176,17 @@ fn mistakes(bench: &Bench) {
     assert!(said.stderr.contains("registry show") && said.stderr.contains("denoiser"), "{}", said.stderr);
     bench.run(&[&base[..], &["--control-part", "motionlcm-control-mini@staging"]].concat()).expect_code(0);
     let said = bench.run(&["generate", "walks", "--control-scale", "2", "-o", "w.npy", "--model", "base@staging"]);
-    assert!(said.expect_code(2).stderr.contains("`--control-scale` says nothing without"));
+    assert!(said.expect_code(2).stderr.contains("`--control-scale` has no effect without"));
     let said = bench.run(&["generate", "walks", "--refine", "1001", "-o", "w.npy", "--model", "base@staging"]);
     assert!(said.expect_code(2).stderr.contains("1001 is not in 0..=1000"));
 
     let told = |waypoints: &str| format!("a person walks\n{{\"caption\": \"w\", \"waypoints\": {waypoints}}}\n");
     for (input, model, wanted) in [
-        (String::new(), &CONTROL[..], "standard input: holds no sentence"),
+        (String::new(), &CONTROL[..], "standard input: has no sentence"),
         (told("[[0, 0, 1]]"), &CONTROL[..], "line 2: waypoints: path[0]"),
-        (told("[[0, 90, 1, 0]]"), &CONTROL[..], "line 2: `pelvis` begins at"),
+        (told("[[0, 90, 1, 0]]"), &CONTROL[..], "line 2: `pelvis` starts at"),
         (told("[[0, 0, 1, 0]]"), &["--model", "base@staging"], "line 2: has waypoints, but the model has no control"),
-        ("walks#soon".to_owned(), &CONTROL[..], "line 1: `soon` is no length"),
+        ("walks#soon".to_owned(), &CONTROL[..], "line 1: `soon` is not a length"),
         ("walks\n".to_owned(), &["--model", "base@staging", "--overlap", "900"][..], ""),
     ] {
         let said = stream(bench, &input, model);
@@ -200,7 +200,7 @@ fn mistakes(bench: &Bench) {
         assert_eq!(frames(&said).is_empty(), !input.starts_with("a person"), "what comes before it is given out");
     }
     let said = stream(bench, "walks\n", &[&CONTROL[..], &["--overlap", "900"]].concat()).expect_code(2);
-    assert!(said.stderr.contains("leaves nothing new"), "{}", said.stderr);
+    assert!(said.stderr.contains("have no new frames"), "{}", said.stderr);
     for arguments in [&["walks"][..], &["--edit", "x.npy", "--keep", ":1"], &["-n", "2"], &["--positions", "x.npy"]] {
         stream(bench, "walks\n", &[&CONTROL, arguments].concat()).expect_code(2);
     }

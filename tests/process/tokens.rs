@@ -120,10 +120,10 @@ fn edits(bench: &Bench) {
             .concat(),
     );
     let said = said.expect_code(0);
-    assert!(said.stdout.contains("8-59 stay; the last 2 of 62 fill no token"), "{}", said.stdout);
+    assert!(said.stdout.contains("8-59 stay; the last 2 of 62 do not fill a token"), "{}", said.stdout);
     for (keep, words) in [
         ("0:9s", "has 62 frames"),
-        (":", "nothing is left to draw"),
+        (":", "nothing is left to generate"),
         ("1:3", "nothing stays"),
         ("now", "expected FROM:TO"),
     ] {

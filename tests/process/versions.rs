@@ -49,7 +49,7 @@ fn p6_a_training_that_begins_with_a_version_is_killed_and_goes_on_with_it() {
     let plan = || undisturbed.run(&["plan", "tuned.yaml", "-o", "json", "--no-time"]).expect_code(0).json();
     assert_eq!(plan()["stages"][3]["action"], "cached", "{}", plan());
     let logs = undisturbed.run(&["logs", "@last"]).expect_code(0).stdout;
-    assert!(logs.contains("begins with") && logs.contains("not used: "), "{logs}");
+    assert!(logs.contains("starts with") && logs.contains("not used: "), "{logs}");
 
     // Both students share one VAE, but each has its own denoiser.
     promote_the_other(&undisturbed);
@@ -80,8 +80,8 @@ fn versions_that_do_not_fit_are_refused_by_plan_and_by_run() {
         ("stages.tuned.init=nobody@prod", "no model `nobody`"),
         ("stages.tuned.init=smoke@nobody", "no `smoke@nobody`"),
         ("stages.tuned.init=smoke@9", "no `smoke:9`"),
-        ("stages.tuned.latents=smoke@staging", "no version of the registry holds latents"),
-        ("stages.tuned.init=a/b@c", "names no model version"),
+        ("stages.tuned.latents=smoke@staging", "versions of the registry do not contain latents"),
+        ("stages.tuned.init=a/b@c", "is not a model version"),
         ("stages.other={kind: train.tokenizer, init: smoke@staging}", "no part of kind `tokenizer`"),
         ("stages.other={kind: train.control, model: tuned, init: smoke@1}", "no part of kind `control`"),
         ("stages.other={kind: register, model: x, from: smoke@1}", "a version of the registry; expected a stage"),

@@ -3,8 +3,27 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-/// The documents with commands for users.
-pub const DOCUMENTS: [&str; 3] = ["README.md", "ops/README.md", "CONTRIBUTING.md"];
+/// The documents with commands for users: three at fixed places, and the chapters of the book.
+///
+/// # Panics
+/// If the book cannot be read.
+pub fn documents(root: &Path) -> Vec<PathBuf> {
+    let fixed = ["README.md", "ops/README.md", "CONTRIBUTING.md"].map(|name| root.join(name));
+    let chapters = crate::book::chapters(root).into_iter().map(|chapter| crate::book::source(root).join(chapter.path));
+    fixed.into_iter().chain(chapters).collect()
+}
+
+/// The command lines that the test in `file` runs: of the block behind `<!-- run by FILE -->` in one of the documents.
+///
+/// # Panics
+/// If no document has the marker, or several have it.
+pub fn run_by(root: &Path, file: &str) -> Vec<String> {
+    let marker = format!("<!-- run by {file} -->");
+    let has = |path: &PathBuf| fs::read_to_string(path).is_ok_and(|text| text.contains(&marker));
+    let found: Vec<PathBuf> = documents(root).into_iter().filter(has).collect();
+    let [document] = &found[..] else { panic!("`{marker}` is expected in one document: {found:?}") };
+    shell_lines(document, Some(&marker))
+}
 
 /// The lines of a document's shell blocks, without comments. With a marker, only those of the block after it.
 pub fn shell_lines(document: &Path, after: Option<&str>) -> Vec<String> {
@@ -102,15 +121,15 @@ pub fn words(line: &str) -> Vec<String> {
 }
 
 /// All command lines of `program` in the documents of the repository at `root`, as words without redirections
-/// (`< FILE`).
+/// (`< FILE`, `> FILE`).
 pub fn commands(root: &Path, program: &str) -> Vec<Vec<String>> {
-    let lines = DOCUMENTS.iter().flat_map(|document| shell_lines(&root.join(document), None));
+    let lines = documents(root).into_iter().flat_map(|document| shell_lines(&document, None));
     let through_cargo = format!("cargo run --release --bin {program} -- ");
     let lines = lines.map(|line| match line.strip_prefix(&through_cargo) {
         Some(rest) => format!("{program} {rest}"),
         None => line,
     });
-    let own = |line: String| words(&line).into_iter().take_while(|word| word != "<").collect::<Vec<_>>();
+    let own = |line: String| words(&line).into_iter().take_while(|word| word != "<" && word != ">").collect::<Vec<_>>();
     lines.map(own).filter(|words| words.first().is_some_and(|first| first == program)).collect()
 }
 

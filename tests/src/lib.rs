@@ -3,6 +3,7 @@
 //! Every test gets its own folder with its own store. This crate never sleeps for a fixed time. It waits for a
 //! condition with a time limit, after which the test fails and prints the trainer's output.
 
+pub mod book;
 pub mod bucket;
 pub mod cluster;
 pub mod disk;

@@ -52,17 +52,6 @@ pub fn render(template: &str, source: &Source) -> Result<String, String> {
     Ok(text)
 }
 
-/// Replaces the part of `text` between the lines `<!-- NAME: from here -->` and `<!-- NAME: to here -->`.
-///
-/// # Errors
-/// If a line is missing.
-pub fn between(text: &str, name: &str, new: &str) -> Result<String, String> {
-    let (from, to) = (format!("<!-- {name}: from here -->\n"), format!("<!-- {name}: to here -->\n"));
-    let (before, rest) = text.split_once(&from).ok_or_else(|| format!("no line `{}`", from.trim()))?;
-    let (_, after) = rest.split_once(&to).ok_or_else(|| format!("no line `{}` behind it", to.trim()))?;
-    Ok(format!("{before}{from}{new}{to}{after}"))
-}
-
 fn fill(place: &str, source: &Source) -> Result<String, String> {
     let mut words: Vec<&str> = place.split_whitespace().collect();
     let decimals = match words.last().and_then(|word| word.strip_prefix(':')) {
@@ -200,14 +189,5 @@ mod tests {
             let refused = filled(place).expect_err(place);
             assert!(refused.contains(part), "{place}: {refused}");
         }
-    }
-
-    #[test]
-    fn what_stands_between_two_lines_is_replaced() {
-        let text = "a\n<!-- x: from here -->\nold\n<!-- x: to here -->\nb\n";
-        let new = between(text, "x", "new\n").expect("both lines");
-        assert_eq!(new, "a\n<!-- x: from here -->\nnew\n<!-- x: to here -->\nb\n");
-        assert_eq!(between(&new, "x", "new\n"), Ok(new.clone()));
-        assert!(between("a\n", "x", "").expect_err("neither").contains("x: from here"));
     }
 }

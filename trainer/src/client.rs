@@ -120,8 +120,8 @@ impl Client {
         let answer = self.send(request).await?;
         answer.json().await.map_err(|error| {
             let problem =
-                Problem::failed(format!("the answer of `{}` does not read: {}", self.server.url(), explain(&error)));
-            problem.hint("use one build for client and server")
+                Problem::failed(format!("cannot parse the answer of `{}`: {}", self.server.url(), explain(&error)));
+            problem.hint("use the same build for client and server")
         })
     }
 

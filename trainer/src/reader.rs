@@ -67,7 +67,7 @@ impl Reader {
         };
         let read = |view: String| {
             serde_json::from_str(&view).map_err(|error| {
-                Problem::failed(format!("what is kept of a run does not read: {error}"))
+                Problem::failed(format!("cannot parse the stored data of a run: {error}"))
                     .hint("use the build that wrote it")
             })
         };
@@ -148,7 +148,7 @@ impl Reader {
         let not_found = |message: String| Problem::new(exit::NOT_FOUND, anyhow::anyhow!("{message}"));
         if text == "@last" {
             return runs.into_iter().next_back().ok_or_else(|| {
-                not_found("there are no runs yet".into()).hint("`trainer run configs/quickstart.yaml` makes one")
+                not_found("there are no runs yet".into()).hint("`trainer run configs/quickstart.yaml` starts one")
             });
         }
         if let Some(exact) = runs.iter().find(|run| run.run.as_str() == text) {
@@ -160,7 +160,7 @@ impl Reader {
             [] => Err(not_found(format!("there is no run `{text}`")).hint("`trainer status --all` lists runs")),
             several => {
                 let names: Vec<&str> = several.iter().map(|run| run.run.as_str()).collect();
-                Err(Problem::usage(format!("`{text}` could be {}", names.join(", "))).hint("give more of the name"))
+                Err(Problem::usage(format!("`{text}` could be {}", names.join(", "))).hint("write more of the name"))
             }
         }
     }

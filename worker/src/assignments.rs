@@ -108,7 +108,7 @@ impl Shared {
                 .iter()
                 .any(|new| new.grant.task == grant.task && new.grant.attempt == grant.attempt);
             if !listed {
-                old.end("the coordinator has taken it back");
+                old.end("the coordinator revoked the grant");
             }
             listed
         });
@@ -121,7 +121,7 @@ impl Shared {
             match held[at].read(assignment) {
                 Reading::Same | Reading::Regrouped => held[at].update(assignment.clone()),
                 Reading::Restart => {
-                    held[at].end("the coordinator has granted it anew");
+                    held[at].end("the coordinator granted the task again");
                     held[at] = self.hold(assignment);
                 }
             }
@@ -171,14 +171,14 @@ async fn join(client: &Client, join: &Join, shared: &Shared) -> Result<Joined, E
                 if said.is_none_or(|said| said.elapsed() > REMIND) {
                     said = Some(Instant::now());
                     let help = match error {
-                        CallError::Away(_) => "; `trainer serve` starts one there, Ctrl-C ends this worker",
+                        CallError::Away(_) => "; `trainer serve` starts a coordinator there; Ctrl-C ends this worker",
                         _ => "",
                     };
                     tracing::warn!("waiting for the coordinator at {}: {error}{help}", client.url());
                 }
             }
             Err(error) => {
-                return Err(End::Refused(format!("the coordinator turned worker `{}` away: {error}", join.worker)));
+                return Err(End::Refused(format!("the coordinator refused worker `{}`: {error}", join.worker)));
             }
         }
         // An idle worker that is leaving does not wait for a coordinator.
@@ -224,13 +224,13 @@ pub(crate) async fn follow(client: &Client, offer: &Join, shared: &Shared) -> En
         match answer {
             Ok(desired) => {
                 if std::mem::take(&mut away) {
-                    tracing::info!("the coordinator is back");
+                    tracing::info!("the coordinator is reachable again");
                 }
                 (version, leave, refusals, pause) = (desired.version, desired.leave, 0, SHORTEST);
                 shared.apply(&desired);
             }
             Err(CallError::NotFound(message)) => {
-                tracing::warn!("the coordinator does not know this process: {message}; joining again");
+                tracing::warn!("the coordinator does not know this worker process: {message}; joining again");
                 joined = match join(client, offer, shared).await {
                     Ok(joined) => joined,
                     Err(end) => return end,
@@ -242,7 +242,7 @@ pub(crate) async fn follow(client: &Client, offer: &Join, shared: &Shared) -> En
             }
             Err(error) if error.may_pass() => {
                 if !std::mem::replace(&mut away, true) {
-                    tracing::warn!("the coordinator takes nothing, work goes on: {error}");
+                    tracing::warn!("cannot reach the coordinator; the stage continues: {error}");
                 }
                 pause = (pause * 2).min(LONGEST);
             }

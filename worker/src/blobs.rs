@@ -101,7 +101,7 @@ impl HttpBlobs {
             }
             if there.staged != end || end == bytes {
                 return Err(CallError::Fault(format!(
-                    "{end} of {bytes} bytes of blob {digest} were sent, and {} have arrived",
+                    "{end} of {bytes} bytes of blob {digest} were sent, but {} bytes arrived",
                     there.staged
                 )));
             }

@@ -229,7 +229,7 @@ impl Cached {
             Self::File(file) => {
                 let length = usize::try_from(file.bytes).unwrap_or(usize::MAX);
                 let mut bytes: Arc<[u8]> = std::iter::repeat_n(0, length).collect();
-                let out = Arc::get_mut(&mut bytes).expect("nobody else has it yet");
+                let out = Arc::get_mut(&mut bytes).expect("the buffer is new and not shared");
                 Self::File(file).read_at(0, out)?;
                 Ok(bytes)
             }

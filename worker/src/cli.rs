@@ -61,7 +61,7 @@ pub struct JoinArgs {
     /// Memory limit of a stage in GiB; a stage above it fails [default: nine tenths of the machine's]
     #[arg(long, env = "STRIDE_STAGE_MEMORY", value_name = "GIB")]
     pub stage_memory: Option<f64>,
-    /// Time limit in minutes of a stage that is no training; a stage above it fails [default: no limit]
+    /// Time limit in minutes of a stage that does not train; a stage above it fails [default: no limit]
     #[arg(long, env = "STRIDE_STAGE_TIME", value_name = "MINUTES")]
     pub stage_time: Option<u64>,
     /// Exit at the latest this many seconds after SIGTERM, even if the state is not saved

@@ -188,7 +188,9 @@ impl Client {
         let response = check(request.send().await).await?;
         match (offset, response.status()) {
             (0, _) | (_, StatusCode::PARTIAL_CONTENT) => Ok(Download(response)),
-            (_, status) => Err(CallError::Refused(format!("a part of blob {digest} was answered with {status}"))),
+            (_, status) => {
+                Err(CallError::Refused(format!("the coordinator answered {status} to a part of blob {digest}")))
+            }
         }
     }
 
@@ -231,8 +233,9 @@ fn header(value: &impl Serialize) -> Result<String, CallError> {
 
 async fn answer<T: DeserializeOwned>(response: Response) -> Result<T, CallError> {
     let bytes = response.bytes().await.map_err(|e| CallError::Away(explain(&e)))?;
-    serde_json::from_slice(&bytes)
-        .map_err(|e| CallError::Refused(format!("the coordinator's answer does not parse: {e}; is it the same build?")))
+    serde_json::from_slice(&bytes).map_err(|e| {
+        CallError::Refused(format!("cannot parse the coordinator's answer: {e}; use the same build for both"))
+    })
 }
 
 async fn check(sent: Result<Response, reqwest::Error>) -> Result<Response, CallError> {

@@ -201,11 +201,11 @@ impl AttemptContext for HttpContext {
     fn manifest(&self, digest: Digest) -> Result<Manifest, ContextError> {
         let bytes = self.blobs.get(digest).map_err(blob_error)?;
         let manifest: Manifest = serde_json::from_slice(&bytes)
-            .map_err(|e| ContextError::Corrupt(format!("{digest} is not a manifest: {e}")))?;
+            .map_err(|e| ContextError::Corrupt(format!("cannot parse the manifest {digest}: {e}")))?;
         if manifest.format != Manifest::FORMAT {
             let (found, known) = (manifest.format, Manifest::FORMAT);
             return Err(ContextError::Corrupt(format!(
-                "manifest {digest} has format {found}, this build reads {known}"
+                "manifest {digest} has format {found}; this build reads {known}"
             )));
         }
         Ok(manifest)
@@ -243,7 +243,7 @@ impl GangContext for HttpContext {
         let Some(digest) = self.held.checkpoint() else { return Ok(None) };
         let manifest = self.manifest(digest)?;
         if manifest.kind != ArtifactKind::Checkpoint {
-            return Err(ContextError::Corrupt(format!("{digest} is a {:?}, expected a checkpoint", manifest.kind)));
+            return Err(ContextError::Corrupt(format!("{digest} is a {:?}; expected a checkpoint", manifest.kind)));
         }
         Ok(Some(manifest))
     }
@@ -258,7 +258,7 @@ impl GangContext for HttpContext {
                 self.mesh = Some(newer);
             }
             let Some(mesh) = self.mesh.clone() else {
-                return Err(ContextError::Unavailable("a rendezvous of a stage that is not a gang's".to_owned()));
+                return Err(ContextError::Unavailable("only the stage of a gang has a rendezvous".to_owned()));
             };
             let held = self.held.clone();
             let generation = mesh.config.generation;
@@ -287,7 +287,7 @@ impl GangContext for HttpContext {
         let directly = applied.is_none();
         match exchange::adopt(&mesh, source, state, directly, &|| held.halt(generation)) {
             Ok(rest) => {
-                let rows = rows(&rest).ok_or_else(|| "is cut short".to_owned());
+                let rows = rows(&rest).ok_or_else(|| "is truncated".to_owned());
                 let taken = rows.and_then(|rows| self.telemetry.take_over(rows, applied).map_err(|e| e.to_string()));
                 // The peer's bytes may already overwrite this member's own state, so this try has failed.
                 taken.map_err(|why| ContextError::Fault(format!("a peer's list of recorded values {why}")))?;
@@ -326,7 +326,8 @@ impl GangContext for HttpContext {
             let part = part.filter(|part| own.first().is_none_or(|(_, first): &(_, &[f32])| first.len() == part.len()));
             let Some(part) = part else {
                 return Err(ContextError::Fault(format!(
-                    "step {step}: slice {slice} of this member's {share:?} is missing or of another length; a fault of the stage"
+                    "step {step}: slice {slice} of this member's {share:?} is missing or has another length; this is a \
+                     bug in the stage"
                 )));
             };
             own.push((slice..slice + 1, part));
@@ -355,7 +356,7 @@ impl GangContext for HttpContext {
 
     fn hold(&mut self) -> Result<(), ContextError> {
         let Some(mesh) = self.mesh.clone() else {
-            return Err(ContextError::Unavailable("a stage that is not a gang's holds no state for others".to_owned()));
+            return Err(ContextError::Unavailable("only the stage of a gang holds state for other members".to_owned()));
         };
         // Store this member's log before rank 0 ends the attempt for all.
         self.flush()?;

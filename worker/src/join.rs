@@ -155,12 +155,14 @@ fn work(options: Options, device: Device, kinds: Arc<dyn Kinds>, timing: Timing)
     let name = options.name.clone().unwrap_or_else(|| WorkerId::new(process::default_name()));
     if !protocol::id::is_name(name.as_str()) {
         return Err(JoinError::Usage(format!(
-            "`{name}` is not a worker name: expected a letter or digit, then letters, digits, `.`, `_` or `-`, at most 64"
+            "`{name}` is not a valid worker name; expected a letter or digit, then letters, digits, `.`, `_` or `-`, \
+             at most 64 characters"
         )));
     }
     if !options.server.is_encrypted() && !options.server.is_local() {
         tracing::warn!(
-            "`{}` has no TLS: its token, the gangs' secrets and all data cross the network readable; so does what peers exchange, to anybody who saw a secret",
+            "`{}` has no TLS: others on the network can read the token, the gangs' secrets and all data, and with a \
+             secret also the exchange between peers",
             options.server.url()
         );
     }
@@ -213,7 +215,7 @@ fn work(options: Options, device: Device, kinds: Arc<dyn Kinds>, timing: Timing)
             // Spares the coordinator the wait for the end of our lease. If this call is lost, the lease simply expires.
             let left = runtime.block_on(async { tokio::time::timeout(FAREWELL, client.leave(&offer.worker)).await });
             if !matches!(left, Ok(Ok(()))) {
-                tracing::debug!("the coordinator did not hear that this worker leaves");
+                tracing::debug!("cannot tell the coordinator that this worker leaves; its lease will expire");
             }
             Ok(())
         }
@@ -226,7 +228,7 @@ fn peer_address(options: &Options) -> Result<(SocketAddr, Option<String>), JoinE
     if let Some(address) = &options.peer_address {
         let port = address.rsplit_once(':').and_then(|(_, port)| port.parse::<u16>().ok());
         let port = port
-            .ok_or_else(|| JoinError::Usage(format!("`{address}` is not an address for peers: expected HOST:PORT")))?;
+            .ok_or_else(|| JoinError::Usage(format!("`{address}` is not an address for peers; expected HOST:PORT")))?;
         return Ok((SocketAddr::from(([0, 0, 0, 0], port)), Some(address.clone())));
     }
     let url = options.server.url();
@@ -243,7 +245,8 @@ fn peer_address(options: &Options) -> Result<(SocketAddr, Option<String>), JoinE
     match local {
         Some(ip) => Ok((SocketAddr::new(ip, 0), None)),
         None => Err(JoinError::Usage(format!(
-            "no route to `{host}`, so no address to give to other workers; check the URL or pass --peer-address HOST:PORT"
+            "there is no route to `{host}`, so the address for other workers is unknown; check the URL, or pass \
+             --peer-address HOST:PORT"
         ))),
     }
 }
@@ -267,13 +270,14 @@ fn watch_signals(shared: Arc<Shared>, owned: bool, leave_within: Duration) -> st
                 }
             }
             if !shared.is_leaving() {
-                tracing::info!("draining: what runs is saved and released");
+                tracing::info!("draining: saving and releasing the running task");
                 shared.leave();
                 // A separate thread, so that nothing that waits on the runtime or for the coordinator delays the exit.
                 thread::spawn(move || {
                     thread::sleep(leave_within);
                     tracing::error!(
-                        "not done {} s after it was asked to leave; ending now: what was acknowledged is stored",
+                        "the worker did not finish within {} s after it was asked to leave; ending now; acknowledged \
+                         work is stored",
                         leave_within.as_secs_f64()
                     );
                     std::process::exit(1);

@@ -41,17 +41,17 @@ pub(crate) struct Preparation {
 /// Reason why a task is not prepared.
 #[derive(Debug, thiserror::Error)]
 enum Stopped {
-    #[error("something else is wanted now")]
+    #[error("the assignment to prepare has changed")]
     News,
     #[error(transparent)]
     Call(#[from] CallError),
-    #[error("it cannot be kept here: {0}")]
+    #[error("cannot store it: {0}")]
     Local(#[from] std::io::Error),
     #[error(transparent)]
     Blob(#[from] BlobError),
     #[error("blob {0} arrived damaged")]
     Damaged(Digest),
-    #[error("{0} is not a manifest: {1}")]
+    #[error("cannot parse the manifest {0}: {1}")]
     Manifest(Digest, serde_json::Error),
     #[error("its member `{0}` does not answer at {1}: {2}")]
     Peer(WorkerId, String, HandshakeError),
@@ -109,7 +109,7 @@ impl Preparation {
                     Ok(all) => self.is_ready(task, all, cache, &news),
                     Err(Stopped::News) => break,
                     Err(error) => {
-                        tracing::debug!(task = %task.task, "it cannot be prepared yet: {error}");
+                        tracing::debug!(task = %task.task, "cannot prepare the task yet: {error}");
                         is_later = true;
                     }
                 }
@@ -135,11 +135,11 @@ impl Preparation {
         let prepared = match known.map_or_else(|| prepare(task, client, cache, news), Ok) {
             // The attempt that reads the blob reports the damage; prefetching cannot.
             Err(Stopped::Call(CallError::Damaged(why))) => {
-                tracing::warn!(task = %task.task, "not all of its inputs can be fetched ahead: {why}");
+                tracing::warn!(task = %task.task, "cannot fetch all inputs ahead: {why}");
                 Ok(Vec::new())
             }
             Err(Stopped::Call(CallError::NotFound(why))) if *missed >= MISSED => {
-                tracing::warn!(task = %task.task, "not all of its inputs can be fetched ahead: {why}");
+                tracing::warn!(task = %task.task, "cannot fetch all inputs ahead: {why}");
                 Ok(Vec::new())
             }
             prepared => prepared,
@@ -154,7 +154,7 @@ impl Preparation {
     }
 
     fn is_ready(&self, task: Prepare, all: Vec<Digest>, cache: &Cache, news: &News) {
-        tracing::info!(task = %task.task, "its inputs are here");
+        tracing::info!(task = %task.task, "its inputs are cached");
         // If the task is no longer wanted, its blobs are merely cached.
         if news.borrow().as_ref().is_some_and(|wanted| wanted.contains(&task)) {
             let mut ready = lock(&self.ready);

@@ -63,7 +63,7 @@ fn until<T>(
         match call(&credential) {
             Ok(done) => {
                 if warned != begun {
-                    tracing::info!("{what}: done after {:.0} s", begun.elapsed().as_secs_f64());
+                    tracing::info!("{what}: succeeded after {:.0} s", begun.elapsed().as_secs_f64());
                 }
                 return Ok(done);
             }

@@ -51,10 +51,10 @@ pub(crate) struct Sandbox {
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum SandboxError {
     /// The system has no Landlock, or one that is too old to close the file system.
-    #[error("--sandbox needs Linux 5.13 or newer with Landlock switched on; start the worker in a container instead")]
+    #[error("--sandbox needs Linux 5.13 or newer with Landlock enabled; start the worker in a container instead")]
     Unsupported,
     /// A folder that the worker needs cannot be opened.
-    #[error("--sandbox: `{path}` cannot be opened: {message}")]
+    #[error("--sandbox: cannot open `{path}`: {message}")]
     Path {
         /// The folder.
         path: String,

@@ -48,8 +48,8 @@ impl StageLimits {
             && used > most
         {
             let message = format!(
-                "is out of memory: it uses {:.2} GiB, expected at most {:.2} GiB; use less data, more `batch.slices` or a \
-                 smaller `network`, or give its worker a larger `--stage-memory`",
+                "is out of memory: it uses {:.2} GiB; expected at most {:.2} GiB; use less data, more `batch.slices` \
+                 or a smaller `network`, or start its worker with a larger `--stage-memory`",
                 gib(used),
                 gib(most)
             );
@@ -59,8 +59,8 @@ impl StageLimits {
         (time > most).then(|| {
             let (time, most) = (time.as_secs(), most.as_secs());
             let message = format!(
-                "is not done after {time} s, expected at most {most} s; use less data or more `shards`, or give its worker a \
-                 longer `--stage-time`"
+                "is not done after {time} s; expected at most {most} s; use less data or more `shards`, or start its \
+                 worker with a larger `--stage-time`"
             );
             (FailureClass::Refused, message)
         })
@@ -107,7 +107,7 @@ fn watch(limits: &StageLimits, held: &ActiveAssignment, client: &Client, ended: 
         }
     }
     if is_running(limits.grace) {
-        tracing::error!("the stage does not stop; ending this process for the memory and the time that it takes");
+        tracing::error!("the stage exceeds a limit and does not stop; ending this process");
         std::process::exit(1);
     }
 }

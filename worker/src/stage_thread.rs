@@ -92,7 +92,7 @@ fn attempt(held: &Arc<ActiveAssignment>, bench: &Bench) {
     failpoints::hit("outcome::after_report");
     match reported {
         Ok(()) => tracing::info!(task = %grant.task, attempt = %grant.attempt, "end: {}", summary(&outcome)),
-        Err(GaveUp::Ended(reason)) => tracing::info!(task = %grant.task, "the outcome came too late: {reason}"),
+        Err(GaveUp::Ended(reason)) => tracing::info!(task = %grant.task, "the outcome arrived too late: {reason}"),
         Err(GaveUp::Answer(error)) => {
             tracing::error!(task = %grant.task, "the outcome was refused: {error}");
             // Without this report, the coordinator would wait for the end as long as this worker lives.
@@ -101,11 +101,11 @@ fn attempt(held: &Arc<ActiveAssignment>, bench: &Bench) {
                 CallError::Refused(_) => FailureClass::Refused,
                 _ => FailureClass::Infrastructure,
             };
-            let message = format!("what it made was refused: {error}");
+            let message = format!("its outputs were refused: {error}");
             if let Err(GaveUp::Answer(error)) =
                 report(held, bench, &TaskOutcome::Failed { class, message }, &BTreeMap::new())
             {
-                tracing::error!(task = %grant.task, "so was the failure: {error}");
+                tracing::error!(task = %grant.task, "the report of the failure was refused, too: {error}");
             }
         }
     }

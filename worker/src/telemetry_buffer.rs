@@ -107,7 +107,7 @@ impl TelemetryBuffer {
             state.dropped += 1;
             if state.dropped.is_power_of_two() {
                 tracing::warn!(
-                    "{} recorded values were dropped: the coordinator has been away for too long",
+                    "{} recorded values were dropped: the coordinator was unreachable for too long",
                     state.dropped
                 );
             }

@@ -113,5 +113,5 @@ impl Blob for Arc<[u8]> {
 
 /// Error of a read past the end of a blob.
 pub fn past_the_end(offset: u64, wanted: usize, bytes: u64) -> BlobError {
-    BlobError::Unavailable(format!("a blob of {bytes} bytes has no {wanted} bytes at {offset}"))
+    BlobError::Unavailable(format!("cannot read {wanted} bytes at {offset}: the blob has {bytes} bytes"))
 }

@@ -27,7 +27,7 @@ pub type Parts = BTreeMap<Role, Digest>;
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum ModelError {
     /// The artifact has another kind.
-    #[error("an artifact of kind {0:?} is not a model")]
+    #[error("the artifact has kind {0:?}; expected a model")]
     NotAModel(ArtifactKind),
     /// The manifest cannot be read.
     #[error("cannot parse the manifest of the {what}: {why}")]
@@ -56,7 +56,7 @@ pub enum ModelError {
         have: Vec<String>,
     },
     /// A part was made for another part than the model's.
-    #[error("the part `{role}` was made for the `{needs}` {wanted}, but the model has {found}")]
+    #[error("the part `{role}` was trained with the `{needs}` {wanted}, but the model has {found}")]
     Unfit {
         /// The part.
         role: Role,
@@ -262,7 +262,7 @@ mod tests {
         let vae = part(ArtifactKind::Vae, json!({"latent": 1}));
         other.insert(Role::VAE, vae.clone());
         let refused = assemble("latent-diffusion", DataFormat::Kit, &other).unwrap_err().to_string();
-        assert!(refused.contains("`denoiser` was made for the `vae`") && refused.contains(&vae.digest().short()));
+        assert!(refused.contains("`denoiser` was trained with the `vae`") && refused.contains(&vae.digest().short()));
         other.remove(&Role::VAE);
         let refused = assemble("latent-diffusion", DataFormat::Kit, &other).unwrap_err().to_string();
         assert!(refused.ends_with("but the model has none"), "{refused}");
@@ -270,7 +270,7 @@ mod tests {
         let manifest = assemble("latent-diffusion", DataFormat::Kit, &parts()).unwrap();
         let length = part(ArtifactKind::Length, json!({"fits": {"text": Digest::of(b"another")}}));
         let refused = extend(&manifest, None, &BTreeMap::from([(Role::LENGTH, length)])).unwrap_err().to_string();
-        assert!(refused.contains("`length` was made for the `text`"), "{refused}");
+        assert!(refused.contains("`length` was trained with the `text`"), "{refused}");
         assert_eq!(Model::read(&vae), Err(ModelError::NotAModel(ArtifactKind::Vae)));
     }
 
@@ -301,6 +301,6 @@ mod tests {
         }
         let meta = json!({"generator": "g", "format": "kit", "parts": {"../x": Digest::of(b"x")}});
         let refused = Model::read(&Manifest::new(ArtifactKind::Model, meta)).unwrap_err().to_string();
-        assert!(refused.contains("not a part's role"), "{refused}");
+        assert!(refused.contains("not a valid role"), "{refused}");
     }
 }

@@ -191,9 +191,9 @@ impl Layout {
         if plan.files.iter().all(|file| file.files.is_empty()) {
             let has: Vec<&str> = places.keys().copied().collect();
             return Err(ExportError::Unfit(format!(
-                "the layout `{}` cannot hold its parts ({}); `safetensors` holds all",
+                "the layout `{}` does not support the model's parts ({}); `safetensors` supports every model",
                 self.name(),
-                if has.is_empty() { "none has weights".to_owned() } else { has.join(", ") }
+                if has.is_empty() { "no layout has weights".to_owned() } else { has.join(", ") }
             )));
         }
         Ok(plan)
@@ -212,7 +212,7 @@ fn places(manifest: &Manifest) -> Result<BTreeMap<&'static str, Vec<String>>, Ex
         ArtifactKind::Vae => Some("vae"),
         ArtifactKind::Tokenizer => Some("tokenizer"),
         ArtifactKind::FlowDecoder => Some("decoder"),
-        other => return Err(ExportError::Unfit(format!("no layout can hold {}", other.noun()))),
+        other => return Err(ExportError::Unfit(format!("no layout supports {}", other.noun()))),
     };
     let mut places = BTreeMap::new();
     for role in ROLES {
@@ -253,7 +253,7 @@ impl Planned {
             let bytes = bytes.get(file).ok_or_else(|| damaged("was not read".into()))?;
             let tensors = SafeTensors::deserialize(bytes).map_err(|e| damaged(e.to_string()))?;
             if let Some((name, view)) = tensors.iter().find(|(_, view)| view.dtype() != Dtype::F32) {
-                return Err(damaged(format!("`{name}` is {:?}, expected F32", view.dtype())));
+                return Err(damaged(format!("`{name}` is {:?}; expected F32", view.dtype())));
             }
             parsed.insert(file, tensors);
         }
@@ -394,7 +394,7 @@ mod tests {
             "{said}"
         );
         let said = Layout::Momask.plan(&manifest).unwrap_err().to_string();
-        assert!(said.contains("`momask` cannot hold its parts (denoiser)"), "{said}");
+        assert!(said.contains("`momask` does not support the model's parts (denoiser)"), "{said}");
         let plan = Layout::Mdm.plan(&manifest).unwrap();
         assert_eq!(written(&plan.files[0], &bytes).unwrap().0, 1);
 

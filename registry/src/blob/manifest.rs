@@ -22,7 +22,7 @@ pub enum ManifestError {
         cause: String,
     },
     /// A newer build wrote the manifest.
-    #[error("manifest {digest} has format {found}, this build reads {expected}; use a newer build", expected = Manifest::FORMAT)]
+    #[error("manifest {digest} has format {found}; this build reads {expected}; use a newer build", expected = Manifest::FORMAT)]
     Format {
         /// The manifest.
         digest: Digest,

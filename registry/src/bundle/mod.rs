@@ -87,7 +87,7 @@ pub enum BundleError {
     #[error("it is not a bundle: {0}")]
     NotABundle(String),
     /// A later build wrote the bundle.
-    #[error("it is a bundle of format {found}, but this build reads {FORMAT}; use a newer build")]
+    #[error("it has bundle format {found}, but this build reads {FORMAT}; use a newer build")]
     Newer {
         /// Format number of the bundle.
         found: u64,

@@ -161,16 +161,16 @@ impl Verb {
         let is_bundle = |path: &PathBuf| path.to_string_lossy().ends_with(SUFFIX);
         match (&self, file) {
             (Self::Export { layout: Some(_), .. }, Some(_)) => {
-                return Err("a bundle holds the whole version; use a layout or a bundle's file, not both".into());
+                return Err("a bundle contains the whole version; use a layout or a bundle file, not both".into());
             }
             (Self::Export { model, dir: None, .. }, Some(file)) => {
                 return Ok(Operation::Bundle { model: model.clone(), file });
             }
             (Self::Export { dir: Some(_), .. }, Some(_)) => {
-                return Err("both a folder and a bundle's file are given; use one of them".into());
+                return Err("a folder and a bundle file are both given; use one of them".into());
             }
             (Self::Export { dir: None, .. }, None) => {
-                return Err(format!("`export` writes to a folder, or with `-o FILE{SUFFIX}` to one file; name one"));
+                return Err(format!("`export` needs a folder, or one file with `-o FILE{SUFFIX}`"));
             }
             (Self::Export { model, dir: Some(file), layout: None }, None) if is_bundle(file) => {
                 return Ok(Operation::Bundle { model: model.clone(), file: file.clone() });

@@ -220,7 +220,7 @@ async fn with(
                     }
                 }
             }
-            None => format!("{busy}, which takes no requests"),
+            None => format!("{busy}, which accepts no requests"),
         };
         if Instant::now() >= until {
             return unreachable_(&problem);

@@ -72,7 +72,7 @@ pub(super) async fn weights(
         }
     }
     if names.is_empty() {
-        let hint = Some("`--layout safetensors` holds every model");
+        let hint = Some("`--layout safetensors` supports every model");
         return Err(error("invalid", format!("`{}` has no weights for `{}`", version.model, layout.name()), hint));
     }
     Ok((names, left_out))

@@ -277,7 +277,7 @@ async fn answer(command: Command, store: &ReadStore, holder: Option<(&Store, &st
                 }
                 (None, Some(before_ms), None) => forget_ended(store, before_ms).await?,
                 (None, None, Some(before_ms)) => forget_leftovers(store, before_ms).await?,
-                _ => return Err(invalid("`forget` needs one run, or one of `ended_before` and `leftovers_before`")),
+                _ => return Err(invalid("`forget` needs one run, `ended_before` or `leftovers_before`")),
             };
             Data::Forgotten { runs }
         }
@@ -302,7 +302,7 @@ async fn promote(store: &Store, actor: &str, order: Move<'_>) -> Result<Promotio
     }
     let Some(pick) = reference.pick else {
         let model = reference.model;
-        return Err(invalid(format!("`{model}` has several versions: say `{model}@best` or `{model}:VERSION`")));
+        return Err(invalid(format!("`{model}` has several versions; write `{model}@best` or `{model}:VERSION`")));
     };
     let Move { expect, require, reason, .. } = order;
     Ok(store.promote(&reference.model, pick, &alias, expect, require, reason, actor).await?)

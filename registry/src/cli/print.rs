@@ -102,7 +102,7 @@ pub fn render(data: &Data) -> String {
 
 fn models_as_table(models: &[versions::Model]) -> String {
     if models.is_empty() {
-        return "no models yet: a `register` stage makes one\n".into();
+        return "no models yet; a `register` stage creates one\n".into();
     }
     let mut table = table(&["MODEL", "VERSIONS", "BEST", "METRIC", "ALIASES"]);
     for model in models {

@@ -60,7 +60,8 @@ impl Leaderboard {
                 }
                 let mut text = format!("{}\n\n* best of ours; ± half the 95 % interval\n", table.trim_fmt());
                 if self.rows.iter().any(|row| row.published) {
-                    text += "[PAPER]: as printed there, full test split and published evaluator; compare only with numbers of the same evaluator\n";
+                    text += "[PAPER]: value from the paper, on the full test split with the published evaluator; \
+                        compare only values of the same evaluator\n";
                 }
                 text
             }
@@ -214,6 +215,6 @@ mod tests {
         );
         assert_eq!(latex.lines().nth(3), Some("Paper [MotionPCM] & - & - & - & - & $0.030$ & - & - & - \\\\"));
         let text = leaderboard().render(Style::Text);
-        assert!(text.contains("0.044 ± 0.003 *") && text.contains("compare only with"), "{text}");
+        assert!(text.contains("0.044 ± 0.003 *") && text.contains("compare only values"), "{text}");
     }
 }

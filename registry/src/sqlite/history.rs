@@ -89,7 +89,7 @@ fn history_row(row: &SqliteRow) -> Result<HistoryRow, QueryError> {
     let name = row.try_get::<&str, _>("kind")?;
     let kind = HistoryKind::ALL.into_iter().find(|kind| kind.name() == name);
     let kind =
-        kind.ok_or_else(|| QueryError::Database(format!("`{name}` is no kind of history that this build knows")))?;
+        kind.ok_or_else(|| QueryError::Database(format!("`{name}` is not a kind of history that this build knows")))?;
     let entry = HistoryEntry {
         kind,
         run: text("run")?.map(RunId::new),

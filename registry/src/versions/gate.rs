@@ -184,10 +184,10 @@ fn find(metrics: &BTreeMap<String, f64>, name: &str) -> Result<f64, String> {
         metrics.iter().filter(|(key, _)| key.strip_suffix(name).is_some_and(|before| before.ends_with('.'))).collect();
     match ends[..] {
         [(_, value)] => Ok(*value),
-        [] if metrics.is_empty() => Err(format!("no metric `{name}`: it has none at all")),
+        [] if metrics.is_empty() => Err(format!("no metric `{name}`; it has no metrics")),
         [] => {
             let meant = question(name, metrics.keys().map(String::as_str));
-            Err(format!("no metric `{name}`{meant}: it has {}", list(metrics.keys())))
+            Err(format!("no metric `{name}`{meant}; it has {}", list(metrics.keys())))
         }
         _ => Err(format!("several metrics `{name}`: name one of {}", list(ends.into_iter().map(|(key, _)| key)))),
     }

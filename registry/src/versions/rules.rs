@@ -50,7 +50,7 @@ pub(crate) fn pick(reference: &ModelRef, model: &Model, versions: &[Version]) ->
     let found = match &reference.pick {
         None => {
             return Err(QueryError::Invalid(format!(
-                "`{name}` has several versions: say `{name}@best`, `{name}@ALIAS` or `{name}:VERSION`"
+                "`{name}` has several versions; write `{name}@best`, `{name}@ALIAS` or `{name}:VERSION`"
             )));
         }
         Some(Pick::Latest) => versions.last(),
@@ -59,14 +59,14 @@ pub(crate) fn pick(reference: &ModelRef, model: &Model, versions: &[Version]) ->
         Some(Pick::Best) => {
             let (Some(metric), Some(_)) = (&model.metric, model.mode) else {
                 return Err(QueryError::NotFound(format!(
-                    "model `{name}` declares no metric, so none of its versions is the best: name one as `{name}:VERSION`, or \
-                     set `metric` and `mode` in the `register` stage"
+                    "model `{name}` has no metric, so it has no best version; use `{name}:VERSION`, or set `metric` \
+                     and `mode` in the `register` stage"
                 )));
             };
             let best = model.best.and_then(|best| versions.iter().find(|v| v.version == best));
             if best.is_none() {
                 return Err(QueryError::NotFound(format!(
-                    "no version of `{name}` has a finite `{metric}`, so none is the best"
+                    "no version of `{name}` has a finite `{metric}`, so there is no best version"
                 )));
             }
             best

@@ -42,16 +42,16 @@ fn what_is_wrong_is_said() {
     let file =
         |all: Vec<named::Named>, what: &str| all.into_iter().find(|(name, _)| *name == what).expect("a named file").1;
     let bvh = |what: &str| Bvh::parse(Path::new("x.bvh"), &file(named::bvh(), what)).expect_err(what).to_string();
-    assert_eq!(bvh("a million channels"), "x.bvh:4: `r` has 1000000 channels, expected at most 6");
+    assert_eq!(bvh("a million channels"), "x.bvh:4: `r` has 1000000 channels; expected at most 6");
     assert!(
-        bvh("joints nested 100,000 deep").ends_with("more than 512 deep; no more are read"),
+        bvh("joints nested 100,000 deep").ends_with("more than 512 levels deep, the largest supported depth"),
         "{}",
         bvh("joints nested 100,000 deep")
     );
     let npy = npy::parse(Path::new("x.npy"), &file(named::npy(), "2^60 numbers"), true).expect_err("huge").to_string();
     assert!(npy.contains("x.npy: 0 bytes of data for shape [1152921504606846976]"), "{npy}");
     let header = WeightsFile::open(Bytes(file(named::safetensors(), "a header of 2^60 bytes"))).expect_err("huge");
-    assert_eq!(header, "says that its header has 1152921504606846976 bytes, of 10; expected a safetensors file");
+    assert_eq!(header, "declares a header of 1152921504606846976 bytes, but has 10 bytes; expected a safetensors file");
     let rules =
         text_models::Rules { repair: false, strip: false, lower: false, first: Some(4), end: 5, pad: 5, most: 6 };
     let tokens =

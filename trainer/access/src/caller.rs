@@ -52,7 +52,8 @@ impl Caller {
             "workers" => self.workers = Some(value.parse()?),
             "project" if protocol::id::is_name(value) => self.project = Some(value.to_owned()),
             "project" => {
-                let expected = "expected a letter or digit, then letters, digits, `.`, `_` or `-`, at most 64";
+                let expected =
+                    "expected a letter or digit, then letters, digits, `.`, `_` or `-`, at most 64 characters";
                 return Err(format!("`{value}` is not a project name: {expected}"));
             }
             "expires" => self.expires = Some(value.parse()?),

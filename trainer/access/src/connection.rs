@@ -85,7 +85,7 @@ impl Server {
             return Err(wrong("unsupported scheme or missing host".to_owned()));
         }
         if !matches!(parsed.path(), "" | "/") || parsed.query().is_some() || !parsed.username().is_empty() {
-            return Err(wrong("it has a path, a query or a user name".to_owned()));
+            return Err(wrong("it must not have a path, a query or a user name".to_owned()));
         }
         let http = reqwest::Client::builder()
             .connect_timeout(Duration::from_secs(5))

@@ -27,7 +27,7 @@ pub fn read_regular(path: &Path, limit: u64) -> io::Result<Vec<u8>> {
     if bytes.len() as u64 > limit {
         return Err(io::Error::new(
             io::ErrorKind::InvalidData,
-            format!("has more than {limit} bytes; is it another file?"),
+            format!("has more than {limit} bytes; check that it is the right file"),
         ));
     }
     Ok(bytes)

@@ -44,8 +44,8 @@ impl Token {
         let text = read_secret(path)?;
         let mut lines = entries(&text);
         let (Some((line, words)), None) = (lines.next(), lines.next()) else {
-            return Err(FileError::new(path, "expected one token, found none or several")
-                .hint("a client's file has a line with its own token and nothing else"));
+            return Err(FileError::new(path, "the file has no token or several; expected one")
+                .hint("the token file of a client has one line with its token"));
         };
         let word = match words.as_slice() {
             [token] | [_, _, token, ..] => token,
@@ -140,7 +140,7 @@ pub(crate) fn read_secret(path: &Path) -> Result<String, FileError> {
     let mut text = String::new();
     file.take(FILE_BYTES + 1).read_to_string(&mut text).map_err(failed)?;
     if text.len() as u64 > FILE_BYTES {
-        return Err(FileError::new(path, "has more than a mebibyte; is it another file?"));
+        return Err(FileError::new(path, "has more than 1 MiB; expected a token file"));
     }
     Ok(text)
 }

@@ -72,7 +72,8 @@ impl Tokens {
                 _ => return Err(wrong(&"expected `NAME SCOPES TOKEN`, such as `alice submit,promote` and a token")),
             };
             if !protocol::id::is_name(&caller.name) {
-                let expected = "expected a letter or digit, then letters, digits, `.`, `_` or `-`, at most 64";
+                let expected =
+                    "expected a letter or digit, then letters, digits, `.`, `_` or `-`, at most 64 characters";
                 return Err(wrong(&format!("`{}` is not a valid name: {expected}", caller.name)));
             }
             let token: Token = token.parse().map_err(|error: TokenError| wrong(&error))?;

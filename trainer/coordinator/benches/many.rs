@@ -16,7 +16,7 @@ use coordinator::{Config, Control, Coordinator, Handle};
 use pipeline::Pipeline;
 use protocol::limits;
 use protocol::message::{
-    DesiredAssignments, Grant, Join, Joined, LogBatch, MetricBatch, MetricRow, PROTOCOL_VERSION, Poll, Submit,
+    Assignment, DesiredAssignments, Join, Joined, LogBatch, MetricBatch, MetricRow, PROTOCOL_VERSION, Poll, Submit,
 };
 use protocol::proof::SECRET_HEADER;
 use protocol::stage::Backend;
@@ -111,6 +111,9 @@ async fn shut(handle: Arc<Handle>) -> Result {
     Ok(())
 }
 
+/// The secret of every worker here.
+const SECRET: &str = "the-secret-of-a-worker-of-this-bench";
+
 /// A persistent connection.
 struct Caller {
     stream: TcpStream,
@@ -124,10 +127,14 @@ impl Caller {
         Ok(Self { stream, token: handle.token().secret().to_owned() })
     }
 
-    /// Sends a call and returns its status and body.
+    /// Sends a call with the secret of the worker and returns its status and body.
     fn call(&mut self, method: &str, path: &str, body: &[u8]) -> Result<(u16, Vec<u8>)> {
+        self.call_with(SECRET, method, path, body)
+    }
+
+    fn call_with(&mut self, secret: &str, method: &str, path: &str, body: &[u8]) -> Result<(u16, Vec<u8>)> {
         let head = format!("authorization: Bearer {}\r\ncontent-type: application/json\r\n", self.token);
-        let head = format!("{head}{SECRET_HEADER}: the-secret-of-a-worker-of-this-bench\r\n");
+        let head = format!("{head}{SECRET_HEADER}: {secret}\r\n");
         let length = body.len();
         let head = format!("{method} {path} HTTP/1.1\r\nhost: localhost\r\n{head}content-length: {length}\r\n\r\n");
         self.stream.write_all(&[head.as_bytes(), body].concat())?;
@@ -152,7 +159,16 @@ impl Caller {
     }
 
     fn post<T: serde::de::DeserializeOwned>(&mut self, path: &str, body: &impl serde::Serialize) -> Result<T> {
-        let (status, answer) = self.call("POST", path, &serde_json::to_vec(body)?)?;
+        self.post_with(SECRET, path, body)
+    }
+
+    fn post_with<T: serde::de::DeserializeOwned>(
+        &mut self,
+        secret: &str,
+        path: &str,
+        body: &impl serde::Serialize,
+    ) -> Result<T> {
+        let (status, answer) = self.call_with(secret, "POST", path, &serde_json::to_vec(body)?)?;
         if status != 200 {
             return Err(format!("{path}: {status} {}", String::from_utf8_lossy(&answer)).into());
         }
@@ -257,9 +273,9 @@ fn heartbeats(handle: &Handle) -> Result {
     let command = |caller: &mut Caller, command: serde_json::Value| {
         caller.post::<serde_json::Value>("/v1/registry", &command).map(drop)
     };
-    let (grant, poll) = recorded(handle)?;
+    let (task, poll) = recorded(handle)?;
     writeln!(out, "| (recorded {CURVES} curves of {STEPS} values; resident {} MB) |", resident_mb()?)?;
-    let run = grant.task.as_str().split('/').next().unwrap_or_default();
+    let run = task.grant.task.as_str().split('/').next().unwrap_or_default();
     let curves = format!("/v1/metrics?run={run}&buckets=500");
     beside(handle, "four curves of a million values, 4 clients", 4, |caller| ask(caller, &curves))?;
     let line = std::sync::atomic::AtomicU64::new(0);
@@ -267,8 +283,8 @@ fn heartbeats(handle: &Handle) -> Result {
         // Keeps the recorder's lease alive.
         caller.post::<DesiredAssignments>("/v1/workers/recorder/poll", &poll)?;
         let first = line.fetch_add(10_000, Ordering::Relaxed);
-        let batch = LogBatch { grant: grant.clone(), first, lines: vec!["x".to_owned(); 10_000] };
-        caller.post::<()>("/v1/logs", &batch)
+        let batch = LogBatch { grant: task.grant.clone(), first, lines: vec!["x".to_owned(); 10_000] };
+        caller.post_with::<()>(&task.secret, "/v1/logs", &batch)
     };
     beside(handle, "log lines of one byte, 2 clients", 2, log)?;
     let lines = format!("/v1/runs/{run}/logs?limit=10000");
@@ -301,8 +317,8 @@ fn heartbeats(handle: &Handle) -> Result {
 const CURVES: usize = 4;
 const STEPS: u64 = 1_000_000;
 
-/// Starts a worker that holds a task and records the curves. Returns its grant and its heartbeat.
-fn recorded(handle: &Handle) -> Result<(Grant, Poll)> {
+/// Starts a worker that holds a task and records the curves. Returns its task and its heartbeat.
+fn recorded(handle: &Handle) -> Result<(Assignment, Poll)> {
     let mut caller = Caller::connect(handle)?;
     let submit = Submit {
         pipeline: serde_json::to_value(pipeline(99)?)?,
@@ -321,21 +337,21 @@ fn recorded(handle: &Handle) -> Result<(Grant, Poll)> {
     };
     let joined: Joined = caller.post("/v1/workers", &join)?;
     let poll = Poll { incarnation: joined.incarnation, doing: vec![], ready: vec![], version: 0 };
-    let grant = loop {
+    let task = loop {
         let desired: DesiredAssignments = caller.post("/v1/workers/recorder/poll", &poll)?;
         if let Some(assignment) = desired.assignments.into_iter().next() {
-            break assignment.grant;
+            break assignment;
         }
     };
     for first in (0..STEPS).step_by(10_000 / CURVES) {
         let rows = (first..first + (10_000 / CURVES) as u64).flat_map(|step| {
             (0..CURVES).map(move |curve| MetricRow { step, key: format!("curve-{curve}"), value: (step as f64).sin() })
         });
-        let batch = MetricBatch { grant: grant.clone(), rows: rows.collect() };
-        caller.post::<()>("/v1/metrics", &batch)?;
+        let batch = MetricBatch { grant: task.grant.clone(), rows: rows.collect() };
+        caller.post_with::<()>(&task.secret, "/v1/metrics", &batch)?;
         caller.post::<DesiredAssignments>("/v1/workers/recorder/poll", &poll)?;
     }
-    Ok((grant, poll))
+    Ok((task, poll))
 }
 
 /// Submits 10,000 runs that wait for a worker of their backend.

@@ -25,6 +25,8 @@ use crate::common::{Result, Worker};
 const SIZES: [u64; 3] = [100, 1_000, 10_000];
 const WORKERS: usize = 64;
 const SHARDS: usize = 10_000;
+/// Stages with so many shards, enough for all rounds.
+const SHARDED: usize = 5;
 const ROUNDS: usize = 5;
 /// Duration of a round of one size.
 const ROUND: Duration = Duration::from_secs(3);
@@ -46,16 +48,20 @@ fn pipeline(seed: u64) -> Pipeline {
             derived: None,
         }
     };
-    let shards = if seed == 0 { SHARDS } else { 4 };
+    let (stages, shards) = if seed == 0 { (SHARDED, SHARDS) } else { (1, 4) };
+    let mut all = vec![
+        stage("dataset", StageSettings::DataSynthetic(DataSynthetic::default())),
+        stage("vae", StageSettings::TrainVae(TrainVae::default())),
+    ];
+    for n in 0..stages {
+        let latents = EncodeLatents { shards, ..Default::default() };
+        all.push(stage(&format!("latents{n}"), StageSettings::EncodeLatents(latents)));
+    }
     Pipeline {
         name: "queued".into(),
         seed: Seed(seed),
         backend: Backend::Flex,
-        stages: vec![
-            stage("dataset", StageSettings::DataSynthetic(DataSynthetic::default())),
-            stage("vae", StageSettings::TrainVae(TrainVae::default())),
-            stage("latents", StageSettings::EncodeLatents(EncodeLatents { shards, ..Default::default() })),
-        ],
+        stages: all,
         code_versions: BTreeMap::new(),
     }
 }
@@ -95,8 +101,11 @@ async fn prepare(runs: u64) -> Result<Size> {
         let output = workers[0].output(&assignment).await?;
         workers[0].finish(assignment, output).await?;
     }
+    workers[0].joins_gangs = false;
     for i in 1..WORKERS {
-        workers.push(Worker::join(address, &token, i).await?);
+        let mut worker = Worker::join(address, &token, i).await?;
+        worker.joins_gangs = false;
+        workers.push(worker);
     }
     let clients: Vec<_> = (0..CLIENTS)
         .map(|client| {

@@ -88,10 +88,10 @@ fn of_worker(before: Option<&Worker>, after: &Worker) -> Option<HistoryEntry> {
     };
     match (before.presence, after.presence) {
         (Presence::Here | Presence::Suspect { .. }, Presence::Silent) => {
-            entry(HistoryKind::Lost, Some("it was not heard for the length of its lease"))
+            entry(HistoryKind::Lost, Some("it was silent until its lease expired"))
         }
         (Presence::Here, Presence::Suspect { .. }) => {
-            entry(HistoryKind::Lost, Some("its peers could not work with it"))
+            entry(HistoryKind::Lost, Some("its peers reported it as unusable"))
         }
         (Presence::Here | Presence::Suspect { .. } | Presence::Silent, Presence::Gone) => {
             entry(HistoryKind::Left, None)

@@ -100,7 +100,7 @@ fn check_format((major, minor): (u32, u32)) -> Result<(), String> {
     if major == FORMAT.0 {
         return Ok(());
     }
-    Err(format!("has format {major}.{minor}, this build reads {}.x; use the build that wrote it", FORMAT.0))
+    Err(format!("has format {major}.{minor}; this build reads {}.x; use the build that wrote it", FORMAT.0))
 }
 
 /// The counters of a state. All other data is in parts.

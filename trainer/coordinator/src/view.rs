@@ -220,8 +220,10 @@ impl State {
             ExecutionState::Open => {
                 let min = execution.placement.workers.min.max(1);
                 let workers = if min == 1 { "worker" } else { "workers" };
-                let set =
-                    execution.bound_to().map(|set| format!(" with {set}, like the earlier ones")).unwrap_or_default();
+                let set = execution
+                    .bound_to()
+                    .map(|set| format!(" with {set}, like the earlier workers"))
+                    .unwrap_or_default();
                 let backend = execution.backend.name();
                 (StageState::Ready, Some(format!("waits for {min} idle `{backend}` {workers}{set}")))
             }

@@ -74,6 +74,8 @@ pub(crate) fn find(settings: &Settings, name: &Name, encoder: Encoder, why: &str
     match get_all(&mut snapshot, encoder) {
         Ok(()) => Ok(Found { folder, commit, note: None }),
         Err(Failure::Said(error)) => Err(error),
-        Err(Failure::Content(what) | Failure::Away(what)) => Err(away(format!("which {what}, {why}"))),
+        Err(Failure::Content(what) | Failure::Away(what)) => {
+            Err(away(format!("the cached copy is incomplete: {what}; {why}")))
+        }
     }
 }

@@ -6,7 +6,7 @@ use std::path::PathBuf;
 #[derive(Debug, thiserror::Error)]
 pub enum HubError {
     /// The encoder is not in the cache, and the hub must not or cannot be reached.
-    #[error("`{name}` is not in the cache {}, {why}", cache.display())]
+    #[error("`{name}` is not in the cache {}; {why}", cache.display())]
     NotHere {
         /// Name as in the pipeline, with its revision.
         name: String,
@@ -16,7 +16,7 @@ pub enum HubError {
         why: String,
     },
     /// The hub refuses the request.
-    #[error("{endpoint} says of `{name}`: {what}")]
+    #[error("{endpoint} refuses `{name}`: {what}")]
     Refused {
         /// Name as in the pipeline, with its revision.
         name: String,
@@ -50,17 +50,17 @@ impl HubError {
             Self::NotHere { name, .. } => {
                 let bare = name.split('@').next().unwrap_or(name);
                 format!(
-                    "where there is a network, `hf download {bare}` or the same command without HF_HUB_OFFLINE fetches it into the cache; or copy the folder here and \
-                     name it as `path`"
+                    "to fetch it into the cache, run `hf download {bare}` or the same command without HF_HUB_OFFLINE \
+                     on a machine with a network; or copy the folder here and set `path` to it"
                 )
             }
             Self::Refused { .. } => {
-                "look at the name and its `revision`; what is private or gated needs HF_TOKEN".into()
+                "check the name and `revision`; a private or gated repository needs HF_TOKEN".into()
             }
             Self::Content { .. } => {
-                "name a repository in the layout of transformers or of sentence-transformers, or a folder".into()
+                "use a repository in the layout of transformers or sentence-transformers, or a folder".into()
             }
-            Self::Io { .. } => "set HF_HOME to a folder that can be written".into(),
+            Self::Io { .. } => "set HF_HOME to a writable folder".into(),
         }
     }
 }

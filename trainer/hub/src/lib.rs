@@ -43,7 +43,7 @@ impl Hub {
     /// If it is missing or incomplete.
     pub fn cached(&self, name: &Name, encoder: Encoder) -> Result<Found, HubError> {
         self.check(name)?;
-        cache::find(&self.settings, name, encoder, "and nothing is fetched now")
+        cache::find(&self.settings, name, encoder, "this command does not fetch")
     }
 
     /// Finds an encoder in the cache, or fetches it. A branch or a tag is resolved on the hub each time, and its
@@ -55,7 +55,7 @@ impl Hub {
     pub fn folder(&self, name: &Name, encoder: Encoder, said: &mut dyn FnMut(&str)) -> Result<Found, HubError> {
         self.check(name)?;
         if self.settings.offline {
-            return cache::find(&self.settings, name, encoder, "and HF_HUB_OFFLINE is set");
+            return cache::find(&self.settings, name, encoder, "HF_HUB_OFFLINE is set");
         }
         if name.is_commit()
             && let Ok(found) = cache::find(&self.settings, name, encoder, "")
@@ -65,14 +65,14 @@ impl Hub {
         match remote::fetch(&self.settings, name, encoder, said) {
             Ok(found) => Ok(found),
             Err(remote::Failure::Away(why)) => {
-                let why = format!("and {} cannot be reached: {why}", self.settings.endpoint);
+                let why = format!("{} cannot be reached: {why}", self.settings.endpoint);
                 let found = cache::find(&self.settings, name, encoder, &why)?;
-                let note = format!("{why}; `{name}` is what it was when it was last fetched, commit {}", found.commit);
+                let note = format!("{why}; using the cached copy of `{name}`, commit {}", found.commit);
                 Ok(Found { note: Some(note), ..found })
             }
             Err(remote::Failure::Said(error)) => Err(error),
             Err(remote::Failure::Content(what)) => {
-                Err(HubError::Content { name: name.to_string(), what: format!("{what}; it is no such encoder") })
+                Err(HubError::Content { name: name.to_string(), what: format!("{what}; it is not such an encoder") })
             }
         }
     }

@@ -125,12 +125,12 @@ impl Remote<'_> {
 
     fn url(&self, parts: &[&str]) -> Result<Url, Failure> {
         let endpoint = &self.settings.endpoint;
-        let wrong = |why: String| Failure::Away(format!("`{endpoint}` is no address ({why})"));
+        let wrong = |why: String| Failure::Away(format!("`{endpoint}` is not a valid address ({why})"));
         let mut url = Url::parse(endpoint).map_err(|e| wrong(e.to_string()))?;
         if !matches!(url.scheme(), "http" | "https") {
             return Err(wrong("expected https".into()));
         }
-        url.path_segments_mut().map_err(|()| wrong("it has no paths".into()))?.pop_if_empty().extend(parts);
+        url.path_segments_mut().map_err(|()| wrong("it cannot have a path".into()))?.pop_if_empty().extend(parts);
         Ok(url)
     }
 
@@ -144,13 +144,12 @@ impl Remote<'_> {
         let answer = request.send().map_err(|e| Failure::Away(chain(&e)))?;
         match answer.status() {
             status if status.is_success() || status.is_redirection() => Ok(answer),
-            StatusCode::UNAUTHORIZED | StatusCode::FORBIDDEN => {
-                Err(self
-                    .refused("no such repository, or one that is private or gated; set HF_TOKEN if it is yours".into()))
-            }
+            StatusCode::UNAUTHORIZED | StatusCode::FORBIDDEN => Err(self.refused(
+                "the repository does not exist, or is private or gated; set HF_TOKEN if you have access".into(),
+            )),
             StatusCode::NOT_FOUND => Err(self.refused("no such repository or revision".into())),
             status if status.is_server_error() || status == StatusCode::TOO_MANY_REQUESTS => {
-                Err(Failure::Away(format!("it answers {status}")))
+                Err(Failure::Away(format!("the server answered {status}")))
             }
             status => Err(self.refused(format!("{status}"))),
         }
@@ -167,7 +166,8 @@ impl Remote<'_> {
         answer.take(LISTING_BYTES + 1).read_to_end(&mut bytes).map_err(|e| Failure::Away(e.to_string()))?;
         let listing: Option<Listing> = serde_json::from_slice(&bytes).ok();
         let listing = listing.filter(|listing| is_commit(&listing.sha) && listing.siblings.len() <= FILES);
-        let listing = listing.ok_or_else(|| self.refused("what is no list of files; is it a hub?".into()))?;
+        let listing = listing
+            .ok_or_else(|| self.refused("the answer is not a list of files; check that the address is a hub".into()))?;
         self.commit = listing.sha;
         self.names = listing.siblings.into_iter().map(|one| one.rfilename).filter(|name| is_sound(name)).collect();
         Ok(())
@@ -207,7 +207,7 @@ impl Remote<'_> {
         let length = answer.content_length();
         if length.is_some_and(|bytes| bytes > limits::WEIGHTS_BYTES) {
             let (bytes, most) = (length.unwrap_or_default(), limits::WEIGHTS_BYTES);
-            return Err(self.refused(format!("`{name}` has {bytes} bytes; at most {most} are fetched")));
+            return Err(self.refused(format!("`{name}` has {bytes} bytes; expected at most {most}")));
         }
         if length.is_some_and(|bytes| bytes >= TOLD_BYTES) {
             (self.said)(&format!("fetching {name} of {} ({} MB)", self.name, length.unwrap_or_default() >> 20));
@@ -217,27 +217,31 @@ impl Remote<'_> {
         let mut kept = tempfile::NamedTempFile::new_in(folder).map_err(io(folder))?;
         let (mut hasher, mut part, mut written) = (Sha256::new(), vec![0; 256 << 10], 0_u64);
         loop {
-            let count = answer.read(&mut part).map_err(|e| Failure::Away(format!("`{name}` was cut: {e}")))?;
+            let count = answer
+                .read(&mut part)
+                .map_err(|e| Failure::Away(format!("the download of `{name}` ended early: {e}")))?;
             if count == 0 {
                 break;
             }
             written += count as u64;
             if written > limits::WEIGHTS_BYTES {
-                return Err(self
-                    .refused(format!("`{name}` has more than {} bytes; no more are fetched", limits::WEIGHTS_BYTES)));
+                return Err(self.refused(format!(
+                    "`{name}` has more than {} bytes, the largest supported size",
+                    limits::WEIGHTS_BYTES
+                )));
             }
             hasher.update(&part[..count]);
             kept.write_all(&part[..count]).map_err(io(blob))?;
         }
         if length.is_some_and(|length| length != written) {
             return Err(Failure::Away(format!(
-                "`{name}` was cut after {written} of {} bytes",
+                "the download of `{name}` ended after {written} of {} bytes",
                 length.unwrap_or_default()
             )));
         }
         let found = protocol::Digest::from_bytes(hasher.finalize().into()).hex();
         if sha256.is_some_and(|expected| expected != found) {
-            return Err(self.refused(format!("`{name}` arrived with another digest than it should have")));
+            return Err(self.refused(format!("the download of `{name}` has the wrong digest")));
         }
         kept.as_file().sync_all().map_err(io(blob))?;
         let kept = kept.persist(blob).map_err(|e| io(blob)(e.error))?;

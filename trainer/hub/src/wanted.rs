@@ -106,7 +106,7 @@ fn modules(repository: &mut dyn Repository, encoder: Encoder) -> Result<Vec<Stri
     if !repository.names().contains("modules.json") {
         return match encoder {
             Encoder::SentenceT5 => {
-                Err(Failure::Content("has no `modules.json`, which sentence-transformers write".into()))
+                Err(Failure::Content("has no `modules.json`, which the layout of sentence-transformers needs".into()))
             }
             Encoder::Clip | Encoder::T5 => Ok(Vec::new()),
         };
@@ -115,7 +115,7 @@ fn modules(repository: &mut dyn Repository, encoder: Encoder) -> Result<Vec<Stri
     let is_below =
         |module: &Module| Path::new(&module.path).components().all(|part| matches!(part, Component::Normal(_)));
     if listed.len() > MODULES || !listed.iter().all(is_below) {
-        return Err(Failure::Content("`modules.json` lists more than folders of its own".into()));
+        return Err(Failure::Content("`modules.json` lists paths outside the repository".into()));
     }
     Ok(listed.into_iter().map(|module| module.path).collect())
 }

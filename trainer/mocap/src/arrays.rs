@@ -51,21 +51,21 @@ pub fn parse(file: &Path, bytes: &[u8]) -> Result<Joints, String> {
         return joints(file, npy::parse(file, bytes, true).map_err(|e| e.to_string())?, None);
     }
     let mut archive = zip::ZipArchive::new(Cursor::new(bytes))
-        .map_err(|e| format!("{shown}: no .npz archive: {}", excerpt(&e.to_string())))?;
+        .map_err(|e| format!("{shown}: not a .npz archive: {}", excerpt(&e.to_string())))?;
     if archive.len() > MEMBERS {
-        return Err(format!("{shown}: {} arrays, at most {MEMBERS} are read", archive.len()));
+        return Err(format!("{shown}: has {} arrays; expected at most {MEMBERS}", archive.len()));
     }
     let names: Vec<String> =
         archive.file_names().flatten().filter_map(|name| name.strip_suffix(".npy").map(str::to_owned)).collect();
     let has = |name: &&&str| names.iter().any(|n| n == **name);
     let Some(key) = KEYS.iter().find(has) else {
         let hint = if ["poses", "trans"].iter().all(|name| has(&name)) {
-            "; these are body parameters: let the body model place the joints and save them as `joints`"
+            "; these are body parameters; compute the joints with the body model and save them as `joints`"
         } else {
             ""
         };
         return Err(format!(
-            "{shown}: has {}, expected joints [T, J, 3] as one of {}{hint}",
+            "{shown}: has {}; expected joints [T, J, 3] as one of {}{hint}",
             excerpts(names.iter().map(String::as_str), 20),
             KEYS.join(", ")
         ));
@@ -84,7 +84,7 @@ fn member(file: &Path, archive: &mut zip::ZipArchive<Cursor<&[u8]>>, key: &str) 
     let mut bytes = vec![];
     member.take(limits::CLIP_BYTES + 1).read_to_end(&mut bytes).map_err(|e| unpack(&e))?;
     if bytes.len() as u64 > limits::CLIP_BYTES {
-        return Err(fail(format!("unpacks to more than {} bytes; no more are read", limits::CLIP_BYTES)));
+        return Err(fail(format!("unpacks to more than {} bytes, the largest supported size", limits::CLIP_BYTES)));
     }
     Ok(bytes)
 }
@@ -102,7 +102,7 @@ fn rate(file: &Path, bytes: &[u8]) -> Result<f64, String> {
     };
     value
         .filter(|rate| (1.0..=10_000.0).contains(rate))
-        .ok_or_else(|| format!("{}: the frame rate is no number from 1 to 10000", file.display()))
+        .ok_or_else(|| format!("{}: the frame rate is not a number from 1 to 10000", file.display()))
 }
 
 fn joints(file: &Path, array: Array, rate: Option<f64>) -> Result<Joints, String> {
@@ -114,7 +114,7 @@ fn joints(file: &Path, array: Array, rate: Option<f64>) -> Result<Joints, String
     if found < 21 || array.data.is_empty() {
         let shown = file.display();
         return Err(format!(
-            "{shown}: shape {:?}, expected [frames, joints, 3] with 21 (KIT-ML) or at least 22 joints",
+            "{shown}: has shape {:?}; expected [frames, joints, 3] with 21 (KIT-ML) or at least 22 joints",
             array.shape
         ));
     }
@@ -178,14 +178,14 @@ mod tests {
         protocol::show_excerpts();
         let said = |members: &[(&str, Vec<u8>)]| read_bytes(&archive(members)).unwrap_err();
         assert!(said(&[("poses", kit.clone()), ("trans", kit.clone())]).contains("body parameters"));
-        assert!(said(&[("x", kit.clone())]).contains("has x, expected joints"));
+        assert!(said(&[("x", kit.clone())]).contains("has x; expected joints"));
         assert!(said(&[("joints", kit.clone()), ("fps", number("<f8", &0_f64.to_le_bytes()))]).contains("frame rate"));
         assert!(said(&[("joints", npy::to_bytes(&[4, 5, 3], &data[..60]).unwrap())]).contains("[4, 5, 3]"));
         assert!(
             said(&[("joints", npy::to_bytes(&[1, 22, 3], &[f32::NAN; 66]).unwrap())]).contains("joint 0 of frame 0")
         );
         let good = archive(&[("joints", kit)]);
-        assert!(read_bytes(&good[..good.len() / 2]).unwrap_err().contains("no .npz archive"));
+        assert!(read_bytes(&good[..good.len() / 2]).unwrap_err().contains("not a .npz archive"));
     }
 
     #[test]

@@ -46,19 +46,19 @@ pub struct Row {
 pub fn sentence(text: &str) -> Result<Caption, String> {
     let text: String = text.split_whitespace().collect::<Vec<_>>().join(" ");
     if text.is_empty() {
-        return Err("an empty caption".into());
+        return Err("the caption is empty".into());
     }
     if text.contains('#') || text.contains(char::is_control) {
         return Err(format!("caption `{}` has a `#` or a control character", excerpt(&text)));
     }
     if text.len() > SENTENCE_BYTES {
-        return Err(format!("a caption of {} bytes, at most {SENTENCE_BYTES} are read", text.len()));
+        return Err(format!("the caption has {} bytes; expected at most {SENTENCE_BYTES}", text.len()));
     }
     let tokens = tokens(&text.to_lowercase());
     let caption = Caption::whole(text, tokens);
     match caption.to_line().len() {
         0..=SENTENCE_BYTES => Ok(caption),
-        bytes => Err(format!("a caption of {bytes} bytes with its tokens, at most {SENTENCE_BYTES} are read")),
+        bytes => Err(format!("the caption has {bytes} bytes with its tokens; expected at most {SENTENCE_BYTES}")),
     }
 }
 
@@ -88,12 +88,14 @@ pub fn of_table(file: &Path, content: &str) -> Result<Vec<Row>, String> {
 
 fn of_csv(content: &str) -> Result<Vec<Row>, String> {
     let mut records = csv_records(content)?.into_iter();
-    let Some((_, names)) = records.next() else { return Err("1: empty, expected a row of names".into()) };
+    let Some((_, names)) = records.next() else {
+        return Err("1: the file is empty; expected a row of column names".into());
+    };
     let column = |wanted: &[&str]| names.iter().position(|name| wanted.contains(&name.trim().to_lowercase().as_str()));
     let (clip, caption, source) = (column(&CLIP), column(&CAPTION), column(&SOURCE));
     let (Some(clip), true) = (clip, caption.is_some() || source.is_some()) else {
         return Err(format!(
-            "1: columns {}; expected one of {} and one of {}",
+            "1: the columns are {}; expected one of {} and one of {}",
             excerpt(&names.join(", ")),
             CLIP.join(", "),
             CAPTION.join(", ")
@@ -104,7 +106,7 @@ fn of_csv(content: &str) -> Result<Vec<Row>, String> {
         .map(|(line, fields)| {
             let fail = |what: String| format!("{line}: {what}");
             if fields.len() != names.len() {
-                return Err(fail(format!("{} fields, expected {}", fields.len(), names.len())));
+                return Err(fail(format!("the row has {} fields; expected {}", fields.len(), names.len())));
             }
             let time = |at: Option<usize>| match at.map(|at| fields[at].trim()) {
                 None | Some("") => Ok(0.0),
@@ -112,7 +114,7 @@ fn of_csv(content: &str) -> Result<Vec<Row>, String> {
                     .parse::<f64>()
                     .ok()
                     .filter(|t| t.is_finite() && *t >= 0.0)
-                    .ok_or_else(|| fail(format!("`{}` is no time in seconds", excerpt(text)))),
+                    .ok_or_else(|| fail(format!("`{}` is not a time in seconds", excerpt(text)))),
             };
             let mut captions = vec![];
             if let Some(at) = caption {
@@ -131,7 +133,7 @@ fn timed(caption: Caption, from_s: f64, to_s: f64) -> Result<Caption, String> {
     if (from_s == 0.0 && to_s == 0.0) || from_s < to_s {
         return Ok(Caption { from_s, to_s, ..caption });
     }
-    Err(format!("a part from {from_s} s to {to_s} s"))
+    Err(format!("the time range is {from_s} s to {to_s} s; expected the smaller time first"))
 }
 
 /// Splits records, each with its first line number. Commas separate fields; fields in quotes may hold commas, line ends
@@ -165,7 +167,7 @@ fn csv_records(content: &str) -> Result<Vec<(usize, Vec<String>)>, String> {
         }
     }
     if quoted {
-        return Err(format!("{began}: a quote is never closed"));
+        return Err(format!("{began}: a quote is not closed"));
     }
     if !(fields.is_empty() && field.trim().is_empty()) {
         fields.push(field);
@@ -178,7 +180,10 @@ fn of_json(content: &str) -> Result<Vec<Row>, String> {
     let value: Value = serde_json::from_str(content).map_err(|e| format!(" {}", json_mistake(&e)))?;
     let sentences = |value: &Value| -> Result<Vec<Caption>, String> {
         let one = |value: &Value| {
-            value.as_str().ok_or_else(|| format!("`{}` is no sentence", excerpt(&value.to_string()))).and_then(sentence)
+            value
+                .as_str()
+                .ok_or_else(|| format!("`{}` is not a string", excerpt(&value.to_string())))
+                .and_then(sentence)
         };
         value.as_array().map_or_else(|| one(value).map(|caption| vec![caption]), |list| list.iter().map(one).collect())
     };
@@ -195,8 +200,9 @@ fn of_json(content: &str) -> Result<Vec<Row>, String> {
                 let get = |names: &[&str]| names.iter().find_map(|name| row.get(name));
                 let number = |names: &[&str]| {
                     get(names).map_or(Ok(0.0), |v| {
-                        v.as_f64()
-                            .ok_or_else(|| format!(" entry {i}: `{}` is no time in seconds", excerpt(&v.to_string())))
+                        v.as_f64().ok_or_else(|| {
+                            format!(" entry {i}: `{}` is not a time in seconds", excerpt(&v.to_string()))
+                        })
                     })
                 };
                 let clip = get(&CLIP).and_then(Value::as_str).ok_or_else(|| format!(" entry {i}: no `clip`"))?;
@@ -291,12 +297,12 @@ mod tests {
         assert_eq!((map.len(), map[1].captions.len()), (2, 2));
         assert!(of_table(file, "source_path,new_name\nx.bvh,000.npy\n").unwrap()[0].captions.is_empty());
         for (content, part) in [
-            ("a,b\n1,2\n", "captions.csv:1: columns a, b; expected one of clip"),
-            ("clip,text\na,b,c\n", "captions.csv:2: 3 fields, expected 2"),
-            ("clip,text\na,\"b\n", "captions.csv:2: a quote is never closed"),
+            ("a,b\n1,2\n", "captions.csv:1: the columns are a, b; expected one of clip"),
+            ("clip,text\na,b,c\n", "captions.csv:2: the row has 3 fields; expected 2"),
+            ("clip,text\na,\"b\n", "captions.csv:2: a quote is not closed"),
             ("clip,text\na,b#c\n", "captions.csv:2: caption `b#c`"),
-            ("clip,text,from,to\na,b,3,1\n", "a part from 3 s to 1 s"),
-            ("{\"a\": 3}", "`a`: `3` is no sentence"),
+            ("clip,text,from,to\na,b,3,1\n", "the time range is 3 s to 1 s"),
+            ("{\"a\": 3}", "`a`: `3` is not a string"),
             ("[{}]", "entry 0: no `clip`"),
             ("[", "EOF"),
         ] {

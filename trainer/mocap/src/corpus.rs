@@ -87,7 +87,7 @@ pub fn joints(file: &DataPath, recipe: &Recipe) -> Result<(Vec<f32>, String, Up)
         (false, DataFormat::Kit) => joints.chunks_exact(66).flat_map(kit_joints).collect(),
         (false, DataFormat::Humanml3d) => {
             return Err(format!(
-                "{}: 21 joints, which are KIT-ML's; expected at least 22, or format kit",
+                "{}: has 21 joints, as in KIT-ML; expected at least 22, or `format: kit`",
                 file.display()
             ));
         }
@@ -108,7 +108,7 @@ fn of_array(file: &DataPath, recipe: &Recipe) -> Result<(Take, usize), String> {
     let seconds = found.data.len() as f64 / (3 * found.joints) as f64 / rate;
     if seconds > MAX_SECONDS {
         return Err(format!(
-            "{}: at {rate} fps it lasts {seconds:.0} s, at most {MAX_SECONDS} s are read",
+            "{}: lasts {seconds:.0} s at {rate} fps; expected at most {MAX_SECONDS} s",
             file.display()
         ));
     }
@@ -357,7 +357,8 @@ fn divide(made: &[Made], division: Division) -> Result<Vec<Option<Split>>, Strin
             let (other, id) = *of.entry(&clip.source).or_insert((split, &clip.id));
             if other != split {
                 return Err(format!(
-                    "`{id}` ({other}) and `{}` ({split}) are of one recording, `{}`; set `splits: source`, or take one of them off the lists",
+                    "`{id}` ({other}) and `{}` ({split}) come from the same recording, `{}`; set `splits: source`, or \
+                     remove one of them from the lists",
                     clip.id, clip.source
                 ));
             }
@@ -422,7 +423,7 @@ pub fn read_target(file: &DataPath, skeleton: &Skeleton) -> Result<Vec<f64>, Str
         [n] if n == joints => array.data.iter().map(|v| f64::from(*v)).collect(),
         _ => {
             return Err(format!(
-                "{}: shape {:?}, expected offsets [{joints}, 3] or lengths [{joints}]",
+                "{}: has shape {:?}; expected offsets [{joints}, 3] or lengths [{joints}]",
                 file.display(),
                 array.shape
             ));
@@ -431,7 +432,7 @@ pub fn read_target(file: &DataPath, skeleton: &Skeleton) -> Result<Vec<f64>, Str
     match (1..joints).find(|j| !(lengths[*j].is_finite() && lengths[*j] > 0.0)) {
         None => Ok(lengths),
         Some(j) => Err(format!(
-            "{}: the bone to `{}` has the length {}, expected a positive number",
+            "{}: the bone to `{}` has length {}; expected a positive number",
             file.display(),
             skeleton.names[j],
             lengths[j]

@@ -86,12 +86,12 @@ impl Form {
 pub enum ExportError {
     /// The extension of the name is unknown.
     #[error(
-        "cannot write `{}`: expected a name that ends in .bvh, .glb, .gif, .png, .html, .npy or .mp4",
+        "cannot write `{}`: expected a file name that ends in .bvh, .glb, .gif, .png, .html, .npy or .mp4",
         .0.display()
     )]
     Ending(PathBuf),
     /// A form of one motion with several or none, or a sheet with too many.
-    #[error("cannot write `{}`: {count} motions, expected {expected}", file.display())]
+    #[error("cannot write `{}`: there are {count} motions; expected {expected}", file.display())]
     Count {
         file: PathBuf,
         /// Number of motions given.
@@ -112,7 +112,7 @@ pub enum ExportError {
     #[error("cannot write `{}`: {source}", file.display())]
     Page { file: PathBuf, source: PageError },
     /// No video encoder was found.
-    #[error("cannot write `{}`: there is no program `{program}` on this machine; install it, or write a .gif", file.display())]
+    #[error("cannot write `{}`: the program `{program}` is not installed; install it, or write a .gif", file.display())]
     NoEncoder {
         file: PathBuf,
         /// Name of the program.
@@ -191,7 +191,7 @@ impl Motion {
                 Ok(Self { note: take.said, ..Self::of(file, skeleton, joints, None) })
             }
             _ => {
-                let what = "expected an array, .npy, or a recording, .bvh".to_owned();
+                let what = "expected an array (.npy) or a recording (.bvh)".to_owned();
                 Err(ExportError::Array { file: file.into(), what })
             }
         }
@@ -224,7 +224,7 @@ impl Motion {
         };
         let width = array.data.len() / array.shape[0];
         if let Some(at) = array.data.iter().position(|value| !value.is_finite()) {
-            return Err(refuse(format!("frame {} holds a number that is not finite", at / width)));
+            return Err(refuse(format!("frame {} has a number that is not finite", at / width)));
         }
         let (joints, features) = match array.shape.len() {
             2 => (recover_joints(&array.data, skeleton), Some(array.data)),
@@ -322,7 +322,7 @@ impl Motion {
         let output = output.map_err(io)?;
         if !output.status.success() {
             let said = String::from_utf8_lossy(&output.stderr);
-            let said = said.lines().next_back().unwrap_or("it said nothing").to_owned();
+            let said = said.lines().next_back().unwrap_or("no message").to_owned();
             return Err(ExportError::Encoder { file: path.into(), said });
         }
         drawn.map_err(io)
@@ -548,7 +548,7 @@ mod tests {
         let refused = motion.mp4(&file, "no-such-encoder").unwrap_err().to_string();
         assert!(refused.contains("`no-such-encoder`") && refused.contains(".gif"), "{refused}");
         let refused = motion.mp4(&file, "false").unwrap_err().to_string();
-        assert!(refused.contains("it said nothing"), "{refused}");
+        assert!(refused.contains("no message"), "{refused}");
         match motion.write(&file) {
             Ok(_) => assert_eq!(&fs::read(&file).unwrap()[4..8], b"ftyp"),
             Err(ExportError::NoEncoder { .. }) => fixtures::skip("there is no ffmpeg here to make a video with"),

@@ -49,7 +49,8 @@ const HEAD: f64 = 0.105;
 pub enum GlbError {
     /// Nothing to animate, or more than a skin can hold.
     #[error(
-        "{nodes} nodes in {frames} frames; expected at least one frame, 1 to {MOST_NODES} nodes and at most {MOST_ROTATIONS} rotations"
+        "the motion has {nodes} nodes and {frames} frames; expected at least one frame, 1 to {MOST_NODES} nodes and at \
+         most {MOST_ROTATIONS} rotations"
     )]
     Size {
         /// Number of nodes of the rig.
@@ -58,7 +59,7 @@ pub enum GlbError {
         frames: usize,
     },
     /// Times of frames must be distinct in f32.
-    #[error("{frames} frames at {fps} frames per second have no times that single precision tells apart")]
+    #[error("{frames} frames at {fps} frames per second need times beyond single precision")]
     Times {
         /// Number of frames T.
         frames: usize,
@@ -66,7 +67,7 @@ pub enum GlbError {
         fps: f64,
     },
     /// A position or rotation is not finite, or too far away to be drawn.
-    #[error("the motion holds a number that is not finite, or a position farther than {FARTHEST} m")]
+    #[error("the motion has a number that is not finite, or a position farther than {FARTHEST} m")]
     NotFinite,
 }
 

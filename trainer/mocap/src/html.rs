@@ -75,11 +75,12 @@ pub struct Page<'a> {
 #[derive(Debug, thiserror::Error)]
 pub enum PageError {
     /// There is nothing to show.
-    #[error("a page without motions; give at least one")]
+    #[error("the page has no motions; expected at least one")]
     Empty,
     /// More than one page can hold.
     #[error(
-        "{panels} motions with {coordinates} coordinates; a page takes at most {MOST_PANELS} with {MOST_COORDINATES}"
+        "the page has {panels} motions with {coordinates} coordinates; expected at most {MOST_PANELS} with \
+         {MOST_COORDINATES}"
     )]
     TooMuch {
         /// Number of motions.
@@ -88,7 +89,7 @@ pub enum PageError {
         coordinates: usize,
     },
     /// The array is not a whole number of frames, or empty.
-    #[error("motion {panel} has {values} coordinates, expected frames of {joints} joints x 3")]
+    #[error("motion {panel} has {values} coordinates; expected frames of {joints} joints x 3")]
     Shape {
         /// Number of the motion, from 1.
         panel: usize,

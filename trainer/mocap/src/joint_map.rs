@@ -60,10 +60,10 @@ pub enum MapError {
         what: String,
     },
     /// No built-in map has that name.
-    #[error("no joint map `{name}` ships (there are {}), and no such file is there", shipped_names())]
+    #[error("there is no built-in joint map `{name}` (there are {}) and no such file", shipped_names())]
     Unknown { name: String },
     /// The file has no such node, or several.
-    #[error("joint map `{map}`: `{joint}` is to be `{node}`, {problem}")]
+    #[error("joint map `{map}`: `{joint}` uses the node `{node}`, {problem}")]
     Node {
         map: String,
         joint: String,
@@ -74,7 +74,8 @@ pub enum MapError {
     },
     /// Neither a built-in map nor the shape of the skeleton fits.
     #[error(
-        "no shipped joint map fits the names of this skeleton, and its shape is no figure's ({what}); write a map and name its file"
+        "no built-in joint map matches the names of this skeleton, and its shape is not that of a human figure \
+         ({what}); write a joint map and pass its file"
     )]
     None {
         /// Missing property of the shape.
@@ -189,8 +190,8 @@ impl JointMap {
     /// YAML that is not a map, missing joints, or unknown ones.
     pub fn parse(file: &Path, text: &str) -> Result<Self, MapError> {
         let fail = |what: String| MapError::Text { file: file.into(), what };
-        let value =
-            yaml_as_json(text).map_err(|mistakes| fail(format!(" no map: {}", excerpt(&mistakes.join("; ")))))?;
+        let value = yaml_as_json(text)
+            .map_err(|mistakes| fail(format!(" not a joint map: {}", excerpt(&mistakes.join("; ")))))?;
         let map: Self = serde_json::from_value(value).map_err(|e| fail(format!(" {}; expected `name` and `joints`, each a node's name, {{from, towards, fraction}} or {{between, towards, metres}}", json_mistake(&e))))?;
         let names = joint_names();
         let missing: Vec<&str> = names.iter().copied().filter(|name| !map.joints.contains_key(*name)).collect();
@@ -200,14 +201,14 @@ impl JointMap {
         }
         if !strange.is_empty() {
             return Err(fail(format!(
-                " `{}` are no joints; expected {}",
+                " `{}` are not joints; expected {}",
                 excerpt(&strange.join("`, `")),
                 names.join(", ")
             )));
         }
         let aimless = |source: &Source| matches!(source, Source::Between(b) if b.towards.is_none() && b.metres != 0.0);
         if let Some((joint, _)) = map.joints.iter().find(|(_, source)| aimless(source)) {
-            return Err(fail(format!(" `{joint}` has `metres`, but no `towards` that says where to; name a node")));
+            return Err(fail(format!(" `{joint}` has `metres`, but no `towards`; set `towards` to a node")));
         }
         Ok(map)
     }
@@ -288,9 +289,9 @@ impl JointMap {
             [one] => Ok(one),
             [] => {
                 let names = bvh.nodes.iter().filter(|n| !n.end).map(|n| n.name.as_str());
-                Err(fail(format!("which the file has not; it has {}", excerpts(names, 60))))
+                Err(fail(format!("which the file does not have; it has {}", excerpts(names, 60))))
             }
-            _ => Err(fail(format!("and the file has {} nodes of that name", found.len()))),
+            _ => Err(fail(format!("but the file has {} nodes with that name", found.len()))),
         }
     }
 }
@@ -400,7 +401,7 @@ mod tests {
                 assert!(said.contains(part) && said.starts_with("m.yaml:"), "{said}");
             };
             refuse("  pelvis:", "  pelvic:", "missing: pelvis");
-            refuse("joints:\n", "joints:\n  tail: Tail\n", "`tail` are no joints");
+            refuse("joints:\n", "joints:\n  tail: Tail\n", "`tail` are not joints");
             refuse("joints:\n", "joints:\n  pelvis: x\n", "pelvis");
             refuse("name:", "title:", "title");
         }

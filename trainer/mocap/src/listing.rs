@@ -88,22 +88,24 @@ pub fn list(folder: &DataPath, table: Option<&DataPath>) -> Result<Listing, List
         }
         if !is_clip_id(&id) {
             problems.push(format!(
-                "{}: not the name of a clip; rename it without control characters and dots in front",
+                "{}: not a valid clip name; rename it without control characters and leading dots",
                 path.display()
             ));
             continue;
         }
         let clip = ClipFile { source: id.clone(), id: id.clone(), path, captions: vec![], listed: None };
         if let Some(other) = clips.insert(id.clone(), clip) {
-            problems
-                .push(format!("{}: another file gives the clip `{id}` too; rename one of them", other.path.display()));
+            problems.push(format!(
+                "{}: another file has the same clip id `{id}`; rename one of them",
+                other.path.display()
+            ));
         }
     }
     if clips.is_empty() && problems.is_empty() {
-        problems.push(format!("no file that ends in .bvh, .npy or .npz in {}", root.display()));
+        problems.push(format!("no .bvh, .npy or .npz file in {}", root.display()));
     }
     if clips.len() > limits::CLIPS {
-        problems.push(format!("{} clips, at most {} are read", clips.len(), limits::CLIPS));
+        problems.push(format!("the folder has {} clips; expected at most {}", clips.len(), limits::CLIPS));
         return Err(fail(problems));
     }
     let mut notes = vec![];
@@ -190,7 +192,7 @@ fn apply(
             Some(ids) if ids.len() == 1 => ids[0].clone(),
             Some(ids) => {
                 problems.push(format!(
-                    "{}: `{}` may be {}; write the path",
+                    "{}: `{}` is ambiguous: it may be {}; write the path",
                     file.display(),
                     excerpt(&row.clip),
                     ids.join(" or ")
@@ -213,7 +215,7 @@ fn apply(
     }
     if !unknown.is_empty() {
         notes.push(format!(
-            "{}: {} rows are of clips that the folder has not, such as {}",
+            "{}: {} rows name clips that are not in the folder, such as {}",
             file.display(),
             unknown.len(),
             excerpts(unknown.iter().map(String::as_str), 5)
@@ -306,13 +308,16 @@ mod tests {
         ]);
         let said = list(&local(folder.path()), None).unwrap_err();
         let text = said.to_string();
-        for part in
-            ["gives the clip `a_b` too", "a_b.txt:1: 1 field", "`b` may be c_b or d_b", "`c_b` is in more than one"]
-        {
+        for part in [
+            "has the same clip id `a_b`",
+            "a_b.txt:1: the line has 1 field",
+            "`b` may be c_b or d_b",
+            "`c_b` is in more than one",
+        ] {
             assert!(text.contains(part), "{part}: {text}");
         }
         let empty = tempfile::tempdir().unwrap();
-        assert!(list(&local(empty.path()), None).unwrap_err().to_string().contains("no file that ends in .bvh"));
+        assert!(list(&local(empty.path()), None).unwrap_err().to_string().contains("no .bvh, .npy or .npz file"));
         assert!(list(&local(empty.path().join("gone")), None).unwrap_err().to_string().contains("gone"));
     }
 }

@@ -52,7 +52,7 @@ impl Length {
         if value > 0.0 && value <= LONGEST {
             Ok(Self::Seconds(value))
         } else {
-            Err(format!("a length of {value} s; expected more than 0 and at most {LONGEST}"))
+            Err(format!("the length is {value} s; expected more than 0 and at most {LONGEST}"))
         }
     }
 
@@ -61,7 +61,7 @@ impl Length {
         if (1..=3_600_000).contains(&value) {
             Ok(Self::Frames(value))
         } else {
-            Err(format!("a length of {value} frames; expected 1 to 3600000"))
+            Err(format!("the length is {value} frames; expected 1 to 3600000"))
         }
     }
 }
@@ -71,7 +71,8 @@ impl FromStr for Length {
 
     fn from_str(text: &str) -> Result<Self, String> {
         let shown = protocol::excerpt(text);
-        let expected = || format!("`{shown}` is no length; expected frames such as `120`, or seconds such as `4.5s`");
+        let expected =
+            || format!("`{shown}` is not a length; expected frames such as `120`, or seconds such as `4.5s`");
         match text.strip_suffix('s') {
             Some(number) => Self::seconds(number.parse().map_err(|_| expected())?),
             None => Self::of_frames(text.parse().map_err(|_| expected())?),
@@ -119,13 +120,13 @@ pub fn read(file: &Path) -> Result<Vec<Request>, RequestError> {
         let mut bytes = Vec::new();
         std::io::stdin().lock().take(MOST_BYTES + 1).read_to_end(&mut bytes).map_err(failed)?;
         if bytes.len() as u64 > MOST_BYTES {
-            return Err(format!("{name}: has more than {MOST_BYTES} bytes; no more are read").into());
+            return Err(format!("{name}: has more than {MOST_BYTES} bytes, the largest supported size").into());
         }
         bytes
     } else {
         DataPath::local(file).read(MOST_BYTES).map_err(failed)?
     };
-    let text = String::from_utf8(bytes).map_err(|_| format!("{name}: is no text in UTF-8"))?;
+    let text = String::from_utf8(bytes).map_err(|_| format!("{name}: is not UTF-8 text"))?;
     let ending = file.extension().and_then(|ending| ending.to_str()).unwrap_or_default().to_lowercase();
     let json = match ending.as_str() {
         "jsonl" | "ndjson" | "json" => true,
@@ -146,21 +147,21 @@ pub fn parse(name: &str, text: &str, json: bool) -> Result<Vec<Request>, Request
         let read = if json { of_json(line) } else { of_text(line.trim()) };
         let read = read.and_then(|request| match request.caption.len() {
             0..=MOST_CAPTION => Ok(request),
-            bytes => Err(format!("a sentence of {bytes} bytes; expected at most {MOST_CAPTION}")),
+            bytes => Err(format!("the sentence has {bytes} bytes; expected at most {MOST_CAPTION}")),
         });
         match read {
             Ok(request) => requests.push(request),
             Err(what) => mistakes.push(format!("{name}:{}: {what}", i + 1)),
         }
         if requests.len() > MOST {
-            mistakes.push(format!("{name}: more than {MOST} sentences; give them in several files"));
+            mistakes.push(format!("{name}: has more than {MOST} sentences; split them into several files"));
         }
         if requests.len() > MOST || mistakes.len() >= MOST_MISTAKES {
             break;
         }
     }
     if requests.is_empty() && mistakes.is_empty() {
-        mistakes.push(format!("{name}: holds no sentence"));
+        mistakes.push(format!("{name}: has no sentence"));
     }
     if mistakes.is_empty() { Ok(requests) } else { Err(RequestError { mistakes }) }
 }
@@ -247,10 +248,19 @@ mod tests {
     #[test]
     fn every_mistake_is_named_with_its_line() {
         for (text, json, words) in [
-            ("", false, &["x: holds no sentence"][..]),
-            ("walks#soon\nruns\njumps#0", false, &["x:1: `soon` is no length", "4.5s", "x:3: a length of 0 frames"]),
-            ("walks#-1s", false, &["x:1: a length of -1 s"]),
-            ("walks#infs", false, &["x:1: a length of inf s"]),
+            ("", false, &["x: has no sentence"][..]),
+            (
+                "walks#soon\nruns\njumps#0",
+                false,
+                &[
+                    "x:1: `soon` is not a length",
+                    "4.5s",
+                    "x:3: the length is 0 \
+                                                                                           frames",
+                ],
+            ),
+            ("walks#-1s", false, &["x:1: the length is -1 s"]),
+            ("walks#infs", false, &["x:1: the length is inf s"]),
             ("{\"caption\": \"a\", \"frames\": 1, \"seconds\": 1}", true, &["x:1: has both"]),
             ("{\"text\": \"a\"}", true, &["x:1:", "`text`", "\"caption\""]),
             ("{\"caption\": \"a\", \"frames\": -3}", true, &["x:1:"]),

@@ -30,7 +30,7 @@ const END: f64 = 0.5;
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum RigError {
     /// The array is not a whole number of frames, or empty.
-    #[error("{values} joint coordinates, expected frames of {joints} joints x 3")]
+    #[error("has {values} joint coordinates; expected frames of {joints} joints x 3")]
     Shape {
         /// Number of values in the array.
         values: usize,

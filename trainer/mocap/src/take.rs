@@ -106,7 +106,7 @@ impl std::fmt::Display for Read {
         let Detected { unit, metres_per_unit, leg, up, sure_of_up } = &self.detected;
         let how = match self.shipped {
             Some(_) => "fits the names",
-            None if self.map.name == "by shape" => "proposed from the skeleton's shape; look at it",
+            None if self.map.name == "by shape" => "proposed from the skeleton's shape; check it",
             None => "given",
         };
         write!(f, "joint map `{}` ({how}), ", self.map.name)?;
@@ -114,14 +114,14 @@ impl std::fmt::Display for Read {
             write!(f, "unit {unit} (legs of {:.2} m), ", leg * metres_per_unit)?;
         } else {
             let legs = leg * self.metres_per_unit;
-            write!(f, "unit {} m as told (legs of {legs:.2} m; {unit} would be likelier), ", self.metres_per_unit)?;
+            write!(f, "unit {} m as given (legs of {legs:.2} m; {unit} is more likely), ", self.metres_per_unit)?;
         }
         let guess = if *sure_of_up || self.up != *up {
             ""
         } else {
             " (as in the rest pose, or a guess: the figure does not stand)"
         };
-        let told = if self.up == *up { "" } else { " as told" };
+        let told = if self.up == *up { "" } else { " as given" };
         write!(f, "{} up{told}{guess}", self.up)
     }
 }

@@ -10,10 +10,10 @@ use protocol::stage::Backend;
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum DeviceError {
     /// The program was built without the backend.
-    #[error("backend `{}` is not in this program: build it with `--features {}`", .0.name(), .0.name())]
+    #[error("this program has no backend `{}`; build it with `--features {}`", .0.name(), .0.name())]
     NotBuilt(Backend),
     /// The machine has fewer devices.
-    #[error("backend `{}` has {found} device(s), so there is no number {index}; see `trainer devices`", .backend.name())]
+    #[error("backend `{}` has {found} device(s), but device {index} was requested; see `trainer devices`", .backend.name())]
     NotFound {
         backend: Backend,
         /// The requested index.
@@ -101,7 +101,7 @@ fn list(backend: Backend) -> Vec<DeviceInfo> {
             .map(|(index, device)| {
                 let (name, note) = match identity(device) {
                     Some((name, true)) => (name, note(backend)),
-                    Some((name, false)) => (name, "a program on the CPU that stands in for a GPU: for checks, slow"),
+                    Some((name, false)) => (name, "an emulated GPU on the CPU: for checks, slow"),
                     None => (format!("{device:?}"), note(backend)),
                 };
                 DeviceInfo { backend, index: Some(index), name, note: note.to_owned() }

@@ -19,16 +19,15 @@ use crate::roots::Root;
 #[derive(Debug, thiserror::Error)]
 pub enum AccessError {
     /// The worker has no data root.
-    #[error(
-        "`{path}`: this worker opens no files; start it with `--data-root DIR`, and name what is below that folder"
-    )]
+    #[error("`{path}`: this worker has no data root; start it with `--data-root DIR` and use a path below that folder")]
     NoRoots {
         /// As the pipeline has it.
         path: String,
     },
     /// The path leads elsewhere.
     #[error(
-        "`{path}` is not below a data root of this worker ({roots}); name a path there, or start the worker with another `--data-root`"
+        "`{path}` is not below a data root of this worker ({roots}); use a path below one, or start the worker with \
+         another `--data-root`"
     )]
     Outside {
         /// As the pipeline has it.
@@ -38,7 +37,8 @@ pub enum AccessError {
     },
     /// The content is not the expected one.
     #[error(
-        "`{path}` on `{machine}` is not what the run expects: digest {found}, expected {expected}; it is a copy that differs on another machine, or it has changed since the run was submitted"
+        "`{path}` on `{machine}` has digest {found}; the run expects {expected}; the copies on the machines \
+         differ, or the data has changed since the run was submitted"
     )]
     Differs {
         /// As the pipeline has it.
@@ -51,7 +51,7 @@ pub enum AccessError {
         expected: Digest,
     },
     /// The content changed between digesting and the end of reading.
-    #[error("`{path}` on `{machine}` changed while it was read; leave it alone while the stage runs")]
+    #[error("`{path}` on `{machine}` changed while it was read; do not change it while the stage runs")]
     Changed {
         /// As the pipeline has it.
         path: String,
@@ -59,7 +59,7 @@ pub enum AccessError {
         machine: String,
     },
     /// The stage came without a digest to hold the content against.
-    #[error("`{path}` came without a digest; the coordinator resolves it before the stage is given out")]
+    #[error("the task has no digest of `{path}`; the coordinator must compute it before it grants the task")]
     Unresolved {
         /// As the pipeline has it.
         path: String,
@@ -229,11 +229,11 @@ mod tests {
         }
         for climbing in [at("root/../secret"), "../secret".into(), "set/../../secret".into()] {
             let said = refused(&climbing);
-            assert!(said.contains("leads out of the data root"), "{said}");
+            assert!(said.contains("is outside the data root"), "{said}");
         }
         let none = DataAccess::beneath(vec![], "here");
         let said = none.digest(&folder_of(&at("root/set/a"))).unwrap_err().to_string();
-        assert!(said.contains("opens no files") && said.contains("--data-root DIR"), "{said}");
+        assert!(said.contains("has no data root") && said.contains("--data-root DIR"), "{said}");
     }
 
     #[test]
@@ -256,12 +256,12 @@ mod tests {
         for path in ["root/set/file", "root/set/folder/secret", "root/set/magic/etc/passwd", "root/set/round"] {
             let path = opened(path);
             let said = path.read(9).unwrap_err().to_string();
-            assert!(said.contains("leads out of the data root"), "{said}");
+            assert!(said.contains("is outside the data root"), "{said}");
             assert!(path.has_entry() && !path.exists() && !path.is_folder());
             assert!(path.hold().is_err() && path.digest().is_err());
         }
         let said = opened("root/set").tree().unwrap_err().to_string();
-        assert!(said.contains("leads out of the data root"), "{said}");
+        assert!(said.contains("is outside the data root"), "{said}");
         // What a reader of paths is given cannot be led elsewhere.
         let held = opened("root/set/a").hold().unwrap();
         fs::remove_file(at("root/set/a")).unwrap();
@@ -281,9 +281,13 @@ mod tests {
         access.expect_unchanged(&opened).unwrap();
         let other = Digest::of(b"other");
         let said = access.open(folder_of(&set), Some(&other)).unwrap_err().to_string();
-        for part in
-            [&*set.display().to_string(), "`here`", &digest.to_string(), &other.to_string(), "a copy that differs"]
-        {
+        for part in [
+            &*set.display().to_string(),
+            "`here`",
+            &digest.to_string(),
+            &other.to_string(),
+            "the copies on the machines differ",
+        ] {
             assert!(said.contains(part), "{part}: {said}");
         }
         assert!(matches!(access.open(folder_of(&set), None), Err(AccessError::Unresolved { .. })));

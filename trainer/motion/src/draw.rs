@@ -235,7 +235,8 @@ fn follow(path: &[[f64; 3]], t: usize, axis: usize) -> f64 {
 fn frames_of(joints: &[f32], skeleton: &Skeleton) -> io::Result<usize> {
     let width = 3 * skeleton.joints;
     if joints.is_empty() || !joints.len().is_multiple_of(width) {
-        let what = format!("{} coordinates are not frames of {} joints x 3", joints.len(), skeleton.joints);
+        let what =
+            format!("{} coordinates are not a whole number of frames of {} joints x 3", joints.len(), skeleton.joints);
         return Err(io::Error::new(io::ErrorKind::InvalidInput, what));
     }
     Ok(joints.len() / width)

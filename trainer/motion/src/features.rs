@@ -27,7 +27,7 @@ const HEADING_SIGMA: f64 = 20.0;
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum FeatureError {
     /// The array is not a whole number of frames.
-    #[error("{values} joint coordinates, expected a multiple of {joints} joints x 3")]
+    #[error("has {values} joint coordinates; expected a multiple of {joints} joints x 3")]
     Shape {
         /// Number of values in the array.
         values: usize,
@@ -35,7 +35,7 @@ pub enum FeatureError {
         joints: usize,
     },
     /// Velocities need a second frame.
-    #[error("{frames} frame(s), expected at least 2: the last frame only gives velocities")]
+    #[error("has {frames} frame(s); expected at least 2, because the last frame only supplies velocities")]
     TooFewFrames {
         /// Number of frames T.
         frames: usize,
@@ -50,10 +50,10 @@ pub enum FeatureError {
     )]
     Undefined { frame: usize },
     /// No target skeleton is known for the format.
-    #[error("the uniform skeleton of this format is not public: give the bone lengths of the target skeleton")]
+    #[error("the uniform skeleton of this format is not public; set the bone lengths of the target skeleton")]
     NoTarget,
     /// The table of bone lengths has another size.
-    #[error("{found} bone lengths, expected {expected}")]
+    #[error("has {found} bone lengths; expected {expected}")]
     Target {
         /// Number of lengths given.
         found: usize,

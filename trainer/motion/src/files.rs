@@ -104,7 +104,7 @@ impl DataPath {
         if bytes.len() as u64 > limit {
             return Err(io::Error::new(
                 io::ErrorKind::FileTooLarge,
-                format!("has more than {limit} bytes; no more are read"),
+                format!("has more than {limit} bytes, the largest supported size"),
             ));
         }
         Ok(bytes)
@@ -204,7 +204,7 @@ impl DataPath {
         while let Some((folder, depth)) = folders.pop() {
             let found = folder.metadata().map_err(|error| named(&folder, error))?;
             if !met.insert((found.dev(), found.ino())) {
-                return refuse(&folder, "leads to a folder that was read already; remove the symbolic link".into());
+                return refuse(&folder, "is a symbolic link to a folder that was already read; remove the link".into());
             }
             if depth > limits::FOLDER_DEPTH {
                 return refuse(&folder, format!("folders are nested more than {} deep", limits::FOLDER_DEPTH));
@@ -288,7 +288,7 @@ fn expect_file(found: FileType) -> io::Result<()> {
         found if found.is_fifo() => "a named pipe",
         found if found.is_socket() => "a socket",
         found if found.is_char_device() || found.is_block_device() => "a device",
-        _ => "no regular file",
+        _ => "not a regular file",
     };
     Err(io::Error::new(io::ErrorKind::InvalidInput, format!("is {what}; expected a file")))
 }
@@ -350,7 +350,7 @@ mod tests {
         // A cycle, and a fan that doubles at each level.
         symlink(folder.path(), at("a/b/up")).unwrap();
         let said = tree(at("")).unwrap_err().to_string();
-        assert!(said.contains("up") && said.contains("was read already"), "{said}");
+        assert!(said.contains("up") && said.contains("was already read"), "{said}");
         fs::remove_file(at("a/b/up")).unwrap();
         for i in 0..30 {
             fs::create_dir(at(&format!("f{i}"))).unwrap();
@@ -359,7 +359,7 @@ mod tests {
             }
         }
         fs::create_dir(at("f30")).unwrap();
-        assert!(tree(at("f0")).unwrap_err().to_string().contains("was read already"));
+        assert!(tree(at("f0")).unwrap_err().to_string().contains("was already read"));
         fifo(&at("a/pipe"));
         let said = tree(at("a")).unwrap_err().to_string();
         assert!(said.contains("a/pipe: is a named pipe"), "{said}");

@@ -68,7 +68,7 @@ pub fn folder_fingerprint(path: &DataPath, format: DataFormat, hashes: &Hashes) 
     let (mut problems, mut stamps) = (vec![], vec![]);
     if !path.is_folder() {
         let what = if path.exists() { "is not a folder" } else { "no such folder" };
-        let todo = "set dataset.path to the folder that holds new_joint_vecs/ and texts/";
+        let todo = "set dataset.path to the folder with new_joint_vecs/ and texts/";
         problems.push(Problem { kind: ProblemKind::Missing, what: format!("{}: {what}; {todo}", path.display()) });
         return Err(OpenError { folder: path.shown().into(), problems });
     }

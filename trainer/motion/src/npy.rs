@@ -39,7 +39,7 @@ pub enum NpyError {
         source: std::io::Error,
     },
     /// The element type is not the expected one.
-    #[error("{}: holds {found}, expected {expected}; save it with numpy.save(..., x.astype(numpy.float32))", file.display())]
+    #[error("{}: has type {found}; expected {expected}; save it with numpy.save(..., x.astype(numpy.float32))", file.display())]
     Type {
         file: PathBuf,
         /// Type in the header.
@@ -48,11 +48,11 @@ pub enum NpyError {
         expected: &'static str,
     },
     /// The array is column-major.
-    #[error("{}: stored column by column (fortran_order), expected rows; save numpy.ascontiguousarray(x)", file.display())]
+    #[error("{}: is stored in column-major order (fortran_order); expected row-major; save numpy.ascontiguousarray(x)", file.display())]
     Order { file: PathBuf },
     /// The file is shorter or longer than its header declares.
-    #[error("{}: {} bytes of data for shape {shape:?}, expected {expected}; the file is {}", file.display(), found,
-        if found < expected { "truncated: copy or download it again" } else { "longer than its header says" })]
+    #[error("{}: has {} bytes of data for shape {shape:?}; expected {expected}; the file is {}", file.display(), found,
+        if found < expected { "truncated: copy or download it again" } else { "longer than its header declares" })]
     Size {
         file: PathBuf,
         /// Shape in the header.
@@ -122,7 +122,7 @@ pub fn parse(file: &Path, bytes: &[u8], allow_f64: bool) -> Result<Array, NpyErr
 
 /// Hides the reader's message about a header, which may quote it.
 fn quoted(error: &Error) -> Error {
-    Error::new(error.kind(), format!("its header cannot be read: {}", excerpt(&error.to_string())))
+    Error::new(error.kind(), format!("cannot read its header: {}", excerpt(&error.to_string())))
 }
 
 /// Largest nesting of brackets; the header of a plain array has a mapping and a tuple in it.
@@ -132,18 +132,18 @@ const DEPTH: usize = 4;
 /// axes it multiplies.
 fn check_header(bytes: &[u8]) -> Result<(), String> {
     let [b'\x93', b'N', b'U', b'M', b'P', b'Y', major, _, rest @ ..] = bytes else {
-        return Err("it does not begin as one".into());
+        return Err("its first bytes are not those of a .npy file".into());
     };
     let (length, rest) = match (major, rest) {
         (1, [a, b, rest @ ..]) => (u32::from(u16::from_le_bytes([*a, *b])), rest),
         (2 | 3, [a, b, c, d, rest @ ..]) => (u32::from_le_bytes([*a, *b, *c, *d]), rest),
-        (1..=3, _) => return Err("its header is cut off".into()),
-        (other, _) => return Err(format!("version {other}, expected 1 to 3")),
+        (1..=3, _) => return Err("its header is truncated".into()),
+        (other, _) => return Err(format!("it has version {other}; expected 1 to 3")),
     };
     if length as usize > limits::ARRAY_HEADER_BYTES {
-        return Err(format!("a header of {length} bytes, expected at most {}", limits::ARRAY_HEADER_BYTES));
+        return Err(format!("its header has {length} bytes; expected at most {}", limits::ARRAY_HEADER_BYTES));
     }
-    let header = rest.get(..length as usize).ok_or("its header is cut off")?;
+    let header = rest.get(..length as usize).ok_or("its header is truncated")?;
     // The reader's time doubles with each level.
     let mut depth = 0_usize;
     for byte in header {
@@ -153,16 +153,17 @@ fn check_header(bytes: &[u8]) -> Result<(), String> {
             _ => {}
         }
         if depth > DEPTH {
-            return Err(format!("a header with more than {DEPTH} brackets in one another"));
+            return Err(format!("its header has brackets nested more than {DEPTH} levels deep"));
         }
     }
     let header = String::from_utf8_lossy(header);
     for after in header.split("shape").skip(1) {
         let axes = after.split_once('(').and_then(|(_, axes)| axes.split_once(')')).map_or("", |(axes, _)| axes);
         let axes = axes.split(',').map(str::trim).filter(|axis| !axis.is_empty());
-        let mut numbers = axes.map(|axis| axis.parse::<u64>().map_err(|_| "a shape that is not made of numbers"));
+        let mut numbers =
+            axes.map(|axis| axis.parse::<u64>().map_err(|_| "its shape has an axis that is not a number"));
         numbers.try_fold(1_u64, |product, axis| {
-            product.checked_mul(axis?).ok_or("a shape with more elements than can be counted")
+            product.checked_mul(axis?).ok_or("its shape has more than 2^64 elements")
         })?;
     }
     Ok(())
@@ -197,7 +198,7 @@ mod tests {
         assert_eq!(parse(file, &bytes, false).unwrap(), Array { shape: vec![2, 3], data });
         let cut = parse(file, &bytes[..bytes.len() - 5], false).unwrap_err().to_string();
         assert!(
-            cut.contains("clip.npy: 19 bytes of data") && cut.contains("expected 24") && cut.contains("truncated"),
+            cut.contains("clip.npy: has 19 bytes of data") && cut.contains("expected 24") && cut.contains("truncated"),
             "{cut}"
         );
         assert!(matches!(parse(file, b"hello", false), Err(NpyError::Header { .. })));
@@ -223,17 +224,17 @@ mod tests {
             let said = parse(file, bytes, true).unwrap_err().to_string();
             assert!(said.contains(part), "{part}: {said}");
         };
-        refuse(&with_header(2, u32::MAX, b"{}", b""), "a header of 4294967295 bytes");
-        refuse(&with_header(1, 900, b"{}", b""), "cut off");
+        refuse(&with_header(2, u32::MAX, b"{}", b""), "its header has 4294967295 bytes");
+        refuse(&with_header(1, 900, b"{}", b""), "truncated");
         refuse(&with_header(9, 2, b"{}", b""), "version 9");
         let shaped = |shape: &str, data: &[u8]| {
             let header = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}\n");
             with_header(1, header.len() as u32, header.as_bytes(), data)
         };
         let most = u64::MAX;
-        refuse(&shaped(&format!("({most}, {most})"), b""), "more elements than can be counted");
-        refuse(&shaped("(4611686018427387904, 4)", b""), "more elements than can be counted");
-        refuse(&shaped("(0xffffffffffffffff, 2)", b""), "not made of numbers");
+        refuse(&shaped(&format!("({most}, {most})"), b""), "more than 2^64 elements");
+        refuse(&shaped("(4611686018427387904, 4)", b""), "more than 2^64 elements");
+        refuse(&shaped("(0xffffffffffffffff, 2)", b""), "an axis that is not a number");
         refuse(&shaped(&format!("({most},)"), b""), "truncated");
         // An axis of zero has no elements, for any other axes.
         assert_eq!(parse(file, &shaped("(0, 9000000000)", b""), false).unwrap().data, [0.0; 0]);

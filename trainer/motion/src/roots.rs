@@ -83,12 +83,12 @@ impl Root {
             match openat2(&self.folder, path, how) {
                 Err(Errno::EAGAIN) => {}
                 Err(Errno::EXDEV) => {
-                    let what = format!("leads out of the data root `{}`", self.path.display());
+                    let what = format!("is outside the data root `{}`", self.path.display());
                     return Err(io::Error::new(io::ErrorKind::PermissionDenied, what));
                 }
                 done => return done.map_err(io::Error::from),
             }
         }
-        Err(io::Error::new(io::ErrorKind::ResourceBusy, "is renamed all the time"))
+        Err(io::Error::new(io::ErrorKind::ResourceBusy, "was renamed repeatedly while it was opened"))
     }
 }

@@ -63,13 +63,16 @@ impl Caption {
     /// Reads one line, with any times. The error describes the defect, without file and line.
     pub fn parse(line: &str) -> Result<Self, String> {
         if line.len() > limits::CAPTION_BYTES {
-            return Err(format!("{} bytes, at most {} are read", line.len(), limits::CAPTION_BYTES));
+            return Err(format!("the line has {} bytes; expected at most {}", line.len(), limits::CAPTION_BYTES));
         }
         let mut fields = line.trim().split('#');
         let (Some(text), Some(tokens), Some(from), Some(to)) =
             (fields.next(), fields.next(), fields.next(), fields.next())
         else {
-            return Err(format!("{} field(s) separated by `#`, expected 4", line.trim().split('#').count()));
+            return Err(format!(
+                "the line has {} field(s) separated by `#`; expected 4",
+                line.trim().split('#').count()
+            ));
         };
         if text.trim().is_empty() {
             return Err("the caption is empty".into());

@@ -76,9 +76,9 @@ pub fn parse(file: &Path, bytes: &[u8], skeleton: &Skeleton, joints: &[String]) 
         return motion(file, bytes, skeleton, if told.is_empty() { &[0] } else { &told });
     }
     if ending != "csv" && ending != "json" {
-        return Err(named("expected a name that ends in .csv, .json or .npy".into()));
+        return Err(named("expected a file name that ends in .csv, .json or .npy".into()));
     }
-    let text = std::str::from_utf8(bytes).map_err(|_| named("is no text in UTF-8".into()))?;
+    let text = std::str::from_utf8(bytes).map_err(|_| named("is not UTF-8 text".into()))?;
     let lines = if ending == "csv" { csv(text) } else { json(text) }.map_err(named)?;
     waypoints(&lines, skeleton, &told).map_err(named)
 }
@@ -108,7 +108,8 @@ pub fn check_start(waypoints: &[Waypoint], skeleton: &Skeleton, start: [f64; 3])
     if speed > FASTEST {
         let (name, seconds) = (skeleton.names[0], first.frame as f64 / skeleton.fps);
         return Err(format!(
-            "`{name}` begins at x = {:.2}, z = {:.2} and would move at {speed:.1} m/s to be {far:.2} m from there at {seconds:.2} s; expected at most {FASTEST} m/s",
+            "`{name}` starts at x = {:.2}, z = {:.2} and would need {speed:.1} m/s to be {far:.2} m away at \
+             {seconds:.2} s; expected at most {FASTEST} m/s",
             start[0], start[2]
         ));
     }
@@ -123,7 +124,7 @@ fn ending(file: &Path) -> String {
 fn number(name: &str, skeleton: &Skeleton) -> Result<usize, String> {
     skeleton.names.iter().position(|known| *known == name).ok_or_else(|| {
         format!(
-            "`{}` is no joint of a skeleton of {} joints; its joints are {}",
+            "`{}` is not a joint of a skeleton with {} joints; its joints are {}",
             excerpt(name),
             skeleton.joints,
             skeleton.names.join(", ")
@@ -183,7 +184,7 @@ fn csv(text: &str) -> Result<Vec<Line>, String> {
             let value = |k: usize| {
                 let cell = cells[k];
                 cell.parse::<f64>()
-                    .map_err(|_| format!("{place}: `{}` in column `{}` is no number", excerpt(cell), columns[k]))
+                    .map_err(|_| format!("{place}: `{}` in column `{}` is not a number", excerpt(cell), columns[k]))
             };
             let (seconds, position) = (value(t)?, [value(x)?, value(y)?, value(z)?]);
             Ok(Line { place, seconds, joint: joint.map(|k| cells[k].to_owned()), position })
@@ -192,7 +193,7 @@ fn csv(text: &str) -> Result<Vec<Line>, String> {
 }
 
 fn json(text: &str) -> Result<Vec<Line>, String> {
-    let value: Value = serde_json::from_str(text).map_err(|error| format!("is no JSON: {error}"))?;
+    let value: Value = serde_json::from_str(text).map_err(|error| format!("is not valid JSON: {error}"))?;
     of_value(&value)
 }
 
@@ -243,7 +244,9 @@ fn waypoints(lines: &[Line], skeleton: &Skeleton, told: &[usize]) -> Result<Vec<
             (Some(name), _) => number(name, skeleton).map_err(|why| format!("{place}: {why}"))?,
             (None, Some(joint)) => joint,
             (None, None) => {
-                return Err("names no joints, but several are told; name them in a column `joint`, or as keys".into());
+                return Err("has no joint names, but several joints are controlled; add a column `joint`, or use the \
+                    names as keys"
+                    .into());
             }
         };
         if !told.is_empty() && !told.contains(&joint) {
@@ -259,7 +262,7 @@ fn waypoints(lines: &[Line], skeleton: &Skeleton, told: &[usize]) -> Result<Vec<
         by_joint.entry(joint).or_default().push((line, Waypoint { frame, joint, position }));
     }
     if by_joint.is_empty() {
-        return Err("tells nothing of the joints that were named".into());
+        return Err("has no waypoint for the requested joints".into());
     }
     for (joint, own) in &mut by_joint {
         own.sort_by_key(|(_, waypoint)| waypoint.frame);
@@ -268,7 +271,7 @@ fn waypoints(lines: &[Line], skeleton: &Skeleton, told: &[usize]) -> Result<Vec<
             let name = skeleton.names[*joint];
             if first.frame == second.frame {
                 return Err(format!(
-                    "{} and {} are both for `{name}` at frame {}, {:.2} s; a frame lasts {} s",
+                    "{} and {} are both waypoints of `{name}` at frame {}, {:.2} s; a frame lasts {} s",
                     before.place,
                     line.place,
                     first.frame,
@@ -281,7 +284,7 @@ fn waypoints(lines: &[Line], skeleton: &Skeleton, told: &[usize]) -> Result<Vec<
             let speed = squares.sum::<f64>().sqrt() / seconds;
             if speed > FASTEST {
                 return Err(format!(
-                    "{}: `{name}` would move at {speed:.1} m/s from {}; expected at most {FASTEST} m/s",
+                    "{}: `{name}` would need {speed:.1} m/s from {}; expected at most {FASTEST} m/s",
                     line.place, before.place
                 ));
             }
@@ -372,8 +375,8 @@ mod tests {
             ("a.csv", "t,x,y,z\n0,0,1,0\n", &["pelvis", "head"], &["column `joint`"]),
             ("a.csv", "t,x,y,z\n0,0,1,0\n0.02,0,1,0\n", &[], &["line 2 and line 3", "frame 0"]),
             ("a.csv", "t,x,y,z\n0,0,1,0\n0.1,0,1,1.2\n", &[], &["line 3", "12.0 m/s", "10 m/s"]),
-            ("a.csv", "t,joint,x,y,z\n0,head,0,1,0\n", &["pelvis"], &["tells nothing"]),
-            ("a.json", "{", &[], &["no JSON"]),
+            ("a.csv", "t,joint,x,y,z\n0,head,0,1,0\n", &["pelvis"], &["has no waypoint"]),
+            ("a.json", "{", &[], &["not valid JSON"]),
             ("a.json", r#"{"pelvis": [[0, 1, 2]]}"#, &[], &["pelvis[0]", "[t, x, y, z]"]),
             ("a.json", "3", &[], &["list of [t, x, y, z]"]),
             ("a.txt", "", &[], &[".csv, .json or .npy"]),

@@ -108,7 +108,7 @@ fn every_bad_clip_is_named_at_once() {
     assert_eq!(error.problems.len(), 6, "{error}");
     let whole = bytes.len() - 128;
     let (found, expected) = (format!("{} bytes of data", whole - 1000), format!("expected {whole}"));
-    expect(&error, ProblemKind::Shape, &[&ids[0], "251 features a frame, expected 263"]);
+    expect(&error, ProblemKind::Shape, &[&ids[0], "251 features per frame; expected 263"]);
     expect(&error, ProblemKind::NotFinite, &[&ids[1], "NaN in frame 7, column 5"]);
     expect(&error, ProblemKind::Size, &[&ids[2], &found, &expected, "truncated"]);
     expect(&error, ProblemKind::Type, &[&ids[3], "expected f32 (<f4)"]);

@@ -21,9 +21,10 @@ impl Pipeline {
             match computed.iter().find(|settings| settings.kind() == kind).map(StageSettings::code_version) {
                 Some(known) if *version <= known => {}
                 Some(known) => wrong.push(format!(
-                    "it has `{kind}` at code version {version}, this program computes {known}; use one build for both"
+                    "the pipeline has `{kind}` at code version {version}, but this program has version {known}; use \
+                     the same build for both"
                 )),
-                None => wrong.push(format!("there is no kind `{}`", kind.escape_debug())),
+                None => wrong.push(format!("unknown stage kind `{}`", kind.escape_debug())),
             }
         }
         let mut found = graph::ByStage::new();
@@ -31,7 +32,7 @@ impl Pipeline {
         for stage in &self.stages {
             for input in stage.inputs.iter().filter(|input| !before.contains(&input.stage)) {
                 let read = shown(input.stage.as_str());
-                wrong.push(format!("stage `{}` reads `{read}`, which does not come before it", stage.name));
+                wrong.push(format!("stage `{}` reads `{read}`, which is not an earlier stage", stage.name));
             }
             if !before.insert(&stage.name) {
                 wrong.push(format!("two stages are called `{}`", stage.name));
@@ -58,15 +59,16 @@ impl Pipeline {
     /// Checks names and counts before any check whose time grows with them.
     fn check_size(&self) -> Result<(), String> {
         if !protocol::id::is_name(&self.name) {
-            return Err(format!("`{}` is not a pipeline name", shown(&self.name)));
+            return Err(format!("`{}` is not a valid pipeline name", shown(&self.name)));
         }
         if !(1..=limits::STAGES).contains(&self.stages.len()) {
-            return Err(format!("it has {} stages; expected 1 to {}", self.stages.len(), limits::STAGES));
+            return Err(format!("the pipeline has {} stages; expected 1 to {}", self.stages.len(), limits::STAGES));
         }
         for stage in &self.stages {
             if !protocol::id::is_stage_name(stage.name.as_str()) {
                 return Err(format!(
-                    "`{}` is not a stage name; expected a small letter, then small letters, digits, `_`, `-`, at most 64",
+                    "`{}` is not a valid stage name; expected a lowercase letter, then lowercase letters, digits, `_` \
+                     or `-`, at most 64 characters",
                     shown(stage.name.as_str())
                 ));
             }
@@ -89,14 +91,16 @@ impl PipelineStage {
         let mut wrong = Vec::new();
         let name = &self.name;
         if self.derived.is_some() || self.settings.training().is_some_and(|training| training.stop.is_some()) {
-            wrong.push(format!("stage `{name}` says that a sweep made it; sweeps are unfolded while a run goes on"));
+            wrong.push(format!(
+                "stage `{name}` is marked as created by a sweep; only a running sweep creates such stages"
+            ));
         }
         let (own, swept) = (graph::references(&self.settings), trial::references(self));
         if own.iter().any(|reference| !self.inputs.contains(reference)) {
-            wrong.push(format!("the inputs of stage `{name}` are not those of its settings"));
+            wrong.push(format!("the inputs of stage `{name}` do not match its settings"));
         }
         if swept.iter().any(|reference| !self.inputs.contains(reference)) {
-            wrong.push(format!("the inputs of stage `{name}` are not those of its sweep"));
+            wrong.push(format!("the inputs of stage `{name}` do not match its sweep"));
         }
         let added = |input: &StageInput| {
             self.settings.get::<Register>().is_some() && input.field == format!("evaluations.{}", input.stage)
@@ -104,13 +108,13 @@ impl PipelineStage {
         for input in self.inputs.iter().filter(|input| !own.contains(input) && !swept.contains(input) && !added(input))
         {
             let (field, stage) = (shown(&input.field), shown(input.stage.as_str()));
-            wrong.push(format!("stage `{name}` reads `{stage}` as `{field}`, of which its settings know nothing"));
+            wrong.push(format!("stage `{name}` reads `{stage}` as `{field}`, but its settings have no such input"));
         }
         let folders = self.settings.folders().into_iter().map(|folder| folder.field);
         let known: BTreeSet<String> = folders.chain(self.versions().into_iter().map(|input| input.field)).collect();
         for field in self.external.keys().filter(|field| !known.contains(*field)) {
             let field = shown(field);
-            wrong.push(format!("stage `{name}` has a digest of `{field}`, which it does not read"));
+            wrong.push(format!("stage `{name}` has a digest of `{field}`, but it does not read `{field}`"));
         }
         wrong
     }

@@ -97,16 +97,20 @@ pub(crate) fn check_totals(stages: &[PipelineStage], found: &mut ByStage) {
         }
         let p = found.entry(stage.name.clone()).or_default();
         if before.0 <= limits::PIPELINE_SHARDS && shards > limits::PIPELINE_SHARDS {
-            let message = format!("the pipeline has more than {} shards up to here", limits::PIPELINE_SHARDS);
-            p.add("shards", message, "take fewer, larger ones");
+            let message = format!("the pipeline has more than {} shards up to this stage", limits::PIPELINE_SHARDS);
+            p.add("shards", message, "use fewer, larger shards");
         }
         if before.1 <= limits::TRIALS && trials > limits::TRIALS {
-            let message = format!("the pipeline's sweeps have more than {} trials up to here", limits::TRIALS);
-            p.add("sweep.trials", message, "search in several pipelines");
+            let message = format!("the pipeline's sweeps have more than {} trials up to this stage", limits::TRIALS);
+            p.add("sweep.trials", message, "distribute the sweeps over several pipelines");
         }
         if before.2 <= most_values && values > most_values {
-            let message = format!("the pipeline's sweeps list more than {most_values} values up to here");
-            p.add("sweep.space", message, "search a range with `uniform`, or in several pipelines");
+            let message = format!("the pipeline's sweeps list more than {most_values} values up to this stage");
+            p.add(
+                "sweep.space",
+                message,
+                "search a range with `uniform`, or distribute the sweeps over several pipelines",
+            );
         }
     }
 }
@@ -128,19 +132,19 @@ pub(crate) fn check_references(stages: &[PipelineStage], found: &mut ByStage) {
             let help = || {
                 let names: Vec<&str> = giving().take(LISTED).collect();
                 match giving().count() {
-                    0 => format!("no stage gives {what}; add one"),
+                    0 => format!("no stage outputs {what}; add one"),
                     more if more > LISTED => {
                         let names = crate::schema::list_keys(names);
-                        format!("stages that give {what}: {names} and {} more", more - LISTED)
+                        format!("stages that output {what}: {names} and {} more", more - LISTED)
                     }
-                    _ => format!("stages that give {what}: {}", crate::schema::list_keys(names)),
+                    _ => format!("stages that output {what}: {}", crate::schema::list_keys(names)),
                 }
             };
             match by_name.get(&input.stage).copied() {
                 None if input.stage.as_str().is_empty() => {
                     problems.add(
                         &input.field,
-                        format!("`{}` is empty; expected a stage that gives {what}", input.field),
+                        format!("`{}` is empty; expected a stage that outputs {what}", input.field),
                         &help(),
                     );
                 }
@@ -153,7 +157,7 @@ pub(crate) fn check_references(stages: &[PipelineStage], found: &mut ByStage) {
                 }
                 Some(other) if other.settings.output().kind != input.kind => {
                     let message = format!(
-                        "`{}` gives {}, but `{}` needs {what}",
+                        "`{}` outputs {}, but `{}` needs {what}",
                         other.name,
                         other.settings.output().kind.noun(),
                         input.field
@@ -172,13 +176,17 @@ fn check_version(stage: &PipelineStage, input: &VersionInput, problems: &mut Pro
     let what = kind.noun();
     if stage.settings.shape() == Shape::Registry {
         let message =
-            format!("`{field}` is `{version}`, a version of the registry; expected a stage that gives {what}");
-        problems.add(field, message, "what is registered already need not be registered again; name a stage");
+            format!("`{field}` is `{version}`, a version of the registry; expected a stage that outputs {what}");
+        problems.add(field, message, "a registered version cannot be registered again; name a stage");
     } else if !kind.is_of_models() {
-        let message = format!("`{field}` is `{version}`, but no version of the registry holds {what}");
+        let message = format!("`{field}` is `{version}`, but versions of the registry do not contain {what}");
         problems.add(field, message, "name a stage");
     } else if let Err(why) = version.parse::<ModelRef>() {
-        problems.add(field, format!("`{field}`: {why}"), "such as `motionlcm@prod`, `motionlcm@best` or `motionlcm@3`");
+        problems.add(
+            field,
+            format!("`{field}`: {why}"),
+            "for example `motionlcm@prod`, `motionlcm@best` or `motionlcm@3`",
+        );
     }
 }
 

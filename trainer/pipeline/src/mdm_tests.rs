@@ -28,7 +28,7 @@ fn what_does_not_go_together_is_refused_where_it_stands() {
     assert!(inputs("tuned").contains(&("init".into(), "mdm".into())));
     assert_eq!(inputs("smf").len(), 2, "no term, no evaluator");
     for (from, to, line, words) in [
-        ("model: mdm, sampler", "model: mdm, evaluator: semantics, sampler", "12:", "would flatter it"),
+        ("model: mdm, sampler", "model: mdm, evaluator: semantics, sampler", "12:", "would be biased"),
         ("steps: 50, guidance", "steps: 51, guidance", "12:", "1 to 50"),
         ("solver: ddim", "solver: euler", "13:", "expected one of `own`, `ddpm`"),
         ("weight: 0.5}}", "weight: 0.5, evaluator: smf}}", "9:", "an evaluator"),
@@ -37,11 +37,11 @@ fn what_does_not_go_together_is_refused_where_it_stands() {
         ("weight: 0.5}}", "weight: 0.5, threshold: 2}}", "9:", "threshold"),
         ("init: mdm,", "init: evaluator,", "10:", "a model"),
         ("init: mdm,", "network: {width: 30},", "10:", "does not divide"),
-        ("init: mdm,", "diffusion: {schedule: flow, prediction: sample},", "10:", "a flow is none"),
+        ("init: mdm,", "diffusion: {schedule: flow, prediction: sample},", "10:", "no sampler for the schedule"),
         ("init: mdm,", "network: {width: 16384, feed_forward: 65536},", "10:", "parameters"),
         ("[1, 2]", "[1, 2, 2, 2, 2]", "11:", "1 to 4 numbers"),
         ("{width: 16, ", "{width: 12, ", "11:", "heads and groups"),
-        ("stages:\n", "stages:\n  lcm: {kind: distill.lcm, teacher: mdm}\n", "", "is no latent diffusion"),
+        ("stages:\n", "stages:\n  lcm: {kind: distill.lcm, teacher: mdm}\n", "", "is not a latent diffusion model"),
         ("stages:\n", "stages:\n  fid: {kind: evaluate.latent_fid, model: mdm}\n", "", "has no latents"),
     ] {
         assert!(GOOD.contains(from), "{from}");

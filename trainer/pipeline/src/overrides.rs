@@ -28,7 +28,7 @@ pub(crate) fn apply(root: &mut Node, text: &str, source: usize, budget: &mut Bud
         return Err(format!("its path has a key of {} bytes; at most {} are read", long.len(), limits::KEY_BYTES));
     }
     if keys.iter().any(|key| key.is_empty()) {
-        return Err(format!("`{path}` is not a path of keys; expected such as `stages.vae.lr`"));
+        return Err(format!("`{path}` is not a path of keys; expected a path such as `stages.vae.lr`"));
     }
     if !TOP_KEYS.contains(&keys[0]) {
         // `vae.lr` abbreviates `stages.vae.lr`.
@@ -51,7 +51,7 @@ pub(crate) fn apply(root: &mut Node, text: &str, source: usize, budget: &mut Bud
     } else {
         yaml::parse(value, source, budget).map_err(|mistakes| {
             let first = mistakes.into_iter().next().map_or_else(String::new, |mistake| mistake.message);
-            format!("the value `{}` does not parse: {first}", yaml::shortened(value))
+            format!("cannot parse the value `{}`: {first}", yaml::shortened(value))
         })?
     };
     put(root, &keys, value, at, path.trim())
@@ -75,7 +75,7 @@ fn put(node: &mut Node, keys: &[&str], value: Node, at: Position, path: &str) ->
             let length = items.len();
             match key.parse::<usize>().ok().and_then(|index| items.get_mut(index)) {
                 Some(item) => put(item, rest, value, at, path),
-                None => Err(format!("`{key}` in `{path}` is no index of a list of {length}")),
+                None => Err(format!("`{key}` in `{path}` is not an index of a list of {length} entries")),
             }
         }
         Content::Scalar { value: Value::Null, .. } => {
@@ -83,7 +83,7 @@ fn put(node: &mut Node, keys: &[&str], value: Node, at: Position, path: &str) ->
             put(node, keys, value, at, path)
         }
         Content::Scalar { text, .. } => {
-            Err(format!("`{key}` in `{path}` leads into the value `{}`, which has no keys", yaml::shortened(text)))
+            Err(format!("`{key}` in `{path}` is not a key: the value `{}` has no keys", yaml::shortened(text)))
         }
     }
 }

@@ -267,15 +267,15 @@ fn a_pipeline_that_came_as_json_keeps_the_same_bounds() {
         assert!(said.contains(part) && !said.contains(|c: char| c.is_control() && c != '\n'), "{part}: {said:?}");
     };
     for name in ["../../a", "a/b", "a\u{1b}[31m", "A", "", ".", "vae.t00.r0", "a\nb", &"x".repeat(65)] {
-        refuse("is not a stage name", &|p| p.stages[0].name = name.into());
+        refuse("is not a valid stage name", &|p| p.stages[0].name = name.into());
     }
     for name in ["../p", "p\u{7}", "", "p q"] {
-        refuse("is not a pipeline name", &|p| p.name = name.into());
+        refuse("is not a valid pipeline name", &|p| p.name = name.into());
     }
     refuse("0 stages", &|p| p.stages.clear());
     refuse("1001 stages", &|p| p.stages = vec![p.stages[0].clone(); 1001]);
     refuse("two stages are called", &|p| p.stages.insert(1, p.stages[0].clone()));
-    refuse("holds a control character", &|p| {
+    refuse("has a control character", &|p| {
         let StageSettings::DataOpen(s) =
             &mut p.stages.iter_mut().find(|s| s.name.as_str() == "folder").unwrap().settings
         else {
@@ -285,18 +285,18 @@ fn a_pipeline_that_came_as_json_keeps_the_same_bounds() {
     });
     refuse("workers.max", &|p| p.stages[0].placement.workers.max = usize::MAX);
     refuse("checkpoint.keep.latest", &|p| p.stages[0].placement.checkpoint.keep.latest = usize::MAX);
-    refuse("says that a sweep made it", &|p| {
+    refuse("is marked as created by a sweep", &|p| {
         p.stages.iter_mut().find_map(|s| s.settings.training_mut()).unwrap().stop = Some(Steps(1));
     });
-    refuse("of which its settings know nothing", &|p| {
+    refuse("but its settings have no such input", &|p| {
         let first = p.stages[0].name.clone();
         let input = StageInput { field: "evaluations.x\u{1b}".into(), stage: first, kind: ArtifactKind::Report };
         p.stages.last_mut().unwrap().inputs.push(input);
     });
-    refuse("which it does not read", &|p| {
+    refuse("but it does not read", &|p| {
         p.stages[0].external.insert("vae\u{1b}".into(), Digest::of(b"z"));
     });
-    refuse("there is no kind", &|p| {
+    refuse("unknown stage kind", &|p| {
         p.code_versions.insert("train.\u{1b}".into(), 1);
     });
 }
@@ -317,7 +317,7 @@ fn a_sweep_that_came_as_json_keeps_the_bounds_of_one_in_a_file() {
     refuse("`rungs.factor` is 18446744073709551615", &|s| s.rungs.factor = u64::MAX);
     refuse("`rungs.first` is 18446744073709551615", &|s| s.rungs.first = Steps(u64::MAX));
     for path in ["kind", "steps", "teacher", "optimizer", "nothing", "a\u{1b}"] {
-        refuse("is not a setting that can be searched", &|s| {
+        refuse("cannot be searched", &|s| {
             s.space.insert(path.into(), Choice(vec![json!(1)]));
         });
     }
@@ -334,5 +334,5 @@ fn a_sweep_that_came_as_json_keeps_the_bounds_of_one_in_a_file() {
     let mut untrained = good.clone();
     let sweep = untrained.stages.iter_mut().find_map(|stage| stage.sweep.take()).unwrap();
     untrained.stages[0].sweep = Some(sweep);
-    assert!(untrained.check().unwrap_err().contains("only training stages are swept"));
+    assert!(untrained.check().unwrap_err().contains("only a training stage can have a sweep"));
 }

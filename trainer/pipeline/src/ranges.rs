@@ -131,7 +131,11 @@ fn walk(p: &mut Problems, field: &str, path: &str, value: &Value, place: Place<'
             p.add(field, format!("`{path}` has {} bytes; expected at most {}", text.len(), limits::TEXT_BYTES), "");
         }
         Value::String(text) if text.contains(char::is_control) => {
-            p.add(field, format!("`{path}` holds a control character, {}", text.escape_debug()), "write it without");
+            p.add(
+                field,
+                format!("`{path}` has a control character, {}", text.escape_debug()),
+                "remove the control character",
+            );
         }
         Value::Number(_) => {
             if let Some(range) = place.range.filter(|range| !range.holds(value)) {

@@ -132,7 +132,7 @@ impl Reader {
         }
         if sets.len() > limits::OVERRIDES {
             let message = format!("there are {} overrides; at most {} are read", sets.len(), limits::OVERRIDES);
-            self.mistake(root.at, "", message, Some("write them into the file".into()));
+            self.mistake(root.at, "", message, Some("write the overrides into the pipeline file".into()));
             return None;
         }
         for (i, set) in sets.iter().enumerate() {
@@ -158,7 +158,7 @@ impl Reader {
         overlay::<Head>(&mut base, root, "the pipeline", "", &["dataset", "text", "stages"], &mut self.mistakes);
         match root.entry("name") {
             None => {
-                let help = Some("begin with such as `name: my-first-pipeline`".to_owned());
+                let help = Some("start with a line such as `name: my-first-pipeline`".to_owned());
                 self.mistake(root.at, "name", "the pipeline has no `name`", help);
             }
             Some(entry) => {
@@ -166,7 +166,8 @@ impl Reader {
                     && !is_name(name)
                 {
                     let message = format!(
-                        "`{name}` is not a pipeline name; expected a letter or digit, then letters, digits, `.`, `_`, `-`, at most 64"
+                        "`{name}` is not a valid pipeline name; expected a letter or digit, then letters, digits, `.`, \
+                         `_` or `-`, at most 64 characters"
                     );
                     self.mistake(entry.value.at, "name", message, None);
                 }
@@ -192,7 +193,7 @@ impl Reader {
                 self.mistake(
                     at,
                     "stages.dataset",
-                    "the top-level key `dataset` already makes a stage of this name",
+                    "the top-level key `dataset` already defines a stage with this name",
                     None,
                 );
             }
@@ -201,7 +202,8 @@ impl Reader {
                 found.stages.push(stage("dataset", settings, Placement::default()));
             }
         } else if declared(root, "dataset").is_none() {
-            let help = "such as `dataset: {format: synthetic}` or `dataset: {format: humanml3d, path: data/HumanML3D}`";
+            let help =
+                "for example `dataset: {format: synthetic}` or `dataset: {format: humanml3d, path: data/HumanML3D}`";
             self.mistake(root.at, "dataset", "the pipeline has no `dataset`", Some(help.into()));
             // Readers of the stage need not report it again.
             found.written.push(Written { name: "dataset".into(), key_at: root.at, node: None, path: "dataset".into() });
@@ -216,7 +218,7 @@ impl Reader {
                     self.mistake(
                         at,
                         "stages.text",
-                        "the top-level key `text` already makes a stage of this name",
+                        "the top-level key `text` already defines a stage with this name",
                         None,
                     );
                 }
@@ -240,7 +242,7 @@ impl Reader {
                 root.at,
                 "stages",
                 "the pipeline has no `stages`",
-                Some("such as `stages: {vae: {kind: train.vae}}`".into()),
+                Some("for example `stages: {vae: {kind: train.vae}}`".into()),
             ),
             Some(entry) => match entry.value.map() {
                 Some([]) => {
@@ -269,7 +271,12 @@ impl Reader {
                 None => {
                     let shown = entry.value.describe();
                     let message = format!("`stages` is {shown}; expected a mapping from names to stages");
-                    self.mistake(entry.value.at, "stages", message, Some("such as `vae: {kind: train.vae}`".into()));
+                    self.mistake(
+                        entry.value.at,
+                        "stages",
+                        message,
+                        Some("for example `vae: {kind: train.vae}`".into()),
+                    );
                 }
             },
         }
@@ -284,7 +291,7 @@ impl Reader {
                 node.at,
                 "dataset",
                 message,
-                Some("such as `{format: humanml3d, path: data/HumanML3D}`".into()),
+                Some("for example `{format: humanml3d, path: data/HumanML3D}`".into()),
             );
             return None;
         }
@@ -319,13 +326,14 @@ impl Reader {
         let owner = format!("stage `{name}`");
         if !is_stage_name(name) {
             let message = format!(
-                "`{name}` is not a stage name; expected a small letter, then small letters, digits, `_`, `-`, at most 64"
+                "`{name}` is not a valid stage name; expected a lowercase letter, then lowercase letters, digits, `_` \
+                 or `-`, at most 64 characters"
             );
             self.mistake(entry.key_at, &path, message, None);
         }
         if node.map().is_none() {
             let message = format!("{owner} is {}; expected a mapping with `kind`", node.describe());
-            self.mistake(node.at, &path, message, Some(format!("such as `{name}: {{kind: train.vae}}`")));
+            self.mistake(node.at, &path, message, Some(format!("for example `{name}: {{kind: train.vae}}`")));
             return None;
         }
         let default = self.kind(node, entry.key_at, &owner, &path)?;
@@ -404,8 +412,8 @@ impl Reader {
                 let first = cycle.first().cloned();
                 let path = cycle.iter().map(|name| format!("`{name}`")).collect::<Vec<_>>().join(" -> ");
                 let at = written.iter().find(|w| Some(&w.name) == first.as_ref()).map_or(root.at, |w| w.key_at);
-                let help = "each stage of the cycle reads the next one; let one of them read another stage";
-                self.mistake(at, "stages", format!("stages wait for each other: {path}"), Some(help.into()));
+                let help = "each stage of the cycle reads the next one; change an input of one of them";
+                self.mistake(at, "stages", format!("stages form a cycle: {path}"), Some(help.into()));
                 None
             }
         };

@@ -45,7 +45,7 @@ impl Reader {
         match serde_json::from_value(base) {
             Ok(value) => Some(value),
             Err(error) => {
-                self.mistake(node.at, path, format!("{owner} does not fit together: {error}"), None);
+                self.mistake(node.at, path, format!("{owner} has settings that conflict: {error}"), None);
                 None
             }
         }
@@ -65,7 +65,7 @@ impl Reader {
             let question = near.map(|near| format!("; did you mean `{near}`?")).unwrap_or_default();
             let message = match kind.value.as_text() {
                 Some(text) => format!("unknown kind `{text}` of {owner}{question}"),
-                None => format!("`kind` of {owner} is {}; expected a text", kind.value.describe()),
+                None => format!("`kind` of {owner} is {}; expected a string", kind.value.describe()),
             };
             let help = Some(format!("kinds: {}", list_keys(kinds)));
             self.mistake(kind.value.at, &format!("{path}.kind"), message, help);

@@ -40,13 +40,13 @@ pub fn json_schema() -> Value {
     });
     properties["text"] = described(&TextEmbed::default());
     properties["stages"] = json!({
-        "description": "What is done, by names of your own.",
+        "description": "The stages, by name.",
         "type": "object",
         "minProperties": 1,
         "propertyNames": {"pattern": "^[a-z][a-z0-9_-]{0,63}$"},
         "additionalProperties": {
             "type": "object",
-            "properties": {"kind": {"description": "What the stage does.", "enum": kinds}},
+            "properties": {"kind": {"description": "The kind of the stage.", "enum": kinds}},
             "required": ["kind"],
             "allOf": cases,
         },
@@ -82,7 +82,7 @@ fn described_kind(settings: &StageSettings) -> Value {
         let lead = match target {
             Target::Stage(kind) => {
                 let or = if kind.is_of_models() && settings.shape() != Shape::Registry { " or a version" } else { "" };
-                format!("{} stage{or} that gives {}", if key == field { "A" } else { "Each a" }, kind.noun())
+                format!("{} stage{or} that outputs {}", if key == field { "A" } else { "Each a" }, kind.noun())
             }
             Target::Dataset(_) | Target::Folder => "A folder".to_owned(),
             Target::File => "A file".to_owned(),
@@ -109,11 +109,11 @@ fn references(settings: &StageSettings) -> BTreeMap<String, Target> {
 /// Reference of all kinds and keys, `docs/pipeline.md`.
 pub fn markdown() -> String {
     let mut text = String::from(
-        "# Stage kinds and their keys\n\n\
-         Generated from the code: `trainer schema --markdown`. `trainer schema` prints the same as JSON Schema, for editors that check YAML.\n\n\
-         A pipeline has the keys `name`, `seed`, `backend`, `dataset` (a `data.synthetic` or `data.open` stage of this name), `text` (a\n\
-         `text.embed` stage) and `stages`, a mapping from names to stages. A stage has a `kind`, the keys of its kind, and where they make sense\n\
-         the keys of every stage. Keys are closed: an unknown one is an error.\n\n",
+        "# Stage kinds and their keys\n\nGenerated from the code: `trainer schema --markdown`. `trainer schema` prints \
+         the same as JSON Schema, for editors that check YAML.\n\nA pipeline has the keys `name`, `seed`, `backend`, \
+         `dataset` (a `data.synthetic` or `data.open` stage with this name), `text` (a\n`text.embed` stage) and \
+         `stages`, a mapping from names to stages. A stage has a `kind`, the keys of its kind, and, where they \
+         apply,\nthe keys of every stage. An unknown key is an error.\n\n",
     );
     let all = StageSettings::all();
     for settings in &all {
@@ -122,25 +122,25 @@ pub fn markdown() -> String {
     let placement = described(&Placement::default());
     let _ = writeln!(text, "\n## Every stage\n\n{}\n", sentence(&placement));
     table(&mut text, &placement);
-    let _ = writeln!(text, "\nA stage that trains may be searched over:\n");
+    let _ = writeln!(text, "\nA training stage may have a hyperparameter search, `sweep`:\n");
     table(&mut text, &sweep::described());
     for settings in &all {
         let schema = described_kind(settings);
         let (kind, output) = (settings.kind(), settings.output());
         let runs = match settings.shape() {
             Shape::Gang => "trained by a gang of workers",
-            Shape::Map => "cut into shards over workers",
-            Shape::Plain => "done by one worker",
-            Shape::Registry => "done by the coordinator",
+            Shape::Map => "split into shards over workers",
+            Shape::Plain => "run by one worker",
+            Shape::Registry => "run by the coordinator",
         };
         let _ = writeln!(text, "\n## {kind}\n\n{}\n", sentence(&schema));
         let version = settings.code_version();
         // The output of `import.model` is described at its parts.
         let gives = match settings.get::<ImportModel>() {
-            Some(_) => "what `part` says".to_owned(),
+            Some(_) => "the artifact that `part` names".to_owned(),
             None => format!("{} (`{}`)", output.kind.noun(), output.name),
         };
-        let _ = writeln!(text, "Gives {gives}; {runs}; code version {version}.\n");
+        let _ = writeln!(text, "Outputs {gives}; {runs}; code version {version}.\n");
         table(&mut text, &schema);
     }
     text
@@ -199,14 +199,14 @@ fn kind_of_value(property: &Value) -> String {
     };
     let base = match (&property["type"], property.get("prefixItems")) {
         _ if !words.is_empty() => words.iter().map(|word| format!("`{word}`")).collect::<Vec<_>>().join(", "),
-        _ if optional => "whole number or nothing".to_owned(),
+        _ if optional => "whole number or null".to_owned(),
         _ if whole => "whole number".to_owned(),
         (Value::String(word), _) if word == "number" => "number".to_owned(),
         (Value::String(word), _) if word == "boolean" => "`true` or `false`".to_owned(),
-        (Value::String(word), _) if word == "string" => "text".to_owned(),
+        (Value::String(word), _) if word == "string" => "string".to_owned(),
         (_, Some(_)) => "two numbers".to_owned(),
         (Value::String(word), _) if word == "array" => "list of numbers".to_owned(),
-        (Value::Array(_), _) => "list of texts".to_owned(),
+        (Value::Array(_), _) => "list of strings".to_owned(),
         _ => "mapping".to_owned(),
     };
     let list = [&property["items"], &property["prefixItems"][0]];

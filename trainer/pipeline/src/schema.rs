@@ -97,7 +97,7 @@ impl Walk<'_> {
             return;
         }
         let Some(mut value) = node.to_json() else {
-            self.push(node.at, path, format!("{label} holds a number that is not finite"), None);
+            self.push(node.at, path, format!("{label} has a number that is not finite"), None);
             return;
         };
         // One text is a list of one.
@@ -132,8 +132,8 @@ fn expectation(example: &Value, node: &Node, reason: &str) -> (String, Option<St
         _ if steps => "a whole number of steps, such as 2000, `300k` or `2000 steps`".to_owned(),
         Value::Bool(_) => "`true` or `false`".into(),
         Value::Number(number) if number.is_f64() => "a number".into(),
-        Value::Number(_) => "a whole number, not negative".into(),
-        Value::String(_) => "a text".into(),
+        Value::Number(_) => "a whole number of 0 or more".into(),
+        Value::String(_) => "a string".into(),
         Value::Array(items) if items.len() == 2 && items[0].is_number() => {
             "a list of two numbers, such as `[5, 15]`".into()
         }
@@ -143,17 +143,17 @@ fn expectation(example: &Value, node: &Node, reason: &str) -> (String, Option<St
     };
     let help = match (&node.value, example) {
         (Content::Scalar { value: Value::Number(_) | Value::Bool(_), text, .. }, Value::String(_)) => {
-            Some(format!("if the text is meant, quote it: \"{text}\""))
+            Some(format!("to write a string, quote it: \"{text}\""))
         }
         (Content::Scalar { value: Value::String(text), plain: false, .. }, Value::Number(_))
             if text.parse::<f64>().is_ok() =>
         {
-            Some("leave out the quotes".into())
+            Some("remove the quotes".into())
         }
         (Content::Scalar { value: Value::String(_), .. }, Value::Number(number)) if number.is_f64() => {
-            Some("write it as in 0.0002 or 2e-4".into())
+            Some("write a number such as 0.0002 or 2e-4".into())
         }
-        (Content::Scalar { value: Value::Null, .. }, _) => Some("give a value, or leave the key out".into()),
+        (Content::Scalar { value: Value::Null, .. }, _) => Some("set a value, or remove the key".into()),
         (Content::List(_), Value::Array(_)) | (_, Value::Null) => Some(reason_in_short(reason)),
         _ => None,
     };
@@ -168,7 +168,7 @@ fn reason_in_short(reason: &str) -> String {
 pub(crate) fn unknown_key(key: &str, place: &str, known: &[&str]) -> (String, String) {
     let list = list_keys(known.iter().copied());
     if key == "<<" {
-        return (format!("merge keys are not read {place}"), "write the keys out".into());
+        return (format!("merge keys are not supported {place}"), "write each key".into());
     }
     match nearest(key, known.iter().copied()) {
         Some(near) => (format!("unknown key `{key}` {place}; did you mean `{near}`?"), format!("known keys: {list}")),

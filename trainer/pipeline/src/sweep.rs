@@ -55,11 +55,14 @@ pub(crate) fn described() -> Value {
     let mut schema = schema_of(&Head::default());
     let properties = &mut schema["properties"];
     properties["space"] = json!({
-        "description": "Settings of the stage, each with `choice: [a, b]`, `uniform: [from, to]` or `log_uniform: [from, to]`; below `evaluate` those of the stage that evaluates, such as `evaluate: {sampler: {guidance: {choice: [2, 3]}}}`.",
+        "description": "Settings of the stage, each with `choice: [a, b]`, `uniform: [from, to]` or `log_uniform: \
+            [from, to]`. Below `evaluate`: settings of the evaluation stage, such as `evaluate: {sampler: {guidance: \
+            {choice: [2, 3]}}}`.",
         "type": "object",
     });
     properties["evaluate"] = json!({
-        "description": "The stage that evaluates a trial, without what it evaluates: an `evaluate.*` kind and its keys.",
+        "description": "The stage that evaluates a trial: an `evaluate.*` kind and its keys, without the input that \
+            it evaluates.",
         "type": "object",
         "required": ["kind"],
     });
@@ -74,7 +77,7 @@ impl Reader {
         let owner = format!("`sweep` of stage `{name}`");
         if default.training().is_none() {
             let message = format!(
-                "stage `{name}` is of kind `{}`, which does not train; only training stages are swept",
+                "stage `{name}` has kind `{}`, which does not train; only a training stage can have a sweep",
                 default.kind()
             );
             self.mistake(entry.key_at, &path, message, None);
@@ -83,7 +86,8 @@ impl Reader {
         let node = &entry.value;
         if node.map().is_none() {
             let message = format!("{owner} is {}; expected a mapping", node.describe());
-            let help = "such as `{search: asha, metric: latent_fid, trials: 24, space: {lr: {log_uniform: [1e-4, 1e-3]}}, evaluate: {kind: evaluate.latent_fid}}`";
+            let help = "for example `{search: asha, metric: latent_fid, trials: 24, space: {lr: {log_uniform: [1e-4, \
+                1e-3]}}, evaluate: {kind: evaluate.latent_fid}}`";
             self.mistake(node.at, &path, message, Some(help.into()));
             return None;
         }
@@ -91,7 +95,7 @@ impl Reader {
         let mut space = BTreeMap::new();
         match node.entry("space") {
             None => {
-                let help = "such as `space: {lr: {log_uniform: [1e-4, 1e-3]}}`";
+                let help = "for example `space: {lr: {log_uniform: [1e-4, 1e-3]}}`";
                 self.mistake(
                     entry.key_at,
                     &format!("{path}.space"),
@@ -112,7 +116,8 @@ impl Reader {
         }
         let evaluate = match node.entry("evaluate") {
             None => {
-                let help = "a stage without its own name, such as `evaluate: {kind: evaluate.latent_fid, sampler: {steps: 1}}`";
+                let help = "write a stage without a name, such as `evaluate: {kind: evaluate.latent_fid, sampler: \
+                    {steps: 1}}`";
                 self.mistake(
                     entry.key_at,
                     &format!("{path}.evaluate"),
@@ -146,7 +151,7 @@ impl Reader {
         let node = &entry.value;
         if node.map().is_none() {
             let message = format!("{owner} is {}; expected a mapping with `kind`", node.describe());
-            self.mistake(node.at, path, message, Some("such as `{kind: evaluate.latent_fid}`".into()));
+            self.mistake(node.at, path, message, Some("for example `{kind: evaluate.latent_fid}`".into()));
             return None;
         }
         let evaluation = self.kind(node, entry.key_at, &owner, path)?;
@@ -157,9 +162,9 @@ impl Reader {
             let evaluations = evaluations.iter().filter(|evaluation| {
                 evaluation.output().kind == ArtifactKind::Report && evaluated_field(evaluation, gives).is_some()
             });
-            let message = format!("`{}` does not measure {}, which `{name}` gives", evaluation.kind(), gives.noun());
+            let message = format!("`{}` does not measure {}, the output of `{name}`", evaluation.kind(), gives.noun());
             let at = node.entry("kind").map_or(node.at, |kind| kind.value.at);
-            let help = format!("kinds that do: {}", list_keys(evaluations.map(StageSettings::kind)));
+            let help = format!("kinds that measure it: {}", list_keys(evaluations.map(StageSettings::kind)));
             self.mistake(at, &format!("{path}.kind"), message, Some(help));
             return None;
         };
@@ -167,8 +172,8 @@ impl Reader {
             && written.value.as_text() != Some(name)
         {
             let message =
-                format!("`{field}` of {owner} is {}; a sweep evaluates its own trials", written.value.describe());
-            self.mistake(written.value.at, &format!("{path}.{field}"), message, Some("leave it out".into()));
+                format!("`{field}` of {owner} is {}, but a sweep evaluates its own trials", written.value.describe());
+            self.mistake(written.value.at, &format!("{path}.{field}"), message, Some("remove it".into()));
             return None;
         }
         let mut base = serde_json::to_value(&evaluation).ok()?;
@@ -186,12 +191,9 @@ impl Reader {
     ) {
         let place = if keys.is_empty() { "`space`".to_owned() } else { format!("`space.{}`", keys.join(".")) };
         let Some(entries) = node.map() else {
-            let message = format!(
-                "{place} is {}; expected settings of {} with the values that they may take",
-                node.describe(),
-                walk.owner
-            );
-            self.mistake(node.at, path, message, Some("such as `lr: {log_uniform: [1e-4, 1e-3]}`".into()));
+            let message =
+                format!("{place} is {}; expected settings of {} with the values to try", node.describe(), walk.owner);
+            self.mistake(node.at, path, message, Some("for example `lr: {log_uniform: [1e-4, 1e-3]}`".into()));
             return;
         };
         if entries.is_empty() {
@@ -212,13 +214,13 @@ impl Reader {
             let references: Vec<String> =
                 walk.default.clone().refs().into_iter().map(|reference| reference.field.into_owned()).collect();
             if keys.is_empty() && entry.key == "steps" {
-                let help = "the stage's `steps` are the budget of every trial; search something else";
+                let help = "`steps` of the stage is the budget of every trial; search another setting";
                 self.mistake(entry.key_at, &path, "`steps` cannot be searched", Some(help.into()));
                 continue;
             }
             if keys.is_empty() && references.contains(&entry.key) {
-                let message = format!("`{}` names a stage or a folder, which cannot be searched", entry.key);
-                self.mistake(entry.key_at, &path, message, Some("write a stage for each of them instead".into()));
+                let message = format!("`{}` names a stage or a folder, so it cannot be searched", entry.key);
+                self.mistake(entry.key_at, &path, message, Some("write one stage for each value instead".into()));
                 continue;
             }
             let known = example.as_object().into_iter().flat_map(|known| known.keys().map(String::as_str));
@@ -255,7 +257,7 @@ impl Reader {
                 return None;
             }
             _ => {
-                let message = format!("{label} is {}; expected the values that it may take", node.describe());
+                let message = format!("{label} is {}; expected the values to try", node.describe());
                 self.mistake(node.at, path, message, help());
                 return None;
             }
@@ -301,13 +303,13 @@ impl Reader {
                 if low > 0.0 {
                     return Some(Domain::LogUniform(low, high));
                 }
-                let message = format!("`log_uniform` of {label} begins at {low}; expected a number above 0");
+                let message = format!("`log_uniform` of {label} starts at {low}; expected a number above 0");
                 self.mistake(items[0].at, &path, message, None);
             }
             _ => {
                 let message =
-                    format!("`{}` of {label} is not a range; expected two numbers, the smaller first", entry.key);
-                self.mistake(entry.value.at, &path, message, Some("values without an order go into `choice`".into()));
+                    format!("`{}` of {label} is not a range; expected two numbers, the smaller one first", entry.key);
+                self.mistake(entry.value.at, &path, message, Some("use `choice` for values without an order".into()));
             }
         }
         None

@@ -18,7 +18,11 @@ pub(crate) fn rules(stage: &PipelineStage) -> Vec<Problem> {
     let mut problems = Problems::default();
     let (p, Some(sweep)) = (&mut problems, &stage.sweep) else { return problems.0 };
     let Some(training) = stage.settings.training() else {
-        p.add("sweep", format!("`{}` does not train; only training stages are swept", stage.settings.kind()), "");
+        p.add(
+            "sweep",
+            format!("`{}` does not train; only a training stage can have a sweep", stage.settings.kind()),
+            "",
+        );
         return problems.0;
     };
     space_rules(p, stage, sweep);
@@ -43,18 +47,18 @@ pub(crate) fn rules(stage: &PipelineStage) -> Vec<Problem> {
 /// Checks that the evaluation gives the metric.
 fn metric_rules(p: &mut Problems, sweep: &Sweep) {
     if sweep.metric.trim().is_empty() {
-        p.add("sweep.metric", "`metric` is missing: the value of `evaluate` that decides which trial is best", "");
+        p.add("sweep.metric", "`metric` is missing; set it to the value of `evaluate` that ranks the trials", "");
     }
     if let Some(given) = sweep.evaluate.metrics()
         && !sweep.metric.trim().is_empty()
         && !given.contains(&sweep.metric)
     {
         let message =
-            format!("`{}` does not give `{}`, by which trials are compared", sweep.evaluate.kind(), sweep.metric);
+            format!("`{}` does not report `{}`, the metric that ranks the trials", sweep.evaluate.kind(), sweep.metric);
         let names = given.iter().filter(|name| !name.ends_with(".lower") && !name.ends_with(".upper"));
         let near = nearest(&sweep.metric, names.clone().map(String::as_str));
         let meant = near.map(|near| format!("did you mean `{near}`? ")).unwrap_or_default();
-        let help = format!("{meant}name one of {}", list_keys(names.map(String::as_str)));
+        let help = format!("{meant}use one of {}", list_keys(names.map(String::as_str)));
         p.add("sweep.metric", message, &help);
     }
 }
@@ -68,7 +72,7 @@ fn search_rules(p: &mut Problems, sweep: &Sweep) {
         (SearchKind::Grid, None) => {
             let ranges = sweep.space.iter().filter(|(_, domain)| !matches!(domain, Domain::Choice(_)));
             for (path, _) in ranges {
-                let message = format!("`{path}` is a range, which has no grid");
+                let message = format!("`{path}` is a range, but a grid needs a list of values");
                 p.add(
                     &format!("sweep.space.{path}"),
                     message,
@@ -79,7 +83,7 @@ fn search_rules(p: &mut Problems, sweep: &Sweep) {
         (SearchKind::Grid, Some(points)) => {
             if sweep.trials != 0 && sweep.trials != points {
                 let message = format!("`trials` is {}, but the grid has {points} points", sweep.trials);
-                p.add("sweep.trials", message, "leave it out, or search with `random`");
+                p.add("sweep.trials", message, "remove `trials`, or search with `random`");
             }
             if points > MAX_TRIALS {
                 p.add("sweep.space", format!("the grid has {points} points; expected at most {MAX_TRIALS}"), "");
@@ -88,7 +92,7 @@ fn search_rules(p: &mut Problems, sweep: &Sweep) {
         (SearchKind::Random | SearchKind::Asha, _) => {
             if !(1..=MAX_TRIALS).contains(&sweep.trials) {
                 let message = format!("`trials` is {}; expected 1 to {MAX_TRIALS}", sweep.trials);
-                p.add("sweep.trials", message, "how many points of the space are tried");
+                p.add("sweep.trials", message, "set it to the number of points to try");
             }
         }
     }
@@ -101,14 +105,14 @@ fn rung_rules(p: &mut Problems, sweep: &Sweep, steps: Steps) {
         if first.0 == 0 || first >= steps {
             let message =
                 format!("`rungs.first` is {first}; expected fewer steps than the stage's {steps}, and at least 1");
-            p.add("sweep.rungs.first", message, "the steps after which trials are compared for the first time");
+            p.add("sweep.rungs.first", message, "trials are first compared after this number of steps");
         }
         if !(2..=1000).contains(&factor) {
             p.add("sweep.rungs.factor", format!("`rungs.factor` is {factor}; expected 2 to 1000"), "");
         }
     } else if sweep.rungs != Rungs::default() {
-        let message = format!("`rungs` are for `asha`; with `{}` every trial trains to the end", sweep.search.name());
-        p.add("sweep.rungs", message, "leave them out");
+        let message = format!("only `asha` has `rungs`; with `{}`, every trial trains to the end", sweep.search.name());
+        p.add("sweep.rungs", message, "remove `rungs`");
     }
 }
 
@@ -141,7 +145,7 @@ fn space_rules(p: &mut Problems, stage: &PipelineStage, sweep: &Sweep) {
         p.add("sweep.space", message, "");
     }
     if sweep.metric.len() > limits::KEY_BYTES || sweep.metric.contains(char::is_control) {
-        p.add("sweep.metric", "`metric` is not the name of a value", "such as `latent_fid`");
+        p.add("sweep.metric", "`metric` is not a valid metric name", "expected a name such as `latent_fid`");
     }
     let references = |settings: &StageSettings| -> Vec<String> {
         settings.clone().refs().into_iter().map(|reference| reference.field.into_owned()).collect()
@@ -155,7 +159,7 @@ fn space_rules(p: &mut Problems, stage: &PipelineStage, sweep: &Sweep) {
             None => (&path[..], &of_stage),
         };
         if found.is_none() || own == "kind" || own == "steps" || references.iter().any(|field| field == own) {
-            p.add(&field, format!("`{}` is not a setting that can be searched", path.escape_debug()), "");
+            p.add(&field, format!("`{}` cannot be searched", path.escape_debug()), "");
             continue;
         }
         let sound = match domain {
@@ -221,7 +225,8 @@ pub(crate) fn check_agreement(stages: &[PipelineStage], found: &mut ByStage) {
                     problems.into_iter().find_map(|(name, wrong)| Some((name, wrong.0.into_iter().next()?)))
                 {
                     let field = format!("sweep.space.{path}.choice[{at}]");
-                    let message = format!("with `{path}` at {value} stage `{other}` does not fit: {}", problem.message);
+                    let message =
+                        format!("with `{path}` at {value}, stage `{other}` does not fit: {}", problem.message);
                     found.entry(stage.name.clone()).or_default().add(&field, message, "");
                 }
             }

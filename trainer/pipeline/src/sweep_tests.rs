@@ -34,7 +34,7 @@ stages:
 
 /// Cases: the text replaced, the replacement, the place of the mistake, and parts of its message.
 const CASES: &[(&str, &str, &str, &[&str])] = &[
-    ("search: asha", "search: ahsa", "11:15", &["the text `ahsa`", "did you mean `asha`?"]),
+    ("search: asha", "search: ahsa", "11:15", &["the string `ahsa`", "did you mean `asha`?"]),
     (
         "search: asha",
         "serach: asha",
@@ -42,26 +42,26 @@ const CASES: &[(&str, &str, &str, &[&str])] = &[
         &["unknown key `serach` in `sweep` of stage `pcm`; did you mean `search`?"],
     ),
     ("metric: latent_fid\n", "metric: ''\n", "12:15", &["`metric` is missing"]),
-    ("metric: latent_fid\n", "mode: most\n", "12:13", &["the text `most`; expected one of `min`, `max`"]),
+    ("metric: latent_fid\n", "mode: most\n", "12:13", &["the string `most`; expected one of `min`, `max`"]),
     ("trials: 24", "trials: 0", "13:15", &["`trials` is 0; expected 1 to 10000"]),
-    ("trials: 24", "trials: few", "13:15", &["the text `few`; expected a whole number"]),
+    ("trials: 24", "trials: few", "13:15", &["the string `few`; expected a whole number"]),
     ("trials: 24", "parallel: 0", "13:17", &["`parallel` is 0"]),
     ("first: 100,", "first: 900,", "14:22", &["fewer steps than the stage's 900"]),
     ("{first: 100, factor: 3}", "{factor: 3}", "14:14", &["`rungs.first` is 0"]),
     ("factor: 3", "factor: 1", "14:35", &["`rungs.factor` is 1; expected 2 to 1000"]),
-    ("search: asha", "search: random", "14:14", &["`rungs` are for `asha`"]),
+    ("search: asha", "search: random", "14:14", &["only `asha` has `rungs`"]),
     ("        skip:", "        skp:", "17:9", &["unknown key `skp` in `space` of stage `pcm`; did you mean `skip`?"]),
     ("        skip: {choice: [50, 100]}", "        steps: {choice: [50]}", "17:9", &["`steps` cannot be searched"]),
     ("        skip: {choice: [50, 100]}", "        teacher: {choice: [mld]}", "17:9", &["names a stage"]),
     ("        skip: {choice: [50, 100]}", "        kind: {choice: [x]}", "17:9", &["unknown key `kind`"]),
-    ("[50, 100]", "[50, many]", "17:29", &["`skip` of stage `pcm` is the text `many`; expected a whole number"]),
+    ("[50, 100]", "[50, many]", "17:29", &["`skip` of stage `pcm` is the string `many`; expected a whole number"]),
     ("[50, 100]", "[50, 30]", "17:29", &["with `skip` at 30", "expected a divisor of the 1000 timesteps"]),
     ("[50, 100]", "[50, 50]", "17:29", &["lists 50 twice"]),
     ("[50, 100]", "[]", "17:24", &["`choice` of `space.skip` is empty"]),
     ("{choice: [50, 100]}", "[50, 100]", "17:15", &["`space.skip` is a list of 2", "write `{choice: [a, b]}`"]),
     ("{choice: [50, 100]}", "{choices: [50, 100]}", "17:16", &["unknown key `choices`", "did you mean `choice`?"]),
     ("{uniform: [0.9, 0.99]}", "{uniform: [0.9, 1]}", "18:30", &["with `ema` at 1", "below 1"]),
-    ("{uniform: [0.9, 0.99]}", "{uniform: [0.99, 0.9]}", "18:24", &["two numbers, the smaller first"]),
+    ("{uniform: [0.9, 0.99]}", "{uniform: [0.99, 0.9]}", "18:24", &["two numbers, the smaller one first"]),
     ("{uniform: [0.9, 0.99]}", "{log_uniform: [0, 0.9]}", "18:29", &["expected a number above 0"]),
     ("{uniform: [0.9, 0.99]}", "{uniform: 0.9}", "18:24", &["expected a list"]),
     (
@@ -88,7 +88,7 @@ const CASES: &[(&str, &str, &str, &[&str])] = &[
         "20:24",
         &["`evaluate.reconstruction` does not measure a model", "`evaluate.latent_fid`"],
     ),
-    ("teacher: mld", "model: mld", "20:52", &["a sweep evaluates its own trials", "leave it out"]),
+    ("teacher: mld", "model: mld", "20:52", &["a sweep evaluates its own trials", "remove it"]),
     ("teacher: mld", "teacher: mdl", "20:54", &["the stage `mdl`, which does not exist; did you mean `mld`?"]),
     ("teacher: mld", "repeats: 0", "20:54", &["`repeats` is 0"]),
     (
@@ -113,7 +113,7 @@ const CASES: &[(&str, &str, &str, &[&str])] = &[
         "  latents: {kind: encode.latents}",
         "  latents: {kind: encode.latents, sweep: {}}",
         "5:35",
-        &["only training stages are swept"],
+        &["only a training stage can have a sweep"],
     ),
 ];
 
@@ -176,7 +176,7 @@ fn each_mistake_in_a_sweep_is_named_with_its_place() {
 fn a_grid_has_points_and_no_ranges() {
     let grid = GOOD.replace("search: asha", "search: grid").replace("      rungs: {first: 100, factor: 3}\n", "");
     let shown = read("p.yaml", &grid, &[]).unwrap_err().to_string();
-    assert!(shown.contains("`ema` is a range, which has no grid"), "{shown}");
+    assert!(shown.contains("`ema` is a range, but a grid needs a list of values"), "{shown}");
     let choices = grid.replace("{uniform: [0.9, 0.99]}", "{choice: [0.9, 0.95]}");
     let choices = choices.replace("beta1: {uniform: [0.5, 0.95]}", "beta1: {choice: [0.5, 0.8, 0.95]}");
     let shown = read("p.yaml", &choices, &[]).unwrap_err().to_string();

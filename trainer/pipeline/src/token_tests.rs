@@ -50,12 +50,12 @@ fn what_does_not_fit_is_refused_where_it_stands() {
         // Tokens of another codebook.
         ("tokens: tokens, tokenizer: residual", "tokens: ids, tokenizer: residual", 11, "was encoded with `plain`"),
         ("tokens: ids, tokenizer: plain", "tokens: tokens, tokenizer: residual", 12, "has 6 codebooks; expected 1"),
-        ("model: momask, decoder", "model: mmm, decoder", 14, "`flow` reads the codes of `residual`"),
-        ("tokenizer: residual, decoder: flow", "tokenizer: plain, decoder: flow", 21, "is of `plain`"),
-        ("decoder: latent_flow", "decoder: flow", 20, "`flow` reads the codes of `residual`"),
-        ("model: momask, decoder: flow", "model: momask, decoder: latent_flow", 14, "reads the latents of `vae`"),
-        ("tokenizer: residual, teacher: flow", "tokenizer: plain, teacher: flow", 19, "is of `plain`"),
-        ("teacher: flow}", "teacher: latent_flow}", 19, "reads the latents of `vae`"),
+        ("model: momask, decoder", "model: mmm, decoder", 14, "`flow` decodes the codes of `residual`"),
+        ("tokenizer: residual, decoder: flow", "tokenizer: plain, decoder: flow", 21, "has the codes of `plain`"),
+        ("decoder: latent_flow", "decoder: flow", 20, "`flow` decodes the codes of `residual`"),
+        ("model: momask, decoder: flow", "model: momask, decoder: latent_flow", 14, "decodes the latents of `vae`"),
+        ("tokenizer: residual, teacher: flow", "tokenizer: plain, teacher: flow", 19, "has the codes of `plain`"),
+        ("teacher: flow}", "teacher: latent_flow}", 19, "decodes the latents of `vae`"),
         // Clips of another skeleton.
         (
             "{kind: train.discord, tokenizer",
@@ -73,14 +73,9 @@ fn what_does_not_fit_is_refused_where_it_stands() {
             "decoder: flow, evaluator",
             "decoder: flow, dataset: kit, evaluator",
             21,
-            "`residual` is for skeletons of 22 joints",
+            "`residual` has skeletons of 22 joints",
         ),
-        (
-            "{kind: train.evaluator}",
-            "{kind: train.evaluator, dataset: kit}",
-            21,
-            "`judge` is for skeletons of 21 joints",
-        ),
+        ("{kind: train.evaluator}", "{kind: train.evaluator, dataset: kit}", 21, "`judge` has skeletons of 21 joints"),
         // Lengths that are not a multiple of the down-sampling.
         ("window: 64", "window: 63", 13, "expected a multiple of 4"),
         ("quantizers: 1, codes: 64", "quantizers: 1, window: 66", 8, "expected a multiple of 4"),
@@ -89,7 +84,7 @@ fn what_does_not_fit_is_refused_where_it_stands() {
         ("generator: mmm, ", "generator: mmm, text: words, ", 12, "embeds the captions of `kit`"),
         ("generator: mmm, ", "generator: mmm, dataset: kit, ", 12, "but `dataset` is `kit`"),
         ("generator: mmm, ", "generator: mmm, network: {word_blocks: 10}, ", 12, "`network.layers`, 9"),
-        ("guidance: 0}", "guidance: 2}", 22, "`mmm` has none"),
+        ("guidance: 0}", "guidance: 2}", 22, "`mmm` has no guidance"),
         // Kinds that need denoising, or latents.
         (
             "kind: evaluate.t2m, model: mmm, evaluator: judge",
@@ -101,7 +96,7 @@ fn what_does_not_fit_is_refused_where_it_stands() {
             "kind: model.decoder, model: mld, decoder: latent_flow",
             "kind: train.control, model: mmm",
             20,
-            "no latent diffusion",
+            "not a latent diffusion model",
         ),
         ("model: momask, decoder: flow", "model: judge, decoder: flow", 14, "needs a model"),
         // Networks with another prediction.
@@ -109,14 +104,14 @@ fn what_does_not_fit_is_refused_where_it_stands() {
             "init: flow",
             "init: whole",
             24,
-            "`init` is `whole`, whose network gives the data, but the one that is trained here gives the velocity",
+            "`init` is `whole`, whose network predicts the data, but this stage trains one that predicts the velocity",
         ),
-        ("init: flow", "prediction: data, init: jumps", 24, "`init` is `jumps`, whose network gives the velocity"),
+        ("init: flow", "prediction: data, init: jumps", 24, "`init` is `jumps`, whose network predicts the velocity"),
         (
             "init: jumps, teacher: flow",
             "init: jumps, teacher: whole",
             25,
-            "gives the velocity, but the one that is trained here gives the data",
+            "predicts the velocity, but this stage trains one that predicts the data",
         ),
     ] {
         assert_eq!(GOOD.matches(from).count(), 1, "{from}");

@@ -35,7 +35,7 @@ pub(crate) fn resolve_best<'a>(
             let Some((_, swept)) = stages.clone().find(|(other, _)| other.as_str() == name) else { continue };
             if !swept {
                 let field = format!("{prefix}{}", reference.field);
-                let message = format!("`{field}` is `{name}{BEST}`, but `{name}` has no `sweep`, so it has one result");
+                let message = format!("`{field}` is `{name}{BEST}`, but `{name}` has no `sweep`; write `{name}`");
                 problems.add(&field, message, &format!("write `{name}`"));
             }
             *reference.name = name;

@@ -36,7 +36,7 @@ pub fn with_values(base: &StageSettings, values: &Values) -> Result<StageSetting
     let mut json = serde_json::to_value(base).map_err(|e| e.to_string())?;
     for (path, value) in values {
         let place = path.split('.').try_fold(&mut json, |value, key| value.get_mut(key));
-        *place.ok_or_else(|| format!("there is no setting `{path}`"))? = value.clone();
+        *place.ok_or_else(|| format!("unknown setting `{path}`"))? = value.clone();
     }
     let settings: StageSettings = serde_json::from_value(json).map_err(|e| e.to_string())?;
     let broken = broken_rules(&settings, &Placement::default());

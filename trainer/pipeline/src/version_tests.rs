@@ -58,7 +58,7 @@ fn versions_are_no_edges_and_their_digests_are_inputs() {
     // An input that is not a reference is refused.
     fill(&mut pipeline, Digest::of(b"one"));
     pipeline.stages[0].external.insert("init".into(), Digest::of(b"x"));
-    assert!(pipeline.check().unwrap_err().contains("which it does not read"));
+    assert!(pipeline.check().unwrap_err().contains("but it does not read"));
 }
 
 #[test]
@@ -73,13 +73,13 @@ fn keys_are_those_from_before_there_was_an_init() {
 #[test]
 fn versions_are_refused_where_none_can_be() {
     for (from, to, line, words) in [
-        ("vae: motionlcm@prod}", "vae: 'motionlcm@'}", 5, "names no model version"),
-        ("teacher: teachers:3", "teacher: 'teachers:x'", 7, "`x` is no number"),
-        ("teacher: teachers:3,", "teacher: teachers:3, latents: motionlcm@prod,", 7, "holds latents"),
-        ("from: lcm", "from: motionlcm@prod", 12, "expected a stage that gives a model"),
-        ("from: lcm", "from: motionlcm@best", 12, "expected a stage that gives a model"),
+        ("vae: motionlcm@prod}", "vae: 'motionlcm@'}", 5, "is not a model version"),
+        ("teacher: teachers:3", "teacher: 'teachers:x'", 7, "`x` is not a number"),
+        ("teacher: teachers:3,", "teacher: teachers:3, latents: motionlcm@prod,", 7, "do not contain latents"),
+        ("from: lcm", "from: motionlcm@prod", 12, "expected a stage that outputs a model"),
+        ("from: lcm", "from: motionlcm@best", 12, "expected a stage that outputs a model"),
         ("model: motionlcm@prod", "model: lcm@best", 8, "`lcm` has no `sweep`"),
-        ("{kind: train.tokenizer", "{kind: train.tokenizer, dataset: d@1", 10, "holds a dataset"),
+        ("{kind: train.tokenizer", "{kind: train.tokenizer, dataset: d@1", 10, "do not contain a dataset"),
         ("vae: motionlcm@prod, init", "vae: motionlcm@best, init", 6, "was encoded with `motionlcm@prod`"),
     ] {
         assert!(GOOD.contains(from), "{from}");

@@ -124,7 +124,7 @@ impl Node {
             Content::Scalar { value: Value::Null, .. } => "nothing".into(),
             Content::Scalar { value: Value::Bool(flag), .. } => format!("the flag `{flag}`"),
             Content::Scalar { value: Value::Number(_), text, .. } => format!("the number `{}`", shortened(text)),
-            Content::Scalar { text, .. } => format!("the text `{}`", shortened(text)),
+            Content::Scalar { text, .. } => format!("the string `{}`", shortened(text)),
             Content::List(items) => format!("a list of {}", items.len()),
             Content::Map(_) => "a mapping".into(),
         }
@@ -174,7 +174,7 @@ pub(crate) fn parse(text: &str, source: usize, budget: &mut Budget) -> Result<No
     let start = Position { source, line: 1, column: 1 };
     let fail = |message: String| vec![YamlError { at: start, message, help: None }];
     if text.len() as u64 > limits::PIPELINE_BYTES {
-        return Err(fail(format!("the text has {} bytes; at most {} are read", text.len(), limits::PIPELINE_BYTES)));
+        return Err(fail(format!("the file has {} bytes; expected at most {}", text.len(), limits::PIPELINE_BYTES)));
     }
     let mut builder = Builder { source, budget, anchors: HashMap::new(), mistakes: Vec::new() };
     let mut parser = Parser::new_from_str(text.strip_prefix('\u{feff}').unwrap_or(text));
@@ -185,7 +185,7 @@ pub(crate) fn parse(text: &str, source: usize, budget: &mut Budget) -> Result<No
             Some(Ok((Event::StreamStart | Event::DocumentEnd | Event::Nothing, _))) => {}
             Some(Ok((Event::DocumentStart(_), span))) => {
                 if root.is_some() {
-                    builder.mistake(span, "a second document begins here; a pipeline is one document".into());
+                    builder.mistake(span, "a second YAML document starts here; a pipeline is one document".into());
                     break;
                 }
             }
@@ -206,7 +206,7 @@ pub(crate) fn parse(text: &str, source: usize, budget: &mut Budget) -> Result<No
     match root {
         Some(root) if builder.mistakes.is_empty() => Ok(root),
         _ if !builder.mistakes.is_empty() => Err(builder.mistakes),
-        _ => Err(fail("the text is empty; a pipeline has `name`, `dataset` and `stages`".into())),
+        _ => Err(fail("the file is empty; a pipeline needs `name`, `dataset` and `stages`".into())),
     }
 }
 
@@ -251,12 +251,14 @@ impl Builder<'_> {
         let at = Position { source: self.source, line: mark.line().max(1), column: mark.col() + 1 };
         let help = match error.info() {
             info if info.contains("tab") => Some("indent with spaces".into()),
-            info if info.contains("mapping values") || info.contains("simple key") => {
-                Some("put a space after `:`, quote texts that hold `: `, and indent keys of one mapping alike".into())
-            }
+            info if info.contains("mapping values") || info.contains("simple key") => Some(
+                "put a space after `:`, quote strings that contain `: `, and give all keys of a mapping the same \
+                 indentation"
+                    .into(),
+            ),
             _ => None,
         };
-        self.mistakes.push(YamlError { at, message: format!("this is not YAML: {}", error.info()), help });
+        self.mistakes.push(YamlError { at, message: format!("invalid YAML: {}", error.info()), help });
     }
 
     /// Subtracts `size` from the budget, or reports that it is exceeded.
@@ -271,7 +273,7 @@ impl Builder<'_> {
             (None, _) => ("values", limits::PIPELINE_VALUES),
             (_, None) => ("bytes of text", limits::PIPELINE_TEXT_BYTES),
         };
-        self.mistake(span, format!("there are more than {limit} {what} once aliases are expanded"));
+        self.mistake(span, format!("the file has more than {limit} {what} after aliases are expanded"));
         Err(Stop::Limit)
     }
 
@@ -292,7 +294,7 @@ impl Builder<'_> {
     ) -> Result<Node, Stop> {
         let at = self.position(span);
         if depth > limits::PIPELINE_DEPTH {
-            self.mistake(span, format!("values are nested more than {} deep", limits::PIPELINE_DEPTH));
+            self.mistake(span, format!("values are nested more than {} levels deep", limits::PIPELINE_DEPTH));
             return Err(Stop::Limit);
         }
         let (value, anchor) = match event {
@@ -308,7 +310,7 @@ impl Builder<'_> {
                 if text.len() > limits::TEXT_BYTES {
                     self.mistake(
                         span,
-                        format!("a text of {} bytes; at most {} are read", text.len(), limits::TEXT_BYTES),
+                        format!("the string has {} bytes; expected at most {}", text.len(), limits::TEXT_BYTES),
                     );
                     return Err(Stop::Limit);
                 }
@@ -334,7 +336,7 @@ impl Builder<'_> {
                 (Content::Map(self.entries(parser, depth)?), anchor)
             }
             _ => {
-                self.mistake(span, "a value was expected here".into());
+                self.mistake(span, "expected a value here".into());
                 return Err(Stop::Limit);
             }
         };
@@ -366,16 +368,16 @@ impl Builder<'_> {
             let (event, value_span) = Self::next(parser)?;
             let value = self.node(event, value_span, parser, depth + 1)?;
             let Content::Scalar { text, .. } = key.value else {
-                self.mistake(span, "a key must be a text, not a list or a mapping".into());
+                self.mistake(span, "a key must be a string, not a list or a mapping".into());
                 continue;
             };
             if text.len() > limits::KEY_BYTES {
-                self.mistake(span, format!("a key of {} bytes; at most {} are read", text.len(), limits::KEY_BYTES));
+                self.mistake(span, format!("the key has {} bytes; expected at most {}", text.len(), limits::KEY_BYTES));
                 return Err(Stop::Limit);
             }
             if let Some(first) = lines.get(&text) {
-                let message = format!("the key `{text}` stands here a second time; the first is in line {first}");
-                let help = Some("keep one of the two".to_owned());
+                let message = format!("duplicate key `{text}`; the first one is in line {first}");
+                let help = Some("remove one of the two".to_owned());
                 self.mistakes.push(YamlError { at: key.at, message, help });
                 continue;
             }

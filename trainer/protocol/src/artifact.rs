@@ -138,7 +138,9 @@ impl TryFrom<String> for Role {
         let known = |c: u8| c.is_ascii_lowercase() || c.is_ascii_digit() || c == b'-';
         match !name.is_empty() && name.len() <= 64 && name.bytes().all(known) {
             true => Ok(Self(Cow::Owned(name))),
-            false => Err(format!("{name:?} is not a part's role; expected small letters, digits and `-`, at most 64")),
+            false => Err(format!(
+                "{name:?} is not a valid role; expected lowercase letters, digits and `-`, at most 64 characters"
+            )),
         }
     }
 }

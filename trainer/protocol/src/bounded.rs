@@ -25,7 +25,7 @@ impl<'de, T: Deserialize<'de>> Visitor<'de> for Batch<T> {
         let mut all = Vec::new();
         while let Some(entry) = entries.next_element()? {
             if all.len() == BATCH_ENTRIES {
-                let message = format!("a batch of more than {BATCH_ENTRIES} entries; send it in several batches");
+                let message = format!("the batch has more than {BATCH_ENTRIES} entries; send several batches");
                 return Err(A::Error::custom(message));
             }
             all.push(entry);

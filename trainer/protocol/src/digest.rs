@@ -67,7 +67,7 @@ impl fmt::Debug for Digest {
 
 /// A text that is not a valid digest.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("`{0}` is not a digest: expected `sha256:` and 64 hexadecimal digits")]
+#[error("`{0}` is not a digest; expected `sha256:` and 64 hexadecimal digits")]
 pub struct ParseDigestError(String);
 
 impl FromStr for Digest {

@@ -128,7 +128,10 @@ impl TaskId {
 
 /// A name with characters that have a meaning elsewhere.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("`{text}` is not a {what}: expected a letter or digit, then letters, digits, `.`, `_` or `-`, at most 64")]
+#[error(
+    "`{text}` is not a valid {what}; expected a letter or digit, then letters, digits, `.`, `_` or `-`, at most 64 \
+     characters"
+)]
 pub struct ParseNameError {
     /// Kind of the expected identifier.
     pub what: &'static str,

@@ -47,10 +47,10 @@ impl FromStr for ModelRef {
 
     fn from_str(text: &str) -> Result<Self, Self::Err> {
         let bad = |why: String| {
-            format!("`{text}` names no model version: {why}; expected `MODEL@ALIAS`, `MODEL@best` or `MODEL:VERSION`")
+            format!("`{text}` is not a model version: {why}; expected `MODEL@ALIAS`, `MODEL@best` or `MODEL:VERSION`")
         };
         let name = |model: &str| model.parse::<ModelName>().map_err(|e| bad(e.to_string()));
-        let number = |text: &str| text.parse().map(Pick::Number).map_err(|_| bad(format!("`{text}` is no number")));
+        let number = |text: &str| text.parse().map(Pick::Number).map_err(|_| bad(format!("`{text}` is not a number")));
         if let Some((model, alias)) = text.split_once('@') {
             let pick = match alias {
                 BEST => Pick::Best,

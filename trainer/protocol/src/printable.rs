@@ -60,9 +60,9 @@ pub fn excerpts<'a>(names: impl IntoIterator<Item = &'a str>, most: usize) -> St
 /// The kind and place of a mistake in JSON. The reader's own message may quote the text, and so is an excerpt.
 pub fn json_mistake(error: &serde_json::Error) -> String {
     let what = match error.classify() {
-        serde_json::error::Category::Syntax => "no JSON",
-        serde_json::error::Category::Eof => "JSON that ends too early",
-        serde_json::error::Category::Data | serde_json::error::Category::Io => "JSON of another form",
+        serde_json::error::Category::Syntax => "invalid JSON",
+        serde_json::error::Category::Eof => "incomplete JSON",
+        serde_json::error::Category::Data | serde_json::error::Category::Io => "unexpected JSON",
     };
     let text = error.to_string();
     // Such a name is one of ours.
@@ -93,7 +93,7 @@ mod tests {
     fn an_error_shows_the_beginning_of_a_text_if_the_process_asked_for_it() {
         let error = serde_json::from_str::<Vec<u8>>("\n[\"secret\"]").unwrap_err();
         assert_eq!((excerpt("secret"), excerpts(["secret"], 2)), ("...".to_owned(), "...".to_owned()));
-        assert_eq!(json_mistake(&error), "JSON of another form at line 2 column 9");
+        assert_eq!(json_mistake(&error), "unexpected JSON at line 2 column 9");
         show_excerpts();
         assert!(json_mistake(&error).contains("secret"));
         assert_eq!(excerpts(["a", "b", "c"], 2), "a, b");

@@ -11,8 +11,8 @@ use motion::waypoints::{self, Waypoint};
 use protocol::Manifest;
 use protocol::artifact::Role;
 use protocol::limits::{FEEDBACK_ROUNDS, REFINE_STEPS};
-use stages::parts::control::ControlOptions;
 use stages::generate::{Generated, Generator};
+use stages::parts::control::ControlOptions;
 use stages::parts::hint::{Hint, metres};
 
 use super::model::{self, Found};
@@ -89,7 +89,7 @@ impl ControlArgs {
         match given.into_iter().find(|(given, _)| *given && !streams && self.control.is_none()) {
             None => Ok(()),
             Some((_, name)) => {
-                Err(Problem::usage(format!("`--{name}` says nothing without `--control` or `--stream`")))
+                Err(Problem::usage(format!("`--{name}` has no effect without `--control` or `--stream`")))
             }
         }
     }
@@ -117,12 +117,15 @@ impl ControlArgs {
             return Err(Problem::usage(format!("{name} has no control part")).hint(TRAIN));
         };
         let bytes = other.blobs.get(*digest).map_err(Problem::failed)?;
-        let part: Manifest = serde_json::from_slice(&bytes)
-            .map_err(|error| Problem::failed(format!("the control part of {name} is no manifest: {error}")))?;
+        let part: Manifest = serde_json::from_slice(&bytes).map_err(|error| {
+            Problem::failed(format!("cannot parse the manifest of the control part of {name}: {error}"))
+        })?;
         found.manifest =
             assembly::extend(&found.manifest, None, &BTreeMap::from([(Role::CONTROL, part)])).map_err(|error| {
-                Problem::usage(format!("{}: {error}", found.label))
-                    .hint("a control part is for the model that it was trained on; `trainer registry show` says which")
+                Problem::usage(format!("{}: {error}", found.label)).hint(
+                    "a control part fits only the model that it was trained with; `trainer registry show` names that \
+                     model",
+                )
             })?;
         found.blobs.add(other.blobs);
         Ok(found)
@@ -132,9 +135,7 @@ impl ControlArgs {
     pub(super) fn targets(&self, generator: &Generator, label: &str, frames: Option<usize>) -> Result<Option<Targets>> {
         let Some(file) = &self.control else { return Ok(None) };
         if generator.control().is_none() {
-            return Err(
-                Problem::usage(format!("{label} has no control part, and so cannot be told where to go")).hint(TRAIN)
-            );
+            return Err(Problem::usage(format!("{label} has no control part, so it cannot follow a path")).hint(TRAIN));
         }
         let skeleton = Skeleton::of(generator.format());
         let waypoints = waypoints::read(file, skeleton, &self.joints).map_err(Problem::usage)?;
@@ -150,12 +151,12 @@ impl ControlArgs {
                 outside.frame as f64 / skeleton.fps,
                 frames.saturating_sub(1) as f64 / skeleton.fps
             ))
-            .hint(format!("at least `--frames {end}` has room for all of them")));
+            .hint(format!("`--frames {end}` or more covers all waypoints")));
         }
         let longest = generator.longest();
         if frames > longest {
             return Err(Problem::usage(format!(
-                "`{}`: the path takes {:.1} s, and {label} draws motions of at most {:.1} s ({longest} frames)",
+                "`{}`: the path takes {:.1} s, but {label} generates motions of at most {:.1} s ({longest} frames)",
                 file.display(),
                 end as f64 / skeleton.fps,
                 longest as f64 / skeleton.fps
@@ -168,7 +169,7 @@ impl ControlArgs {
 }
 
 /// Hint for a model without a control part.
-pub(super) const TRAIN: &str = "a `train.control` stage gives a model that has one";
+pub(super) const TRAIN: &str = "a `train.control` stage outputs a model with a control part";
 
 impl Targets {
     /// Target positions and strength of the control.

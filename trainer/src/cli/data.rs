@@ -84,7 +84,7 @@ fn inspect(args: &InspectArgs) -> Result<u8> {
     let how = take::read(&bvh, &Reading { map, ..Reading::default() }).map_err(|error| {
         let names: Vec<&str> = bvh.nodes.iter().filter(|node| !node.end).map(|node| node.name.as_str()).collect();
         Problem::usage(format!("{}: {size}; {error}", args.file.display())).hint(format!(
-            "its joints are {}; a map has the form of `trainer data inspect` on another file",
+            "the file has the joints {}; a joint map has the form that `trainer data inspect` prints for another file",
             names.join(", ")
         ))
     })?;
@@ -100,9 +100,9 @@ fn inspect(args: &InspectArgs) -> Result<u8> {
     print::note(&format!("{}: {size}", args.file.display()));
     print::note(&how.to_string());
     if how.shipped.is_some() {
-        print::note("the map need not be named: files with these names find it");
+        print::note("files with these joint names use this map by default");
     } else {
-        print::note("keep the map in a file that ends in .yaml and name that as `map` of data.features");
+        print::note("save the map as a .yaml file and set `map` of data.features to it");
     }
     print::out(how.map.to_yaml().trim_end());
     Ok(0)
@@ -115,13 +115,13 @@ fn inspect_array(file: &Path, output: Output) -> Result<u8> {
         print::json(&json!({"file": file, "joints": joints.joints, "frames": frames, "fps": joints.rate}));
         return Ok(0);
     }
-    let rate = joints.rate.map_or("it does not say its rate".to_owned(), |rate| format!("at {rate} fps"));
+    let rate = joints.rate.map_or("the frame rate is not in the file".to_owned(), |rate| format!("at {rate} fps"));
     print::out(&format!("{}: {frames} frames of {} joints, {rate}", file.display(), joints.joints));
     if joints.joints == 22 {
         let points: Vec<[f64; 3]> = joints.data.chunks_exact(3).map(|p| [p[0], p[1], p[2]].map(f64::from)).collect();
         let found = mocap::detect::detect(points.chunks_exact(22).take(200));
         let up = if found.sure_of_up { found.up } else { Up::Y };
-        let guess = if found.sure_of_up { "" } else { " (a guess: the figure does not stand)" };
+        let guess = if found.sure_of_up { "" } else { " (a guess: the figure does not stand upright)" };
         print::out(&format!("unit {} (legs of {:.2}), {up} up{guess}", found.unit, found.leg));
     }
     Ok(0)
@@ -131,12 +131,12 @@ fn sample(args: &SampleArgs) -> Result<u8> {
     let SampleFormat::Bvh = args.format;
     let taken = std::fs::read_dir(&args.folder).is_ok_and(|mut entries| entries.next().is_some());
     if taken {
-        return Err(Problem::usage(format!("{}: the folder is not empty; name another one", args.folder.display())));
+        return Err(Problem::usage(format!("{}: the folder is not empty; choose another one", args.folder.display())));
     }
     let worst = mocap::sample::write_bvh_folder(&args.folder, args.clips as usize, Seed(args.seed))
         .map_err(|error| Problem::failed(format!("{}: {error}", args.folder.display())))?;
     print::out(&format!(
-        "{}: {} clips in BVH with captions in TXT; joints at most {:.2} mm from the clips'",
+        "{}: {} clips as BVH, with captions as TXT; joints differ from the clips' by at most {:.2} mm",
         args.folder.display(),
         args.clips,
         1000.0 * worst

@@ -98,7 +98,7 @@ fn devices() -> Vec<Finding> {
         let backend = device.backend.name();
         match device.index {
             Some(index) => Finding::ok("device", format!("`{backend}` {index}: {}", device.name)),
-            None => Finding::warn("device", format!("`{backend}` has none"), device.note.clone()),
+            None => Finding::warn("device", format!("`{backend}` has no device"), device.note.clone()),
         }
     };
     here.iter().map(finding).collect()
@@ -109,8 +109,8 @@ async fn store(dir: &Path) -> Vec<Finding> {
     let store = match ReadStore::open(dir).await {
         Ok(store) => store,
         Err(OpenError::NotAStore(_)) => {
-            let hint = "`trainer run PIPELINE` makes one; --store names another folder";
-            return vec![Finding::warn("store", format!("there is none in `{name}`"), hint)];
+            let hint = "`trainer run PIPELINE` creates one; --store selects another folder";
+            return vec![Finding::warn("store", format!("there is no store in `{name}`"), hint)];
         }
         Err(error) => {
             let hint = error.hint();
@@ -124,11 +124,11 @@ async fn store(dir: &Path) -> Vec<Finding> {
         Ok(None) => {
             findings.push(Finding::ok("store", format!("`{name}`; no process holds it")));
             if dir.join("token").exists() {
-                let found = format!("`{name}/token` is left by a process that was killed");
+                let found = format!("`{name}/token` was left by a process that was killed");
                 findings.push(Finding::warn(
                     "store",
                     found,
-                    "it opens nothing, and the next `trainer run` replaces it",
+                    "the token is no longer valid, and the next `trainer run` replaces the file",
                 ));
             }
         }
@@ -140,7 +140,7 @@ async fn store(dir: &Path) -> Vec<Finding> {
     let mode = std::fs::metadata(dir).map_or(0, |found| found.permissions().mode());
     if mode & 0o022 != 0 {
         let found = format!("other users may write to `{name}`");
-        findings.push(Finding::warn("store", found, format!("`chmod go-w {name}` closes it")));
+        findings.push(Finding::warn("store", found, format!("`chmod go-w {name}` prevents that")));
     }
     findings
 }
@@ -154,13 +154,15 @@ fn disk(dir: &Path) -> Finding {
             let free = found.blocks_available() * found.fragment_size();
             space(free, existing)
         }
-        Err(error) => Finding::fail("disk", format!("`{}`: {error}", existing.display()), "name another --store"),
+        Err(error) => {
+            Finding::fail("disk", format!("`{}`: {error}", existing.display()), "choose another folder with --store")
+        }
     }
 }
 
 fn space(free: u64, folder: &Path) -> Finding {
     let found = format!("{:.1} GiB are free in `{}`", free as f64 / f64::from(1 << 30), folder.display());
-    let hint = "`trainer registry gc` removes what nothing needs; --store names a folder of another disk";
+    let hint = "`trainer registry gc` removes unneeded data; --store selects a folder on another disk";
     match free {
         0..NONE => Finding::fail("disk", found, hint),
         NONE..LITTLE => Finding::warn("disk", found, hint),
@@ -172,13 +174,15 @@ fn token_file(path: Option<&Path>) -> Option<Finding> {
     let path = path?;
     let name = path.display();
     Some(match std::fs::metadata(path) {
-        Err(error) => Finding::fail("token", format!("`{name}`: {error}"), "name the file with --token-file"),
-        Ok(found) if !found.is_file() => Finding::fail("token", format!("`{name}` is no file"), "name a regular file"),
+        Err(error) => Finding::fail("token", format!("`{name}`: {error}"), "set the file with --token-file"),
+        Ok(found) if !found.is_file() => {
+            Finding::fail("token", format!("`{name}` is not a regular file"), "choose a regular file")
+        }
         Ok(found) if found.permissions().mode() & 0o077 != 0 => {
             let says = format!("other users may read `{name}`");
-            Finding::warn("token", says, format!("`chmod 600 {name}` closes it"))
+            Finding::warn("token", says, format!("`chmod 600 {name}` prevents that"))
         }
-        Ok(_) => Finding::ok("token", format!("`{name}` is closed to other users")),
+        Ok(_) => Finding::ok("token", format!("other users cannot read `{name}`")),
     })
 }
 
@@ -190,7 +194,7 @@ async fn server(target: &Target) -> Option<Finding> {
         Err(problem) => Err(problem),
     };
     Some(match asked {
-        Ok(_) => Finding::ok("server", "it answers and takes the token"),
+        Ok(_) => Finding::ok("server", "it answers and accepts the token"),
         Err(problem) => {
             let hint = problem.hint.unwrap_or_else(|| "start it with `trainer serve`".to_owned());
             Finding::fail("server", problem.error.to_string(), hint)

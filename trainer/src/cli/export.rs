@@ -47,7 +47,7 @@ impl ExportArgs {
     fn reading(&self) -> Result<Reading> {
         let map = self.joint_map.as_deref().map(JointMap::load).transpose().map_err(Problem::usage)?;
         if let Some(unit) = self.unit.filter(|unit| !(unit.is_finite() && *unit > 0.0)) {
-            return Err(Problem::usage(format!("`--unit {unit}`: expected metres, more than 0")));
+            return Err(Problem::usage(format!("`--unit {unit}`: expected metres above 0")));
         }
         Ok(Reading { map, metres_per_unit: self.unit, up: self.up })
     }
@@ -90,7 +90,8 @@ pub(crate) fn export(args: &ExportArgs) -> Result<u8> {
             ),
             Output::Table => {
                 let said = if said.is_empty() { said } else { format!("; {said}") };
-                let off = off.map(|off| format!("; joints up to {:.2} mm off, bones keep their lengths", 1e3 * off));
+                let off = off
+                    .map(|off| format!("; joints are up to {:.2} mm off, because bones keep their lengths", 1e3 * off));
                 let off = off.unwrap_or_default();
                 print::out(&format!("{} from {}: {frames} frames{said}{off}", files.join(", "), file.display()));
             }

@@ -75,7 +75,7 @@ pub(crate) async fn gallery(args: GalleryArgs) -> Result<u8> {
         return Err(Problem::usage(format!("cannot write `{}`: expected .html or .png", args.out.display())));
     }
     if names.is_empty() {
-        return Err(Problem::usage(format!("no stage of run `{}` gave a model yet", run.run)));
+        return Err(Problem::usage(format!("no stage of run `{}` has a model yet", run.run)));
     }
     let (device, _) = model::device(args.backend.as_deref())?;
 

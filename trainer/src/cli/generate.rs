@@ -128,10 +128,10 @@ impl GenerateArgs {
 
     fn check(&self, requests: &[Request]) -> Result<()> {
         if requests.len() > 1 && self.control.given() {
-            return Err(Problem::usage("a path is of one motion: give one sentence with `--control`"));
+            return Err(Problem::usage("`--control` applies to one motion; give one sentence"));
         }
         if self.edit.is_some() && SentenceArgs::have_length(requests) {
-            return Err(Problem::usage("a motion that is edited keeps its length: give sentences without one"));
+            return Err(Problem::usage("an edited motion keeps its length; give sentences without a length"));
         }
         [&self.positions, &self.features].into_iter().flatten().try_for_each(|path| check_parent(path))
     }
@@ -184,7 +184,7 @@ pub(crate) async fn generate(args: GenerateArgs) -> Result<u8> {
     if let Some((low, high)) = generator.family().exceeded_range(sampler.guidance) {
         let guidance = sampler.guidance;
         print::note(&format!(
-            "note: {label} was trained for guidance {low} to {high}; at {guidance} it may draw anything"
+            "note: {label} was trained for guidance {low} to {high}; at {guidance} the motion may be arbitrary"
         ));
     }
     let edit = args.edit.as_deref().map(|path| Edit::read(path, &args.keep, &generator)).transpose()?;
@@ -251,10 +251,11 @@ pub(crate) async fn generate(args: GenerateArgs) -> Result<u8> {
 pub(super) fn is_known(generator: &Generator, label: &str, caption: &str) -> Result<bool> {
     let known = generator.knows(caption).map_err(model::refused)?;
     if !known && caption.trim().is_empty() {
-        print::note(&format!("note: the sentence is empty: {label} draws without being told what"));
+        print::note(&format!("note: the sentence is empty, so {label} generates an arbitrary motion"));
     } else if !known {
         print::note(&format!(
-            "note: the text encoder of {label} has no word of `{caption}`; the motion is that of an empty sentence"
+            "note: the text encoder of {label} recognises no word of `{caption}`; the result is the same as for an \
+             empty sentence"
         ));
     }
     Ok(known)
@@ -387,11 +388,11 @@ fn table(rows: &[Row], shared: &Shared, together: &[String], edit: Option<&Edit>
     );
     if let Some(off) = rows.iter().filter_map(|row| row.off).reduce(f64::max) {
         text +=
-            &format!("\njoints of .bvh and .glb, whose bones keep their lengths, are up to {:.1} mm off", 1e3 * off);
+            &format!("\nin .bvh and .glb, joints are up to {:.1} mm off, because bones keep their lengths", 1e3 * off);
     }
     for missed in rows.iter().filter_map(|row| row.missed) {
         text += &format!(
-            "\n{} positions told: {:.1} cm off in the mean, {:.1} cm at worst, {:.0} % missed by more than 50 cm",
+            "\n{} target positions: {:.1} cm off on average, {:.1} cm at most; {:.0} % are missed by more than 50 cm",
             missed.targets,
             100.0 * missed.average,
             100.0 * missed.worst,
@@ -415,17 +416,17 @@ impl Edit {
         let skeleton = Skeleton::of(generator.format());
         let refuse = |what: String| Problem::usage(format!("{}: {what}", path.display()));
         let [frames, width] = array.shape[..] else {
-            return Err(refuse(format!("has shape {:?}, expected [frames, {}]", array.shape, skeleton.features)));
+            return Err(refuse(format!("has shape {:?}; expected [frames, {}]", array.shape, skeleton.features)));
         };
         if width != skeleton.features {
             let name = generator.format().name();
             return Err(refuse(format!(
-                "has {width} features a frame, the model's skeleton (`{name}`) has {}",
+                "has {width} features per frame, but the model's skeleton (`{name}`) has {}",
                 skeleton.features
             )));
         }
         if let Some(at) = array.data.iter().position(|value| !value.is_finite()) {
-            return Err(refuse(format!("frame {} holds a number that is not finite", at / width)));
+            return Err(refuse(format!("frame {} has a number that is not finite", at / width)));
         }
         let keep = keep.iter().map(|span| span.of(frames, skeleton.fps)).collect::<std::result::Result<_, String>>();
         Ok(Self { motion: array.data, frames, keep: keep.map_err(refuse)? })
@@ -436,7 +437,7 @@ impl Edit {
         let spans: Vec<String> = kept.iter().map(|span| format!("{}-{}", span.start, span.end - 1)).collect();
         let rest = match self.frames - frames {
             0 => String::new(),
-            rest => format!("; the last {rest} of {} fill no token and were left out", self.frames),
+            rest => format!("; the last {rest} of {} do not fill a token and were left out", self.frames),
         };
         format!(" ({} stay{rest})", spans.join(", "))
     }

@@ -101,8 +101,10 @@ impl ImportArgs {
             Some((encoder, folder)) => format!("{{encoder: {encoder}, path: {}}}", quoted(Path::new(folder))),
             None if self.text == "hashed" => "{encoder: hashed}".to_owned(),
             None => {
-                let problem = Problem::usage(format!("`--text {}` names no folder", self.text));
-                return Err(problem.hint("write `--text sentence-t5=FOLDER`, or `clip=`, `t5=`; `hashed` needs none"));
+                let problem = Problem::usage(format!("`--text {}` has no folder", self.text));
+                return Err(problem.hint(
+                    "write `--text sentence-t5=FOLDER`, `clip=FOLDER` or `t5=FOLDER`; `hashed` needs no folder",
+                ));
             }
         };
         let (format, statistics) = (&self.format, quoted(&self.statistics));

@@ -35,7 +35,8 @@ impl FromStr for Place {
         match number.parse::<f64>() {
             Ok(value) if digits && value.is_finite() => Ok(Self { value, seconds, from_end }),
             _ => Err(format!(
-                "`{text}` is no point in time; expected frames such as `20`, seconds such as `1.5s`, or either from the end, `-1s`"
+                "`{text}` is not a point in time; expected frames such as `20`, seconds such as `1.5s`, or either \
+                 counted from the end, such as `-1s`"
             )),
         }
     }
@@ -55,7 +56,7 @@ impl FromStr for Span {
         let place = |text: &str| if text.is_empty() { Ok(None) } else { text.parse().map(Some) };
         let (from, to) = text
             .split_once(':')
-            .ok_or_else(|| format!("`{text}` is no span; expected FROM:TO, such as `0:1s` or `-1s:`"))?;
+            .ok_or_else(|| format!("`{text}` is not a span; expected FROM:TO, such as `0:1s` or `-1s:`"))?;
         Ok(Self { from: place(from)?, to: place(to)? })
     }
 }
@@ -66,19 +67,17 @@ impl Span {
     /// # Errors
     /// If the span is outside the motion, or ends before it begins.
     pub(super) fn of(self, frames: usize, fps: f64) -> Result<Range<usize>, String> {
-        let outside = || {
-            format!(
-                "a span to keep lies outside of the motion, which has {frames} frames, {:.2} s",
-                frames as f64 / fps
-            )
-        };
+        let outside =
+            || format!("a span to keep is outside the motion, which has {frames} frames, {:.2} s", frames as f64 / fps);
         let place = |place: Option<Place>, open: usize| match place {
             None => Ok(open),
             Some(place) => place.frame(frames, fps).ok_or_else(outside),
         };
         let (from, to) = (place(self.from, 0)?, place(self.to, frames)?);
         if from >= to {
-            return Err(format!("a span to keep goes from frame {from} to frame {to}; expected its beginning first"));
+            return Err(format!(
+                "a span to keep goes from frame {from} to frame {to}; expected the earlier frame first"
+            ));
         }
         Ok(from..to)
     }
@@ -104,13 +103,13 @@ mod tests {
         }
         for (text, words) in [
             ("1s", "expected FROM:TO"),
-            ("a:b", "`a` is no point in time"),
-            ("0:1.5", "`1.5` is no point"),
-            ("0:infs", "no point"),
+            ("a:b", "`a` is not a point in time"),
+            ("0:1.5", "`1.5` is not a point"),
+            ("0:infs", "not a point"),
             ("0:4s", "60 frames, 3.00 s"),
-            ("-61:", "lies outside"),
+            ("-61:", "is outside"),
             ("2s:1s", "from frame 40 to frame 20"),
-            ("20:20", "its beginning first"),
+            ("20:20", "the earlier frame first"),
         ] {
             let refused = of(text).unwrap_err();
             assert!(refused.contains(words), "{text}: {refused}");

@@ -54,7 +54,10 @@ enum Over {
 pub(crate) async fn metrics(args: MetricsArgs) -> Result<u8> {
     if let Some(path) = &args.plot {
         if path.extension().is_none_or(|extension| extension != "svg") {
-            return Err(Problem::usage(format!("cannot draw `{}`; expected a name that ends in .svg", path.display())));
+            return Err(Problem::usage(format!(
+                "cannot write `{}`; expected a file name that ends in .svg",
+                path.display()
+            )));
         }
         super::remote::check_parent(path)?;
     }
@@ -87,8 +90,8 @@ pub(crate) async fn metrics(args: MetricsArgs) -> Result<u8> {
 fn nothing(run: &RunId, args: &MetricsArgs) -> Problem {
     let of = args.stage.as_ref().map(|stage| format!(" in stage `{stage}`")).unwrap_or_default();
     let named = if args.key.is_empty() { String::new() } else { format!(" named {}", args.key.join(", ")) };
-    let problem = Problem::new(exit::NOT_FOUND, anyhow::anyhow!("run `{run}` has recorded no values{named}{of}"));
-    problem.hint("`trainer metrics` without --stage and --key lists all that there is")
+    let problem = Problem::new(exit::NOT_FOUND, anyhow::anyhow!("run `{run}` has no recorded values{named}{of}"));
+    problem.hint("`trainer metrics` without --stage and --key lists all values")
 }
 
 fn table(curves: &[CurveSeries]) -> String {

@@ -104,14 +104,12 @@ pub(super) async fn version(reader: &Reader, name: &str) -> Result<Found> {
         Some(Data::Version { version, manifest, .. }) => (version, manifest),
         Some(Data::Model { model, .. }) => {
             let aliases: Vec<String> = model.aliases.keys().map(|alias| format!("{name}@{alias}")).collect();
-            let problem = Problem::usage(format!("`{name}` is a model; which of its {} versions?", model.versions));
-            return Err(problem.hint(format!("name one, such as {name}@best {}", aliases.join(" "))));
+            let problem =
+                Problem::usage(format!("`{name}` is a model with {} versions; name one version", model.versions));
+            return Err(problem.hint(format!("for example {name}@best {}", aliases.join(" "))));
         }
         _ => {
-            return Err(Problem::new(
-                exit::FAULT,
-                anyhow::anyhow!("the registry answered something else than a model"),
-            ));
+            return Err(Problem::new(exit::FAULT, anyhow::anyhow!("the registry's answer is not a model")));
         }
     };
     let blobs = Fetched::files(reader, &manifest).await?;
@@ -127,8 +125,10 @@ pub(super) async fn stage(reader: &Reader, run: &RunView, name: &str) -> Result<
         let why = if model.is_none() { "has no stage" } else { "has no model yet from stage" };
         let problem = Problem::new(exit::NOT_FOUND, anyhow::anyhow!("run `{}` {why} `{name}`", run.run));
         return Err(problem.hint(match have.as_slice() {
-            [] => "no stage of it gave one yet; `trainer status --all` lists other runs, --run takes one".to_owned(),
-            have => format!("stages of it that gave one: {}; --run names another run", have.join(", ")),
+            [] => {
+                "no stage of the run has a model yet; `trainer status --all` lists runs, --run selects one".to_owned()
+            }
+            have => format!("stages with a model: {}; --run selects another run", have.join(", ")),
         }));
     };
     let manifest = manifest(reader, *model).await?;
@@ -154,17 +154,18 @@ pub(super) fn stages(run: &RunView) -> Vec<&str> {
 /// Reads the report of an evaluation.
 pub(super) async fn report(reader: &Reader, digest: Digest) -> Result<serde_json::Value> {
     let manifest = manifest(reader, digest).await?;
-    let file = manifest.files.get(REPORT_FILE).ok_or_else(|| Problem::failed(format!("{digest} is no report")))?;
+    let file = manifest.files.get(REPORT_FILE).ok_or_else(|| Problem::failed(format!("{digest} is not a report")))?;
     let bytes = verified(reader, file.digest).await?;
-    serde_json::from_slice(&bytes).map_err(|error| Problem::failed(format!("{digest} is no report: {error}")))
+    serde_json::from_slice(&bytes)
+        .map_err(|error| Problem::failed(format!("cannot parse the report {digest}: {error}")))
 }
 
 async fn manifest(reader: &Reader, digest: Digest) -> Result<Manifest> {
     let manifest: Manifest = serde_json::from_slice(&verified(reader, digest).await?)
-        .map_err(|error| Problem::failed(format!("{digest} is no manifest: {error}")))?;
+        .map_err(|error| Problem::failed(format!("cannot parse the manifest {digest}: {error}")))?;
     if manifest.format != Manifest::FORMAT {
         let (found, known) = (manifest.format, Manifest::FORMAT);
-        return Err(Problem::failed(format!("{digest} has format {found}, this program knows {known}")));
+        return Err(Problem::failed(format!("the manifest {digest} has format {found}; this build reads {known}")));
     }
     Ok(manifest)
 }

@@ -115,8 +115,10 @@ pub(crate) async fn submit(args: SubmitArgs) -> Result<u8> {
     let until = args.until.map(StageName::new);
     pipeline_file::check_stage(&file.pipeline, until.as_ref())?;
     let Some(client) = Client::running(&args.target).await? else {
-        let problem = Problem::usage("no server is running on this store, so no worker would do the work");
-        return Err(problem.hint("`trainer serve` starts one, `trainer run` needs none; or name one with --server"));
+        let problem = Problem::usage("no server is running on this store, so the run would have no workers");
+        return Err(
+            problem.hint("`trainer serve` starts a server; `trainer run` needs none; --server selects another server")
+        );
     };
     advice(&file.pipeline).iter().for_each(|note| print::note(&format!("note: {note}")));
     let pipeline = serde_json::to_value(&file.pipeline).map_err(|error| Problem::new(exit::FAULT, error))?;
@@ -130,8 +132,7 @@ pub(crate) async fn submit(args: SubmitArgs) -> Result<u8> {
         return Ok(0);
     }
     let bars = args.output == Output::Table && print::on_terminal();
-    let for_workers =
-        "`trainer worker join` on a machine gives the server one, `trainer worker list` shows those it has";
+    let for_workers = "`trainer worker join` adds a worker to the server; `trainer worker list` shows the workers";
     let mut progress = Progress::new(bars, &file.pipeline, for_workers);
     let view = loop {
         let view = client.run(&run).await?;

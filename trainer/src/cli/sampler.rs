@@ -26,7 +26,7 @@ fn guidance(text: &str) -> Result<f64, String> {
     if scale.is_finite() && scale >= 0.0 {
         return Ok(scale);
     }
-    Err("expected 0 or more; the larger it is, the closer a motion follows its sentence".to_owned())
+    Err("expected 0 or more; a larger value makes a motion follow its sentence more closely".to_owned())
 }
 
 /// Parses a solver by its word in settings.
@@ -57,7 +57,8 @@ impl SamplerArgs {
         let meant = measured.iter().filter(|(_, sampler)| as_asked(sampler));
         let meant = measured_with(meant.map(|(name, sampler)| (name.as_str(), sampler))).map_err(|differ| {
             format!(
-                "it was measured in several ways: {differ}; say which with --steps, --guidance, --timesteps, --solver or --footing"
+                "it was evaluated with several samplers: {differ}; choose one with --steps, --guidance, --timesteps, \
+                 --solver or --footing"
             )
         })?;
         // If all evaluations use one sampler, the options change that one.

@@ -48,7 +48,8 @@ fn check_quotes(prompts: &[String]) -> Result<()> {
     let sentence = prompts.join(" ");
     let (count, lines) = (prompts.len(), prompts.join("\\n"));
     Err(Problem::usage(format!("`{sentence}` without quotes is {count} sentences of one word each")).hint(format!(
-        "for one motion write \"{sentence}\"; for {count} motions give the words as lines: printf '{lines}\\n' | trainer generate --captions - ..."
+        "for one motion, write \"{sentence}\"; for {count} motions, pass the words as lines: printf '{lines}\\n' | \
+         trainer generate --captions - ..."
     )))
 }
 
@@ -79,13 +80,16 @@ impl SentenceArgs {
             each => {
                 let (lengths, sentences) = (each.len(), requests.len());
                 return Err(Problem::usage(format!(
-                    "{lengths} lengths for {sentences} sentences; give one for all or one for each"
+                    "there are {lengths} lengths for {sentences} sentences; give one length for all sentences, or one \
+                     for each"
                 )));
             }
         }
         let motions = requests.len() * self.seeds().len();
         if motions > MOST {
-            return Err(Problem::usage(format!("{motions} motions; one command draws at most {MOST}")));
+            return Err(Problem::usage(format!(
+                "{motions} motions were requested; one command generates at most {MOST}"
+            )));
         }
         Ok(requests)
     }
@@ -111,7 +115,10 @@ impl SentenceArgs {
             [] => Ok(None),
             [one] => Ok(Some(one.frames(fps) as u64)),
             each => {
-                let why = format!("{} lengths for one stream; lengths of sentences stand in their lines", each.len());
+                let why = format!(
+                    "there are {} lengths for one stream; give the length of a sentence in its line",
+                    each.len()
+                );
                 Err(Problem::usage(why))
             }
         }
@@ -176,7 +183,7 @@ mod tests {
             assert_eq!(seconds(text), Ok(Length::Seconds(4.0)), "{text}");
         }
         assert!(seconds("-4").unwrap_err().contains("expected more than 0"));
-        assert!(seconds("4ss").unwrap_err().contains("no length"));
+        assert!(seconds("4ss").unwrap_err().contains("not a length"));
     }
 
     #[test]

@@ -17,11 +17,12 @@ use crate::report::print;
 use crate::report::problem::{Problem, Result};
 
 const TOKENS: &str = "\
-A token file has a line `NAME SCOPES TOKEN` for each caller, such as `alice submit,promote` and what `openssl rand -hex 32`
-prints. Scopes: read, submit, worker, promote, admin. Behind the token may stand `workers=nodes-*`, `project=NAME` and
-`expires=2026-12-31`. A line `protect ALIAS=NAME,NAME` has an alias moved by these only. SIGHUP has the file read again.
-A token alone, in a file or as --token, may do everything. Without any, one is made for this user at every start and lies
-in the store's folder; beyond this machine a token is required.";
+A token file has one line `NAME SCOPES TOKEN` per caller, such as `alice submit,promote` and the output of
+`openssl rand -hex 32`. Scopes: read, submit, worker, promote, admin. After the token, a line may have
+`workers=nodes-*`, `project=NAME` and `expires=2026-12-31`. With a line `protect ALIAS=NAME,NAME`, only these callers
+may move the alias. On SIGHUP, the server reads the file again. A single token, in a file or as --token, has all
+scopes. Without a token, the server creates one for this user at every start, in the store's folder. Other machines
+need a token.";
 
 #[derive(Debug, Args)]
 #[command(after_help = TOKENS)]
@@ -64,7 +65,7 @@ impl ServeArgs {
                 handle.replace_tokens(tokens);
                 print::note("read the token file again");
             }
-            Err(problem) => print::note(&format!("the tokens stay as they were: {:#}", problem.error)),
+            Err(problem) => print::note(&format!("keeping the earlier tokens: {:#}", problem.error)),
         }
     }
 }
@@ -112,8 +113,7 @@ pub(crate) async fn serve(args: ServeArgs) -> Result<u8> {
     handle.shutdown().await;
     match failure {
         None => Ok(0),
-        Some(why) => Err(Problem::coordinator_failed(why).hint(
-            "what was acknowledged is stored: start the server again, and workers re-attach; please report this",
-        )),
+        Some(why) => Err(Problem::coordinator_failed(why)
+            .hint("acknowledged work is stored: start the server again, and workers reconnect; please report this")),
     }
 }

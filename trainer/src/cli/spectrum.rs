@@ -17,7 +17,10 @@ const KIND: &str = "evaluate.spectrum";
 /// Draws the stage `name` of a run, or its only stage of this kind.
 pub(super) async fn draw(reader: &Reader, run: &RunView, name: Option<&str>, path: &Path) -> Result<()> {
     if path.extension().is_none_or(|extension| extension != "svg") {
-        return Err(Problem::usage(format!("cannot draw `{}`; expected a name that ends in .svg", path.display())));
+        return Err(Problem::usage(format!(
+            "cannot write `{}`; expected a file name that ends in .svg",
+            path.display()
+        )));
     }
     let ready = run.stages.iter().filter(|stage| stage.kind == KIND && stage.outputs.contains_key("report"));
     let found: Vec<&StageView> = ready.filter(|stage| name.is_none_or(|name| stage.name.as_str() == name)).collect();
@@ -28,7 +31,7 @@ pub(super) async fn draw(reader: &Reader, run: &RunView, name: Option<&str>, pat
             false => format!("run `{}` has several stages of kind `{KIND}`: {}", run.run, names.join(", ")),
         };
         let problem = Problem::new(exit::NOT_FOUND, anyhow::anyhow!("{message}"));
-        return Err(problem.hint("--stage says which one to draw"));
+        return Err(problem.hint("select one with --stage"));
     };
     let report = model::report(reader, stage.outputs["report"]).await?;
     let title = format!("{} of {}", stage.name, run.run);

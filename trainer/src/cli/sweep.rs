@@ -81,7 +81,10 @@ pub(crate) async fn sweep(verb: SweepVerb) -> Result<u8> {
 async fn status(args: StatusArgs) -> Result<u8> {
     if let Some(path) = &args.plot {
         if path.extension().is_none_or(|extension| extension != "svg") {
-            return Err(Problem::usage(format!("cannot draw `{}`; expected a name that ends in .svg", path.display())));
+            return Err(Problem::usage(format!(
+                "cannot write `{}`; expected a file name that ends in .svg",
+                path.display()
+            )));
         }
         super::remote::check_parent(path)?;
     }
@@ -90,7 +93,7 @@ async fn status(args: StatusArgs) -> Result<u8> {
         let [sweep] = sweeps.as_slice() else {
             let names: Vec<&str> = sweeps.iter().map(|sweep| sweep.stage.as_str()).collect();
             let problem = Problem::usage(format!("run `{}` has {} sweeps: {}", run.run, names.len(), names.join(", ")));
-            return Err(problem.hint("say with --stage which one to draw"));
+            return Err(problem.hint("select one with --stage"));
         };
         let by = match &args.by {
             Some(name) => By::named(name, sweep).map_err(Problem::usage)?,
@@ -126,9 +129,9 @@ async fn best(args: BestArgs) -> Result<u8> {
     let mut found = Vec::new();
     for sweep in &sweeps {
         let best = sweep.best.and_then(|best| sweep.trials.get(best)).ok_or_else(|| {
-            let message = format!("no trial of the sweep of `{}` has been trained to its end", sweep.stage);
+            let message = format!("no trial of the sweep of `{}` is fully trained", sweep.stage);
             Problem::new(exit::NOT_FOUND, anyhow::anyhow!("{message}"))
-                .hint("`trainer sweep status` shows how far they are")
+                .hint("`trainer sweep status` shows their progress")
         })?;
         found.push((sweep, best));
     }
@@ -146,7 +149,7 @@ async fn best(args: BestArgs) -> Result<u8> {
                 print::out(&summary::sweep_line(sweep));
                 let own = best.values.iter().filter(|(path, _)| in_evaluation(path).is_none());
                 let sets = own.map(|(path, value)| format!(" --set {}.{path}={value}", sweep.stage));
-                print::out(&format!("alone, with the sweep left out:{}", sets.collect::<String>()));
+                print::out(&format!("to train only this trial, remove the sweep and use:{}", sets.collect::<String>()));
             }
         }
     }
@@ -175,8 +178,8 @@ async fn find(which: &Which) -> Result<(RunView, Vec<SweepView>)> {
     let sweeps: Vec<SweepView> = run.sweeps.iter().filter(wanted).cloned().collect();
     if sweeps.is_empty() {
         let of = which.stage.as_ref().map(|stage| format!(" of stage `{stage}`")).unwrap_or_default();
-        let problem = Problem::new(exit::NOT_FOUND, anyhow::anyhow!("in run `{}` no sweep{of} has begun", run.run));
-        return Err(problem.hint("a stage with `sweep:` begins when what it reads is there"));
+        let problem = Problem::new(exit::NOT_FOUND, anyhow::anyhow!("no sweep{of} of run `{}` has started", run.run));
+        return Err(problem.hint("a stage with `sweep:` starts when its inputs are ready"));
     }
     Ok((run, sweeps))
 }

@@ -6,8 +6,8 @@ use clap::Args;
 use models::device::DeviceInfo;
 use protocol::stage::Sampler;
 use serde_json::json;
-use stages::generate::{DEFAULT_FRAMES, Generator};
 use stages::generate::timing::{self, Times, WARM_UP};
+use stages::generate::{DEFAULT_FRAMES, Generator};
 
 use super::model::{self, Found};
 use super::sampler::SamplerArgs;
@@ -77,8 +77,7 @@ pub(crate) async fn time(args: TimeArgs) -> Result<u8> {
     let mut timed: Vec<(&str, &Generator, Sampler)> = Vec::new();
     for (label, generator, found) in &models {
         let samplers = samplers(label, generator, &found.measured, &args).map_err(|why| {
-            Problem::usage(format!("{label}: {why}"))
-                .hint("leave --steps out for the steps that each model has by default")
+            Problem::usage(format!("{label}: {why}")).hint("leave out --steps to use the default of each model")
         })?;
         timed.extend(samplers.into_iter().map(|sampler| (label.as_str(), generator, sampler)));
     }
@@ -202,8 +201,9 @@ fn show(rows: &[Row], frames: usize, machine: &Machine, output: Output) {
             let processor = machine.processor.as_deref().unwrap_or("processor unknown");
             let Machine { backend, device, threads, instruction_set, .. } = machine;
             print::out(&format!(
-                "{}\n\n{} sentences one by one after {WARM_UP} of warm-up, all models in turn, {frames} frames each; from the sentence to features\n\
-                 {backend} ({device}) with {threads} threads, {instruction_set}, {processor}",
+                "{}\n\n{} sentences, one at a time, after {WARM_UP} for warm-up; models alternate; {frames} frames \
+                 each; measured from the sentence to the features\n{backend} ({device}) with {threads} threads, \
+                 {instruction_set}, {processor}",
                 print::table(&heads, cells.collect()),
                 first.times.sentences,
             ));

@@ -46,9 +46,9 @@ pub(super) fn unknown(vocabulary: Option<&Vocabulary>, label: &str, caption: &st
 fn note(vocabulary: &Vocabulary, label: &str, caption: &str, unknown: &[String]) -> String {
     let words = unknown.iter().map(|word| format!("`{word}`")).collect::<Vec<_>>().join(", ");
     let rest =
-        if vocabulary.has_any(caption) { "only the other words guide it" } else { "it draws an arbitrary motion" };
+        if vocabulary.has_any(caption) { "only the other words have an effect" } else { "the motion is arbitrary" };
     let nearest = vocabulary.nearest(caption, OFFERED);
     let offered = nearest.iter().map(|sentence| format!("\"{sentence}\"")).collect::<Vec<_>>().join(", ");
     let offered = if offered.is_empty() { String::new() } else { format!("; nearest known: {offered}") };
-    format!("note: {label} never saw {words} in training: {rest}{offered}")
+    format!("note: {words} did not occur in the training of {label}: {rest}{offered}")
 }

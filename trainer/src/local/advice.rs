@@ -15,7 +15,8 @@ fn long_warmup(stage: &PipelineStage) -> Option<String> {
     (warmup >= steps && warmup > 0).then(|| {
         let (name, shorter) = (&stage.name, (steps / 10).max(1));
         format!(
-            "stage `{name}` warms up for {} of {} steps, so its learning rate never reaches `lr`; `--set stages.{name}.warmup={shorter}` shortens it",
+            "stage `{name}` warms up for {} of {} steps, so its learning rate never reaches `lr`; `--set \
+             stages.{name}.warmup={shorter}` shortens the warm-up",
             grouped(warmup),
             grouped(steps)
         )
@@ -28,7 +29,9 @@ fn untrained_guidance(pipeline: &Pipeline, stage: &PipelineStage) -> Option<Stri
     let model = pipeline.stages.iter().find(|stage| stage.name.as_str() == measured)?;
     let (low, high) = model.settings.family()?.exceeded_range(guidance)?;
     let name = &stage.name;
-    Some(format!("stage `{name}` draws from `{measured}` at guidance {guidance}; it is trained for {low} to {high}"))
+    Some(format!(
+        "stage `{name}` samples `{measured}` at guidance {guidance}, but `{measured}` is trained for {low} to {high}"
+    ))
 }
 
 #[cfg(test)]
@@ -51,8 +54,9 @@ mod tests {
         assert_eq!(
             said,
             [
-                "stage `mld` warms up for 1,000 of 300 steps, so its learning rate never reaches `lr`; `--set stages.mld.warmup=30` shortens it",
-                "stage `fid` draws from `lcm` at guidance 40; it is trained for 0.5 to 5",
+                "stage `mld` warms up for 1,000 of 300 steps, so its learning rate never reaches `lr`; `--set \
+                 stages.mld.warmup=30` shortens the warm-up",
+                "stage `fid` samples `lcm` at guidance 40, but `lcm` is trained for 0.5 to 5",
             ]
         );
     }

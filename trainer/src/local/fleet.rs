@@ -80,8 +80,9 @@ impl Fleet {
     }
 
     fn spawn(&mut self, i: usize) -> Result<()> {
-        let program = std::env::current_exe()
-            .map_err(|error| Problem::failed(format!("cannot find this program to start workers: {error}")))?;
+        let program = std::env::current_exe().map_err(|error| {
+            Problem::failed(format!("cannot find the path of this program to start workers: {error}"))
+        })?;
         let log = self.log(&self.members[i].name);
         let stderr =
             std::fs::OpenOptions::new().create(true).append(true).open(&log).map_or(Stdio::null(), Stdio::from);
@@ -138,7 +139,7 @@ impl Fleet {
                         return Err(Problem::failed(format!(
                             "worker `{name}` died {EARLY_DEATHS} times right after its start ({status})\n{said}"
                         ))
-                        .hint(format!("all it said is in `{}`", log.display())));
+                        .hint(format!("its log is `{}`", log.display())));
                     }
                 }
                 None if restart && member.next_start <= now => self.spawn(i)?,

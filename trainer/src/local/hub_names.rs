@@ -44,10 +44,12 @@ fn check_revision(stage: &str, settings: &TextEmbed) -> Result<()> {
     if settings.revision.is_empty() || settings.encoder == TextEncoder::Hashed {
         return Ok(());
     }
-    let message =
-        format!("stage `{stage}`: `revision` is given, but `path` is the folder `{}`, which has none", settings.path);
+    let message = format!(
+        "stage `{stage}`: `revision` is set, but `path` is the folder `{}`; a folder has no revision",
+        settings.path
+    );
     Err(Problem::usage(message)
-        .hint("leave it out, or name the encoder as on huggingface.co, such as `openai/clip-vit-base-patch32`"))
+        .hint("remove `revision`, or set `path` to a name on huggingface.co, such as `openai/clip-vit-base-patch32`"))
 }
 
 /// Replaces names by folders, and fetches those that are not in the cache.

@@ -65,7 +65,7 @@ fn lacks(folder: &ExternalFolder) -> Option<String> {
         return None;
     }
     let absent = folder.files.iter().find(|file| !file.split('|').any(|one| path.join(one).exists()));
-    absent.map(|file| format!("no `{}` in it", file.split('|').collect::<Vec<_>>().join("` or `")))
+    absent.map(|file| format!("the folder has no `{}`", file.split('|').collect::<Vec<_>>().join("` or `")))
 }
 
 /// Refuses a folder whose features have the width of another format, according to its statistics.
@@ -78,16 +78,21 @@ pub(crate) fn check_format(path: &Path, format: DataFormat) -> Result<()> {
         return Ok(());
     }
     let other = [DataFormat::Humanml3d, DataFormat::Kit].into_iter().find(|other| width(*other) == found);
-    let is = other.map_or_else(String::new, |other| format!(", as `{}` has", other.name()));
+    let is = other.map_or_else(String::new, |other| format!(", like `{}`", other.name()));
     let problem = Problem::usage(format!(
-        "{}: Mean.npy has {found} features{is}; `format: {}` has {}",
+        "{}: Mean.npy has {found} features{is}, but `format: {}` has {}",
         path.display(),
         format.name(),
         width(format)
     ));
     Err(problem.hint(other.map_or_else(
-        || "give the folder with the published features".to_owned(),
-        |other| format!("set `dataset.format={}`, or another folder with `--set dataset.path=FOLDER`", other.name()),
+        || "use the folder with the published features".to_owned(),
+        |other| {
+            format!(
+                "use `--set dataset.format={}`, or choose another folder with `--set dataset.path=FOLDER`",
+                other.name()
+            )
+        },
     )))
 }
 
@@ -95,8 +100,9 @@ pub(crate) fn check_format(path: &Path, format: DataFormat) -> Result<()> {
 pub(crate) fn check_backend(backend: Backend) -> Result<()> {
     let problem = |error| Problem::usage(format!("`backend: {}`: {error}", backend.name()));
     models::device::open(backend, 0).map(drop).map_err(|error| {
-        problem(error)
-            .hint("`trainer devices` lists what this program and machine have; `--set backend=flex` runs everywhere")
+        problem(error).hint(
+            "`trainer devices` lists the backends of this program and machine; `--set backend=flex` runs everywhere",
+        )
     })
 }
 
@@ -121,7 +127,7 @@ mod tests {
         let expected = [
             ("dataset", "path", "no such folder"),
             ("judge", "path", "no such folder"),
-            ("judge", "words", "no `our_vab_words.pkl` in it"),
+            ("judge", "words", "the folder has no `our_vab_words.pkl`"),
         ];
         assert_eq!(shown, expected);
         assert!(found[0].line().contains("AMASS") && found[1].line().contains("text-to-motion"), "{found:#?}");

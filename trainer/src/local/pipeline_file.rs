@@ -54,7 +54,7 @@ fn instead_of(path: &Path) -> String {
     let near = spelling::nearest(&stem(path), stems.iter().map(String::as_str));
     let near = near.and_then(|near| known.iter().find(|path| stem(path) == near));
     near.map_or_else(
-        || "shipped pipelines are in `configs/`; `trainer run configs/quickstart.yaml` needs no data".to_owned(),
+        || "example pipelines are in `configs/`; `trainer run configs/quickstart.yaml` needs no data".to_owned(),
         |near| format!("did you mean `{}`?", near.strip_prefix(".").unwrap_or(near).display()),
     )
 }
@@ -62,7 +62,7 @@ fn instead_of(path: &Path) -> String {
 /// Suggests a pipeline inside a folder.
 fn inside(folder: &Path) -> String {
     match pipelines_in(folder).as_slice() {
-        [] => "name a pipeline's file, such as `configs/quickstart.yaml`; it has none".to_owned(),
+        [] => "the folder has no pipelines; name a pipeline file, such as `configs/quickstart.yaml`".to_owned(),
         found => {
             let names: Vec<String> = found.iter().take(8).map(|path| path.display().to_string()).collect();
             let more = if found.len() > names.len() { ", ..." } else { "" };
@@ -76,7 +76,7 @@ pub(crate) fn of_text(name: &str, source: String, sets: &[String]) -> Result<Pip
     let pipeline = pipeline::read(name, &source, sets).map_err(|mistakes| {
         let count = mistakes.0.len();
         let problem = Problem::usage(format!("{count} mistake(s) in the pipeline\n\n{mistakes}"));
-        problem.hint("nothing was run and nothing was stored")
+        problem.hint("nothing was run or stored")
     })?;
     Ok(PipelineFile { pipeline, source })
 }
@@ -98,7 +98,7 @@ fn read_text(path: &Path) -> std::io::Result<String> {
     if bytes.len() as u64 > limits::PIPELINE_BYTES {
         return Err(refuse(format!("it has more than {} bytes", limits::PIPELINE_BYTES)));
     }
-    String::from_utf8(bytes).map_err(|error| refuse(format!("it is no UTF-8 text: {}", error.utf8_error())))
+    String::from_utf8(bytes).map_err(|error| refuse(format!("it is not UTF-8 text: {}", error.utf8_error())))
 }
 
 /// Reads the file and digests the folders that it names, which must all exist. Folders that it names by hub id are
@@ -113,9 +113,11 @@ pub(crate) fn with_data(mut file: PipelineFile) -> Result<PipelineFile> {
     let missing = missing(&file.pipeline);
     if !missing.is_empty() {
         let lines: Vec<String> = missing.iter().map(|one| format!("\n  {}", one.line())).collect();
-        return Err(Problem::usage(format!("the pipeline reads what is not on this machine{}", lines.concat())).hint(
-            "set a folder with such as `--set dataset.path=FOLDER`; `trainer plan` shows all else; `dataset: {format: synthetic}` needs none",
-        ));
+        return Err(Problem::usage(format!("the pipeline needs data that is not on this machine{}", lines.concat()))
+            .hint(
+                "set a folder with, for example, `--set dataset.path=FOLDER`; `trainer plan` shows the rest; `dataset: \
+                 {format: synthetic}` needs no data",
+            ));
     }
     digest_folders(&mut file.pipeline)?;
     Ok(file)
@@ -164,7 +166,7 @@ pub(crate) async fn resolve_versions(pipeline: &mut Pipeline, store: Option<&Rea
             let (name, field, version) = (&stage.name, input.field, input.version);
             let text =
                 format!("stage `{name}`: `{field}` is `{version}`, a version of a registry, but there is no store");
-            Err(Problem::usage(text).hint("name the store with `--store DIR`; `registry list` shows what is in one"))
+            Err(Problem::usage(text).hint("select the store with `--store DIR`; `registry list` shows its models"))
         }
     }
 }
@@ -175,7 +177,7 @@ pub(crate) fn check_stage(pipeline: &Pipeline, until: Option<&StageName>) -> Res
         Some(until) if pipeline.stage(until).is_none() => {
             let names: Vec<&str> = pipeline.stages.iter().map(|stage| stage.name.as_str()).collect();
             Err(Problem::usage(format!(
-                "`--until {until}`: there is no such stage; expected one of {}",
+                "`--until {until}`: the pipeline has no such stage; expected one of {}",
                 names.join(", ")
             )))
         }
@@ -213,5 +215,5 @@ fn dataset_folders(pipeline: &Pipeline) -> impl Iterator<Item = (&PipelineStage,
 
 fn bad_folder(error: motion::dataset::OpenError) -> Problem {
     Problem::usage(error)
-        .hint("set the folder with `--set dataset.path=FOLDER`; `dataset: {format: synthetic}` needs none")
+        .hint("set the folder with `--set dataset.path=FOLDER`; `dataset: {format: synthetic}` needs no folder")
 }

@@ -107,7 +107,8 @@ impl Plan {
         }
         let wall = seconds / self.workers.max(1) as f64;
         let mut text = format!(
-            "\nabout {} of one worker, {} of {} at best; from {} updates of {} made-up clips a stage\n",
+            "\nabout {} with one worker, at best {} with {}; estimated from {} updates with {} synthetic clips per \
+             stage\n",
             long(seconds),
             long(wall),
             self.workers,
@@ -116,7 +117,7 @@ impl Plan {
         );
         if untried > 0 {
             text.push_str(&format!(
-                "without {untried} stage(s) that were not tried in the time that a plan may take\n"
+                "without {untried} stage(s) that could not be estimated within the time limit of a plan\n"
             ));
         }
         text
@@ -257,7 +258,7 @@ pub(crate) async fn plan(pipeline: &Pipeline, store: Option<&ReadStore>) -> Resu
                 }
                 (None, None) if stage.sweep.is_some() => {
                     let trials = stage.sweep.as_ref().map_or(0, protocol::sweep::Sweep::trials);
-                    ("run", format!("a sweep of up to {trials} trials; those that are known are not run again"))
+                    ("run", format!("a sweep of up to {trials} trials; finished trials are not run again"))
                 }
                 (Some(why), _) => ("resume", why),
                 (None, Some(input)) => ("run", format!("upstream `{}` runs", input.stage)),
@@ -452,8 +453,8 @@ mod tests {
             "Sentence-T5, such as huggingface.co/",
             "flex (CPU",
             "1150000  18.06M      139 days",
-            "about 139 days of one worker",
-            "that were not tried",
+            "about 139 days with one worker",
+            "that could not be estimated",
         ] {
             assert!(screen.contains(part), "`{part}` is missing");
         }

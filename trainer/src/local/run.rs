@@ -80,7 +80,9 @@ enum End {
 pub(crate) async fn run(request: Request, options: Options) -> Result<u8> {
     let mut stop = Stop::new()?;
     if options.workers == Some(0) {
-        return Err(Problem::usage("`--workers` is 0; expected at least 1").hint("leave it out for one a core"));
+        return Err(
+            Problem::usage("`--workers` is 0; expected at least 1").hint("leave it out to start one worker per core")
+        );
     }
     if let Request::Submit { file, until } = &request {
         pipeline_file::check_stage(&file.pipeline, until.as_ref())?;
@@ -102,7 +104,7 @@ pub(crate) async fn run(request: Request, options: Options) -> Result<u8> {
     pipeline_file::remember_data(&pipeline, &dir);
     let bars = options.output == Output::Table && print::on_terminal();
     let mut progress =
-        Progress::new(bars, &pipeline, "all of this run are busy or starting, and `--workers N` has N of them");
+        Progress::new(bars, &pipeline, "all workers of this run are busy or starting; `--workers N` starts N workers");
     progress.note(&format!("run {run} in {}", client::shown(&options.store)));
     if options.ui {
         progress.note(&format!("page {}", handle.page_link()));
@@ -126,7 +128,7 @@ pub(crate) async fn run(request: Request, options: Options) -> Result<u8> {
             }),
             // Programs find the pictures by their path.
             Ok(_) => {}
-            Err(why) => print::note(&format!("pictures of the run were not copied: {why}")),
+            Err(why) => print::note(&format!("cannot copy the pictures of the run: {why}")),
         }
     }
     Ok(exit)
@@ -145,9 +147,8 @@ async fn begin(handle: &Handle, store: &Store, request: Request) -> Result<(RunI
                 Problem::new(exit::NOT_FOUND, anyhow::anyhow!("there is no run `{run}` in this store"))
                     .hint("`trainer status --all` lists runs")
             })?;
-            let pipeline = serde_json::from_value(row.pipeline.clone()).map_err(|error| {
-                Problem::failed(format!("the pipeline of run `{}` does not read: {error}", row.run))
-            })?;
+            let pipeline = serde_json::from_value(row.pipeline.clone())
+                .map_err(|error| Problem::failed(format!("cannot parse the pipeline of run `{}`: {error}", row.run)))?;
             handle.control(&row.run, Control::Resume).await?;
             Ok((row.run.clone(), pipeline))
         }
@@ -202,7 +203,8 @@ async fn report_death(handle: &Handle, death: &Death) {
         // Reported as by the worker itself: under a grant that still holds.
         let message = format!("worker `{}` {why}", death.worker);
         if let Err(error) = handle.fail_for(&death.worker, FailureClass::OutOfMemory, message).await {
-            tracing::warn!(worker = %death.worker, "its work is tried again: {error}");
+            tracing::warn!(worker = %death.worker, "cannot report that the worker ran out of memory; its task will be \
+                retried: {error}");
         }
     }
     // A worker that never joined is unknown and holds no work.
@@ -221,7 +223,7 @@ async fn drain(
     fleet: &mut Option<Fleet>,
     stop: &mut Stop,
 ) -> Result<End> {
-    progress.note("stopping: workers finish their step and save; Ctrl-C again ends them at once");
+    progress.note("stopping: workers finish their step and save; press Ctrl-C again to end them at once");
     handle.drain().await?;
     let deadline = Instant::now() + PATIENCE;
     let mut changes = handle.changes();
@@ -245,7 +247,7 @@ async fn drain(
             return Ok(End::Trouble(trouble));
         }
         if Instant::now() > deadline {
-            progress.note("the workers do not stop; ending them");
+            progress.note("the workers did not stop in time; ending them");
             return Ok(End::Interrupted { killed: true });
         }
         tokio::select! {
@@ -265,10 +267,10 @@ fn report(view: &RunView, pipeline: &Pipeline, end: &End, options: &Options) -> 
     match end {
         End::Trouble(trouble) => {
             let problem = match trouble {
-                Trouble::Store(why) => Problem::usage(format!("the store takes no writes: {why}"))
-                    .hint(format!("free some space or make the store writable, then `{}` goes on", options.command)),
+                Trouble::Store(why) => Problem::usage(format!("cannot write to the store: {why}"))
+                    .hint(format!("free some space or make the store writable, then `{}` continues", options.command)),
                 Trouble::Failed(why) => Problem::coordinator_failed(why).hint(format!(
-                    "what was saved is kept, and `{}` goes on from it; please report this",
+                    "saved work is kept, and `{}` continues from it; please report this",
                     options.command
                 )),
             };
@@ -277,8 +279,8 @@ fn report(view: &RunView, pipeline: &Pipeline, end: &End, options: &Options) -> 
         }
         End::Interrupted { .. } if !view.state.is_final() => {
             let killed = matches!(end, End::Interrupted { killed: true });
-            let saved = if killed { "Ended; the last checkpoints are kept." } else { "Stopped; all work is saved." };
-            print::note(&format!("\n{saved} To go on:\n  {}", options.command));
+            let saved = if killed { "Ended; the latest checkpoints are kept." } else { "Stopped; all work is saved." };
+            print::note(&format!("\n{saved} To continue:\n  {}", options.command));
             return exit::INTERRUPTED;
         }
         End::Interrupted { .. } | End::Final => {}
@@ -314,7 +316,7 @@ fn report(view: &RunView, pipeline: &Pipeline, end: &End, options: &Options) -> 
             let message =
                 if reasons.is_empty() { format!("run `{}` ended early", view.run) } else { reasons.join("\n") };
             let problem = Problem::failed(message)
-                .hint(format!("`trainer logs {}` shows what its workers said; what is done stays done", view.run));
+                .hint(format!("`trainer logs {}` shows the workers' logs; finished stages are kept", view.run));
             print::problem(&problem, options.output);
             problem.exit
         }

@@ -92,8 +92,8 @@ pub(crate) async fn verify(pipeline: &Pipeline, dir: &Path, steps: u64, output: 
         let thread = std::thread::Builder::new().name("verify".to_owned()).stack_size(64 << 20);
         let again = thread
             .spawn(move || rerun(task, device, blobs, start, until))
-            .map_err(|error| Problem::failed(format!("no thread to compute in: {error}")))?;
-        let again = again.join().map_err(|_| Problem::new(exit::FAULT, anyhow::anyhow!("the stage has panicked")))?;
+            .map_err(|error| Problem::failed(format!("cannot start a thread: {error}")))?;
+        let again = again.join().map_err(|_| Problem::new(exit::FAULT, anyhow::anyhow!("the stage panicked")))?;
         let again = again.map_err(|error| {
             Problem::failed(format!("stage `{}` cannot be run again: {error}", stage.name))
                 .hint("`trainer registry fsck` checks the store")
@@ -101,8 +101,8 @@ pub(crate) async fn verify(pipeline: &Pipeline, dir: &Path, steps: u64, output: 
         all.push(compare(&stage.name, &recorded, &again));
     }
     if all.is_empty() {
-        return Err(Problem::usage(format!("nothing of `{}` was trained in `{}` yet", pipeline.name, dir.display()))
-            .hint("run it first without --verify"));
+        return Err(Problem::usage(format!("no training of `{}` is stored in `{}` yet", pipeline.name, dir.display()))
+            .hint("run the pipeline without --verify first"));
     }
     Ok(report(&all, output))
 }
@@ -135,7 +135,7 @@ async fn recorded(
         for row in store.checkpoints(&TaskId::of(&run, &name, None)).await?.into_iter().rev() {
             let bytes = store.blobs().get(row.manifest).map_err(Problem::failed)?;
             let manifest = serde_json::from_slice(&bytes)
-                .map_err(|error| Problem::failed(format!("checkpoint {} does not read: {error}", row.manifest)))?;
+                .map_err(|error| Problem::failed(format!("cannot read checkpoint {}: {error}", row.manifest)))?;
             checkpoints.push((row.step, manifest));
         }
         let mut values = BTreeMap::new();
@@ -224,8 +224,11 @@ fn report(all: &[Verified], output: Output) -> u8 {
     if different.is_empty() {
         return 0;
     }
-    let problem = Problem::new(exit::INTEGRITY, anyhow::anyhow!("not what was stored: {}", different.join(", ")))
-        .hint("another processor, backend or build computes other bits; `trainer registry fsck` says whether the store is whole");
+    let problem = Problem::new(
+        exit::INTEGRITY,
+        anyhow::anyhow!("the result differs from the stored one: {}", different.join(", ")),
+    )
+    .hint("another processor, backend or build may compute other bits; `trainer registry fsck` checks the store");
     print::problem(&problem, output);
     exit::INTEGRITY
 }

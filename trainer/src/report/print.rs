@@ -50,7 +50,7 @@ pub(crate) fn note(text: &str) {
 pub(crate) fn json(value: &impl Serialize) {
     match serde_json::to_string_pretty(value) {
         Ok(text) => out(&text),
-        Err(error) => note(&format!("error: the answer does not serialise: {error}")),
+        Err(error) => note(&format!("error: cannot serialise the answer: {error}")),
     }
 }
 

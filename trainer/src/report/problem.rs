@@ -5,14 +5,13 @@ use std::fmt::Display;
 /// Exit codes, one meaning each.
 pub(crate) mod exit {
     /// The table of `--help`.
-    pub(crate) const HELP: &str = "\
-Exit codes:
+    pub(crate) const HELP: &str = "Exit codes:
     0  done
-    1  what was asked for failed, such as a run
+    1  the requested operation failed, such as a run
     2  wrong usage, a wrong file or a store that cannot be used; nothing was changed
-    3  a fault of this program; please report it
+    3  a bug in this program; please report it
     4  a conflict with what is stored
-    5  the token is missing or not enough
+    5  the token is missing or lacks a scope
     6  the server does not answer
     7  there is no such run, stage or model
     8  the run was cancelled
@@ -116,16 +115,15 @@ impl From<coordinator::StartError> for Problem {
     fn from(error: coordinator::StartError) -> Self {
         match &error {
             coordinator::StartError::NoToken(_) => {
-                Self::new(exit::USAGE, error).hint("give a file of tokens with --token-file, or listen on 127.0.0.1")
+                Self::new(exit::USAGE, error).hint("set a token file with --token-file, or listen on 127.0.0.1")
             }
-            coordinator::StartError::NoTls(_) => Self::new(exit::USAGE, error).hint(
-                "give --tls-cert and --tls-key; on a network that only you see, or one that encrypts by itself, say --insecure",
-            ),
+            coordinator::StartError::NoTls(_) => Self::new(exit::USAGE, error)
+                .hint("set --tls-cert and --tls-key; on a private or encrypted network, use --insecure"),
             coordinator::StartError::Listen { .. } => {
-                Self::new(exit::USAGE, error).hint("choose another address with --bind; port 0 takes a free one")
+                Self::new(exit::USAGE, error).hint("choose another address with --bind; port 0 selects a free port")
             }
             coordinator::StartError::Recover(_) => Self::new(exit::FAILED, error)
-                .hint("go on with the build that wrote it, or use another --store; `registry` still reads this one"),
+                .hint("use the build that wrote it, or another --store; `registry` can still read this store"),
             _ => Self::new(exit::FAILED, error),
         }
     }

@@ -135,7 +135,7 @@ fn storage_line(problem: &StorageProblem) -> String {
 /// `pcm: trial 7 is best, latent_fid 0.1234 with adversarial 0.1; 24 trials, 5200 of 21600 steps (24 %)`.
 pub(crate) fn sweep_line(sweep: &SweepView) -> String {
     let best =
-        sweep.best.and_then(|best| sweep.trials.get(best)).map_or("no trial is at its end yet".to_owned(), |best| {
+        sweep.best.and_then(|best| sweep.trials.get(best)).map_or("no trial is finished yet".to_owned(), |best| {
             let value = best.results.last().copied().flatten().unwrap_or(f64::NAN);
             let values: Vec<String> = best.values.iter().map(|(path, value)| format!("{path} {value}")).collect();
             format!(

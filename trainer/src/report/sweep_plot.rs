@@ -113,7 +113,7 @@ impl By {
             _ => {
                 let there =
                     numbers.iter().map(String::as_str).chain(["seconds", "steps"]).collect::<Vec<_>>().join(", ");
-                Err(format!("`{name}` is no searched number; there is: {there}"))
+                Err(format!("`{name}` is not a searched number; available: {there}"))
             }
         }
     }
@@ -174,7 +174,7 @@ pub(crate) fn curves(run: &RunView, sweep: &SweepView, by: &By, metrics: &[Strin
                 evaluations.iter().flat_map(|(_, stage)| stage.metrics.keys().map(String::as_str)).collect();
             let given = given.into_iter().filter(|name| !name.ends_with(".lower") && !name.ends_with(".upper"));
             return Err(format!(
-                "no evaluation of `{}` has both `{metric}` and what it is drawn by; metrics: {}",
+                "no evaluation of `{}` has `{metric}` together with the value of the x axis; metrics: {}",
                 sweep.stage,
                 given.collect::<Vec<_>>().join(", ")
             ));

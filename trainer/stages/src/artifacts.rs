@@ -173,7 +173,7 @@ pub struct DenoiserMeta {
 /// Reads a manifest's meta as `T`; `what` names the artifact in the error.
 pub fn meta<T: DeserializeOwned>(manifest: &Manifest, what: &str) -> Result<T, StageError> {
     serde_json::from_value(manifest.meta.clone())
-        .map_err(|e| StageError::Input(format!("{what}: its manifest is not one that this build writes: {e}")))
+        .map_err(|e| StageError::Input(format!("{what}: this build cannot parse its manifest: {e}")))
 }
 
 /// Serialises a meta as JSON.
@@ -210,13 +210,13 @@ pub fn expect(what: &str, manifest: &Manifest, kind: ArtifactKind) -> Result<(),
     if manifest.kind == kind {
         return Ok(());
     }
-    Err(StageError::Input(format!("{what} is an artifact of kind {:?}, expected {kind:?}", manifest.kind)))
+    Err(StageError::Input(format!("{what} is an artifact of kind {:?}; expected {kind:?}", manifest.kind)))
 }
 
 fn entry<'a>(manifest: &'a Manifest, name: &str) -> Result<&'a FileEntry, StageError> {
     manifest.files.get(name).ok_or_else(|| {
         let have: Vec<_> = manifest.files.keys().map(String::as_str).collect();
-        StageError::Input(format!("an artifact of kind {:?} has no file `{name}`; it has {have:?}", manifest.kind))
+        StageError::Input(format!("the artifact of kind {:?} has no file `{name}`; it has {have:?}", manifest.kind))
     })
 }
 
@@ -302,6 +302,11 @@ pub fn publish(
 /// Reads the dataset of an artifact of kind `dataset`.
 pub fn dataset(blobs: &dyn Blobs, manifest: &Manifest) -> Result<Dataset, StageError> {
     from_files(blobs, manifest, |fetch| Dataset::from_files(fetch))
+}
+
+/// Reads the input `dataset`.
+pub fn input_dataset(cx: &dyn AttemptContext) -> Result<Dataset, StageError> {
+    dataset(&*cx.blobs(), &input(cx, "dataset", ArtifactKind::Dataset)?.1)
 }
 
 /// Reads only the captions of a dataset.
@@ -446,7 +451,7 @@ impl Tensors {
     ) -> Result<HostTensor<T>, StageError> {
         let bad = |text: String| StageError::Context(ContextError::Corrupt(format!("{what}: {text}")));
         let tensor =
-            found.ok_or_else(|| bad(format!("no tensor `{name}`; there are {:?}", others.collect::<Vec<_>>())))?;
+            found.ok_or_else(|| bad(format!("no tensor `{name}`; the file has {:?}", others.collect::<Vec<_>>())))?;
         if tensor.shape.len() != rank {
             return Err(bad(format!("tensor `{name}` has shape {:?}, expected {rank} axes", tensor.shape)));
         }
@@ -474,7 +479,7 @@ impl Embeddings {
         let null = tensors.take("null", 1, EMBEDDINGS_FILE)?.values.into_vec();
         if captions.shape != [meta.captions, meta.dim] || null.len() != meta.dim {
             return Err(StageError::Context(ContextError::Corrupt(format!(
-                "{EMBEDDINGS_FILE}: `captions` has shape {:?} and `null` {}, the manifest says {} x {}",
+                "{EMBEDDINGS_FILE}: `captions` has shape {:?} and `null` has {} numbers; the manifest declares {} x {}",
                 captions.shape,
                 null.len(),
                 meta.captions,
@@ -506,7 +511,7 @@ impl Latents {
         let expected = [meta.splits.len() * meta.crops, meta.latent.tokens, meta.latent.dim];
         if mu.shape != expected || sigma.shape != expected {
             return Err(StageError::Context(ContextError::Corrupt(format!(
-                "{LATENTS_FILE}: `mu` has shape {:?} and `sigma` {:?}, the manifest says {expected:?}",
+                "{LATENTS_FILE}: `mu` has shape {:?} and `sigma` has shape {:?}; the manifest declares {expected:?}",
                 mu.shape, sigma.shape
             ))));
         }

@@ -381,7 +381,7 @@ fn a_model_with_a_length_estimator_says_how_long_a_motion_is() {
     let mut other = part;
     other.meta["fits"]["text"] = serde_json::to_value(Digest::of(b"another encoder")).expect("a digest");
     let refused = with(&other).expect_err("another encoder").to_string();
-    assert!(refused.contains("`length` was made for the `text`"), "{refused}");
+    assert!(refused.contains("`length` was trained with the `text`"), "{refused}");
 }
 
 /// A student's prediction in its last step equals the generated motion, and all steps of a teacher are reported.

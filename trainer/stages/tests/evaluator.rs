@@ -222,7 +222,7 @@ fn pools_have_names_of_their_own_and_drop_last_leaves_out_what_fills_none() {
     };
     let (both, log, meta) = measured(&mut bench, &of(&[16, 8], false), &inputs);
     assert_eq!(
-        (&meta["pools"], log.iter().any(|line| line.contains("fill no pool"))),
+        (&meta["pools"], log.iter().any(|line| line.contains("do not fill a pool"))),
         (&serde_json::json!([16, 8]), false)
     );
     let (eight, ..) = measured(&mut bench, &of(&[8], false), &inputs);
@@ -247,7 +247,7 @@ fn pools_have_names_of_their_own_and_drop_last_leaves_out_what_fills_none() {
     assert_eq!(whole, kept);
 
     let refused = bench.run("eval", &evaluate(1, of(&[32, entries + 1], false)), &inputs).unwrap_err().to_string();
-    assert!(refused.contains(&format!("among {}", entries + 1)) && refused.contains("smaller `pools`"), "{refused}");
+    assert!(refused.contains(&format!("pools of {}", entries + 1)) && refused.contains("smaller `pools`"), "{refused}");
 }
 
 #[test]
@@ -304,7 +304,7 @@ fn motions_are_as_long_as_an_estimator_draws_if_there_is_one() {
     let other = bench.blobs().put(other.to_bytes()).expect("stored");
     let with = [&inputs[..], &[("length", other)]].concat();
     let refused = bench.run("eval", &evaluate(1, drawn), &with).expect_err("another encoder");
-    assert!(refused.to_string().contains("another text encoder"), "{refused}");
+    assert!(refused.to_string().contains("different text encoders"), "{refused}");
     assert_eq!(refused.class(), FailureClass::Input, "{refused}");
 }
 
@@ -434,10 +434,10 @@ fn what_an_evaluator_does_not_fit_is_refused_with_the_reason() {
     let kit = bench.blobs().put(manifest.to_bytes()).unwrap();
 
     for (data, evaluator, settings, reason) in [
-        (store(&bench, &normalised, data), evaluator, &test, "another scale"),
-        (store(&bench, &millimetres, data), evaluator, &test, "another scale"),
+        (store(&bench, &normalised, data), evaluator, &test, "do not have the evaluator's scale"),
+        (store(&bench, &millimetres, data), evaluator, &test, "do not have the evaluator's scale"),
         (store(&bench, &nothing, data), evaluator, &test, "`test` has no entries"),
-        (data, evaluator, &few, "ranks a motion among 32"),
+        (data, evaluator, &few, "needs pools of 32"),
         (data, kit, &test, "`kit` skeletons"),
         (data, data, &test, "kind Dataset"),
     ] {
@@ -493,5 +493,5 @@ fn a_vocabulary_is_kept_with_the_evaluator_and_named() {
     std::fs::write(&index, pickled(&[("sos", 0), ("eos", 1), ("unk", 9)])).unwrap();
     let refused = bench.run("evaluator-3", &settings, &[("dataset", data)]).unwrap_err().to_string();
     // The word is out of the file, and so is not quoted.
-    assert!(refused.contains("row 9") && refused.contains("4 vectors"), "{refused}");
+    assert!(refused.contains("row 9") && refused.contains("4 rows"), "{refused}");
 }

@@ -224,7 +224,7 @@ fn training_goes_on_from_a_trained_model() {
     );
     let smf = TrainStableMoFusion { init: "host".into(), ..stablemofusion() };
     let refused = bench.run("smf", &smf.into(), &inputs).unwrap_err().to_string();
-    assert!(refused.contains("nothing of `init` fits"), "{refused}");
+    assert!(refused.contains("`init` does not match this network"), "{refused}");
 }
 
 /// The latent host, through its decoder.

@@ -74,8 +74,8 @@ fn broken_recordings_are_all_named_or_left_out() {
     assert_eq!((ran.metrics()["clips"], ran.metrics()["skipped"]), (8.0, 2.0));
     // The user's settings take precedence: a map, splits, axis or captions that do not fit the recordings are refused.
     for (settings, part) in [
-        (DataFeatures { map: "nobody".into(), ..base.clone() }, "no joint map `nobody` ships"),
-        (DataFeatures { map: "lafan1".into(), ..base.clone() }, "`pelvis` is to be"),
+        (DataFeatures { map: "nobody".into(), ..base.clone() }, "no built-in joint map `nobody`"),
+        (DataFeatures { map: "lafan1".into(), ..base.clone() }, "`pelvis` uses the node"),
         (
             DataFeatures { splits: Splits::Lists, skip_broken: true, up: UpAxis::Y, ..base.clone() },
             "no usable training clip",

@@ -291,13 +291,13 @@ fn masked_generators_draw_a_part_of_a_motion_and_keep_the_tokens_of_the_rest() {
         let refused = |keep: &[std::ops::Range<usize>], motion: &[f32]| {
             model.edit("a jump", motion, keep, Some(&sampler), Seed(3)).unwrap_err().to_string()
         };
-        assert!(refused(&[0..64], &source.features).contains("nothing is left to draw"));
+        assert!(refused(&[0..64], &source.features).contains("nothing is left to generate"));
         assert!(refused(&[1..4], &source.features).contains("nothing stays"));
-        assert!(refused(&[0..4], &source.features.repeat(2)).contains("draws motions of 1 to 80"));
+        assert!(refused(&[0..4], &source.features.repeat(2)).contains("generates 1 to 80"));
     }
     let source = open("momask").generate("a person walks", Some(40), None, Seed(1)).unwrap();
     let refused = open("gpt").edit("a jump", &source.features, &[0..20], None, Seed(1)).unwrap_err().to_string();
-    assert!(refused.contains("draws whole motions"), "{refused}");
+    assert!(refused.contains("cannot regenerate part of a motion"), "{refused}");
 }
 
 /// Chains of kills with 1 to 3 members in turn, some right after a checkpoint, one before the first step. Then members
@@ -383,12 +383,12 @@ fn what_begins_with_another_prediction_is_refused() {
     let velocity = ("init", world.outputs["discord"]);
     let with = |more: &[(&'static str, Digest)]| [&inputs[..], more].concat();
     let error = world.bench.run("data", &data.clone().into(), &with(&[velocity])).unwrap_err();
-    let said = "the network of `init` gives the velocity, but the one that is trained here gives the data";
+    let said = "the network of `init` predicts the velocity, but this stage trains one that predicts the data";
     assert!(matches!(&error, StageError::Input(error) if error.starts_with(said)), "{error}");
     assert_eq!(world.bench.checkpoints("data"), [0_u64; 0], "it had begun");
     let output = world.bench.run("data", &data.clone().into(), &inputs).unwrap().output();
     let begun = world.bench.run("more", &data.into(), &with(&[("init", output)])).unwrap();
-    assert!(begun.told.log.iter().any(|line| line.starts_with("begins with")), "{:?}", begun.told.log);
+    assert!(begun.told.log.iter().any(|line| line.starts_with("starts with")), "{:?}", begun.told.log);
     // A student has its teacher's prediction.
     let of_data = with(&[("teacher", output), velocity]);
     let error = world.bench.run("jumps", &jumps("", 1), &of_data).unwrap_err().to_string();
@@ -405,11 +405,11 @@ fn what_does_not_fit_is_refused_with_a_reason() {
     };
     let other = [("tokens", "plain-tokens"), ("tokenizer", "residual"), ("text", "text")];
     let error = refused(&mut world, generator(TokenGenerator::Autoregressive), &other);
-    assert!(error.contains("another tokenizer"), "{error}");
+    assert!(error.contains("were not encoded with"), "{error}");
     let mut other = other.to_vec();
     other.push(("dataset", "dataset"));
     let error = refused(&mut world, generator(TokenGenerator::Mmm), &other);
-    assert!(error.contains("another tokenizer"), "{error}");
+    assert!(error.contains("were not encoded with"), "{error}");
     let layered = [("tokens", "residual-tokens"), ("tokenizer", "residual"), ("text", "text")];
     let error = refused(&mut world, generator(TokenGenerator::Autoregressive), &layered);
     assert!(error.contains("one codebook"), "{error}");
@@ -417,15 +417,15 @@ fn what_does_not_fit_is_refused_with_a_reason() {
     let mut decoders = run(1, 1);
     for (decoder, model, words) in [
         ("discord", "gpt", "another tokenizer"),
-        ("latent-flow", "gpt", "of a vae, not of a tokenizer"),
-        ("jumps", "mld", "of a tokenizer, not of a vae"),
+        ("latent-flow", "gpt", "a vae instead of a tokenizer"),
+        ("jumps", "mld", "a tokenizer instead of a vae"),
     ] {
         let error = refused(&mut decoders, ModelDecoder::default().into(), &[("model", model), ("decoder", decoder)]);
         assert!(error.contains(words), "{decoder} on {model}: {error}");
     }
     let taught = [("dataset", "dataset"), ("tokenizer", "residual"), ("teacher", "jumps")];
     let error = refused(&mut decoders, jumps("", 2), &taught);
-    assert!(error.contains("a student itself"), "{error}");
+    assert!(error.contains("is a student"), "{error}");
     let StageSettings::TrainTokenizer(mut settings) = tokenizer(1, 8, Resets::Always) else { unreachable!() };
     settings.window = 4_000;
     let error = refused(&mut world, settings.into(), &[("dataset", "dataset")]);

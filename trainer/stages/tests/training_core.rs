@@ -371,7 +371,7 @@ fn a_slice_that_breaks_its_plan_is_refused() {
         }
     };
     let error = world(1).run_gang("toy", &settings, &[], &body).unwrap_err().to_string();
-    assert!(error.contains("a slice gave gradients of [3, 3, 3] values"), "{error}");
+    assert!(error.contains("a slice has gradients of [3, 3, 3] values"), "{error}");
 }
 
 /// Codebooks, sums and counts over several steps against those of the published quantiser (fixture `05_rvq_ema`): the

@@ -77,7 +77,10 @@ fn p6_a_vae_of_other_features_is_gone_on_from_and_fresh_where_features_go_in_and
         (2..=4).contains(&fresh.len()) && fresh.iter().all(|line| line.contains("263") && line.contains("251")),
         "{said}"
     );
-    assert!(said.contains("begins with") && said.contains("differs in `features`, `format`, `mean`, `std`"), "{said}");
+    assert!(
+        said.contains("starts with") && said.contains("was trained with another `features`, `format`, `mean`, `std`"),
+        "{said}"
+    );
     for (members, script) in
         [(2, Script::default()), (3, Script { lost: vec![(0, 1)], joins: vec![(2, 2)], ..Script::default() })]
     {
@@ -111,7 +114,7 @@ fn what_fits_nothing_and_what_is_of_another_kind_is_refused() {
         bench.run("vae", &settings.into(), &inputs(init)).unwrap_err().to_string()
     };
     let nothing = refused(other, outputs["vae"]);
-    assert!(nothing.contains("nothing of `init` fits"), "{nothing}");
+    assert!(nothing.contains("`init` does not match this network"), "{nothing}");
     let kind = refused(settings, outputs["latents"]);
     assert!(kind.contains("expected Vae"), "{kind}");
 }

@@ -100,7 +100,7 @@ impl Description {
         self.network.check()?;
         let (most, positions) = (self.rules.most, self.network.positions());
         if most > positions {
-            return Err(format!("captions have up to {most} tokens, the network {positions} positions"));
+            return Err(format!("captions have up to {most} tokens, but the network has {positions} positions"));
         }
         match &self.head {
             Some(Head { width, .. }) if !(1..=WIDEST).contains(width) => {
@@ -131,8 +131,8 @@ impl EncoderFolder {
     /// The missing or invalid file, with the remedy.
     pub fn open(path: &DataPath, request: &Request) -> Result<Self, EncoderError> {
         if !path.is_folder() {
-            let what = if path.exists() { "is no folder" } else { "no such folder" };
-            return Err(EncoderError::at(path, format!("{what}; expected one with a published text encoder")));
+            let what = if path.exists() { "is not a folder" } else { "no such folder" };
+            return Err(EncoderError::at(path, format!("{what}; expected a folder with a published text encoder")));
         }
         let modules = Modules::read(path)?;
         let root = modules.as_ref().map_or_else(|| path.clone(), |modules| modules.first.clone());
@@ -202,7 +202,7 @@ impl EncoderFolder {
         let parts: Vec<String> = parts.iter().map(|(part, count)| format!("{part}* ({count})")).collect();
         (!parts.is_empty()).then(|| {
             let (count, names) = (self.skipped.len(), excerpts(parts.iter().map(String::as_str), 8));
-            format!("{}: {count} tensors are not of the text encoder: {names}", self.path.display())
+            format!("{}: skipped {count} tensors that are not part of the text encoder: {names}", self.path.display())
         })
     }
 }
@@ -236,13 +236,14 @@ fn tokenizer(root: &DataPath, kind: Kind) -> Result<(String, Vec<u8>), EncoderEr
     }
     let folder = root.display();
     let make = format!(
-        "make one with `python -c \"from transformers import AutoTokenizer as A; A.from_pretrained('{folder}').save_pretrained('{folder}')\"`"
+        "create one with `python -c \"from transformers import AutoTokenizer as A; \
+         A.from_pretrained('{folder}').save_pretrained('{folder}')\"`"
     );
     let what = match kind {
         Kind::Clip => {
             format!("no `tokenizer.json`, and no `vocab.json` with `merges.txt`; download one of them, or {make}")
         }
-        _ if is_there("spiece.model") => format!("no `tokenizer.json`; a `spiece.model` alone is not read: {make}"),
+        _ if is_there("spiece.model") => format!("no `tokenizer.json`; `spiece.model` alone is not supported: {make}"),
         _ => format!("no `tokenizer.json`; download it, or {make}"),
     };
     Err(EncoderError::at(root, what))
@@ -269,7 +270,7 @@ fn rules(
     let most = |own: usize, highest: usize| match request.most {
         0 => Ok(own.min(highest)),
         asked if asked <= highest => Ok(asked),
-        asked => Err(EncoderError::at(root, format!("has {highest} positions, but {asked} tokens are asked for"))),
+        asked => Err(EncoderError::at(root, format!("has {highest} positions, but {asked} tokens are requested"))),
     };
     match network {
         Network::Clip(sizes) => {
@@ -277,7 +278,7 @@ fn rules(
             let (first, end) = (id(&word("bos_token", "<|startoftext|>"))?, id(&end_word)?);
             if ![2, end as usize].contains(&sizes.eos_token_id) {
                 let (said, is) = (sizes.eos_token_id, excerpt(&end_word));
-                let what = format!("`eos_token_id` is {said}; expected 2, or {end}, which is `{is}` of the tokenizer");
+                let what = format!("`eos_token_id` is {said}; expected 2, or {end}, the id of `{is}` in the tokenizer");
                 return Err(EncoderError::at(&root.join("config.json"), what));
             }
             let is_openai = request.ids == TokenIds::OpenAi;
@@ -344,7 +345,7 @@ impl Modules {
         let mut all = Vec::new();
         for Module { path: below, class } in listed {
             if !Path::new(&below).components().all(|part| matches!(part, Component::Normal(_))) {
-                return Err(refuse(format!("`{}` is not a folder below it", excerpt(&below))));
+                return Err(refuse(format!("`{}` is not a folder below this one", excerpt(&below))));
             }
             let class = class.rsplit('.').next().unwrap_or_default().to_owned();
             all.push((class, path.join_quoted(&below)));
@@ -367,7 +368,7 @@ impl Modules {
         if !known.contains(&&classes[..]) {
             let found = classes.join(", ");
             return Err(refuse(format!(
-                "lists {} behind the network; expected Pooling, then maybe Dense, then maybe Normalize",
+                "lists {} after the network; expected Pooling, then optionally Dense, then optionally Normalize",
                 excerpt(&found)
             )));
         }
@@ -401,10 +402,12 @@ fn check_pooling(file: &DataPath, width: usize) -> Result<(), EncoderError> {
         .collect();
     if on != ["pooling_mode_mean_tokens"] && on != ["mean"] {
         let on = on.join(", ");
-        return Err(refuse(format!("pools by `{}`; expected the mean of the tokens", excerpt(&on))));
+        return Err(refuse(format!("pools with `{}`; expected the mean of the tokens", excerpt(&on))));
     }
     match config["word_embedding_dimension"].as_u64() {
-        Some(said) if said != width as u64 => Err(refuse(format!("pools {said} numbers, the network gives {width}"))),
+        Some(said) if said != width as u64 => {
+            Err(refuse(format!("pools {said} numbers, but the network returns {width}")))
+        }
         _ => Ok(()),
     }
 }

@@ -216,7 +216,8 @@ impl Network {
                 let (buckets, most) = (of.relative_attention_num_buckets, of.relative_attention_max_distance);
                 if buckets % 4 != 0 || most <= buckets / 4 {
                     return Err(format!(
-                        "{buckets} buckets up to a distance of {most}; expected a multiple of 4, and a distance above its quarter"
+                        "there are {buckets} buckets up to a distance of {most}; expected a multiple of 4, and a \
+                         distance above a quarter of it"
                     ));
                 }
                 match of.feed_forward_proj.as_str() {

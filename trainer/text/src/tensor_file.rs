@@ -111,7 +111,7 @@ impl ReadAt for [u8] {
     fn read_at(&self, offset: u64, out: &mut [u8]) -> Result<(), String> {
         let start = usize::try_from(offset).ok();
         let range = start.and_then(|start| Some(start..start.checked_add(out.len())?));
-        out.copy_from_slice(range.and_then(|range| self.get(range)).ok_or("it ends before that")?);
+        out.copy_from_slice(range.and_then(|range| self.get(range)).ok_or("the file is too short")?);
         Ok(())
     }
 }
@@ -150,15 +150,15 @@ impl<R: ReadAt> WeightsFile<R> {
         source.read_at(0, &mut length)?;
         let length = u64::from_le_bytes(length);
         if length > HEADER_BYTES.min(bytes - 8) {
-            return Err(bad(&format!("says that its header has {length} bytes, of {bytes}")));
+            return Err(bad(&format!("declares a header of {length} bytes, but has {bytes} bytes")));
         }
         let mut json = vec![0; usize::try_from(length).unwrap_or_default()];
         source.read_at(8, &mut json)?;
         let header: Metadata =
-            serde_json::from_slice(&json).map_err(|e| bad(&format!("has a header that is {}", json_mistake(&e))))?;
+            serde_json::from_slice(&json).map_err(|e| bad(&format!("has an invalid header: {}", json_mistake(&e))))?;
         if header.data_len() as u64 != bytes - 8 - length {
             let said = header.data_len();
-            return Err(bad(&format!("says that its tensors take {said} bytes, and has {}", bytes - 8 - length)));
+            return Err(bad(&format!("declares tensors of {said} bytes, but has {}", bytes - 8 - length)));
         }
         let place = |info: &TensorInfo| TensorFile {
             element: Element::of(info.dtype),
@@ -189,7 +189,7 @@ impl<R: ReadAt> WeightsFile<R> {
     /// # Errors
     /// If there is no tensor of floats with that number of elements, or it cannot be read.
     pub fn read(&self, name: &str, out: &mut [f32]) -> Result<(), String> {
-        let missing = || format!("no tensor `{name}` of {} numbers", out.len());
+        let missing = || format!("no tensor `{name}` with {} numbers", out.len());
         let tensor = self.tensors.get(name).ok_or_else(missing)?;
         let element = tensor.element.ok_or_else(missing)?;
         if tensor.shape.iter().product::<usize>() != out.len() {

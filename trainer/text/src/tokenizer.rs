@@ -145,19 +145,23 @@ impl Tokenizer {
         if let Some((word, id)) = known.iter().filter(|(_, id)| **id as usize >= rows).min() {
             let word = excerpt(word);
             return Err(refuse(format!(
-                "the token `{word}` has the id {id}, but the table of the weights has {rows} rows; take both from one model"
+                "the token `{word}` has id {id}, but the embedding table has {rows} rows; use the tokenizer and the \
+                 weights of the same model"
             )));
         }
         if let Some(id) = [rules.end, rules.pad].into_iter().chain(rules.first).find(|id| *id as usize >= rows) {
-            return Err(refuse(format!("the id {id} is needed, but the table of the weights has {rows} rows")));
+            return Err(refuse(format!("the token id {id} is needed, but the embedding table has {rows} rows")));
         }
         if rules.most <= rules.added() {
-            return Err(refuse(format!("{} tokens a caption leave no room for one; expected at least 3", rules.most)));
+            return Err(refuse(format!(
+                "a limit of {} tokens leaves no room for a caption; expected at least 3",
+                rules.most
+            )));
         }
         let added = inner.get_post_processor().map_or(0, |post| post.added_tokens(false));
         if added != rules.added() {
             return Err(refuse(format!(
-                "adds {added} tokens to a caption; expected {}, the end and what this model has before the first",
+                "adds {added} tokens to a caption; expected {}, the number of special tokens of this model",
                 rules.added()
             )));
         }
@@ -196,15 +200,15 @@ impl Tokenizer {
         }
         let text = self.rules.prepared(caption);
         let encoded = catch_unwind(AssertUnwindSafe(|| self.inner.encode_fast(text.as_str(), true)))
-            .map_err(|_| refuse("the tokenizer broke; its file is damaged".into()))?
-            .map_err(|e| refuse(format!("the tokenizer says: {}", excerpt(&e.to_string()))))?;
+            .map_err(|_| refuse("the tokenizer failed; its file is damaged".into()))?
+            .map_err(|e| refuse(format!("the tokenizer failed: {}", excerpt(&e.to_string()))))?;
         let ids = encoded.get_ids().to_vec();
         let sound = ids.len() <= self.rules.most
             && ids.iter().all(|id| (*id as usize) < self.rows)
             && ids.last() == Some(&self.rules.end)
             && self.rules.first.is_none_or(|first| ids.first() == Some(&first));
         if !sound {
-            return Err(refuse(format!("became the ids {ids:?}, which are not those of a caption of this model")));
+            return Err(refuse(format!("has the ids {ids:?}, which do not form a caption of this model")));
         }
         Ok(ids)
     }
@@ -224,7 +228,7 @@ impl Tokenizer {
 /// Creates the tokenizer of a checked file.
 fn parsed(place: &str, json: &[u8]) -> Result<tokenizers::Tokenizer, EncoderError> {
     let refuse = |what: String| EncoderError::new(place, what);
-    let expected = "expected a `tokenizer.json` as Hugging Face's tokenizers write it";
+    let expected = "expected a `tokenizer.json` of Hugging Face tokenizers";
     let looked: Looked =
         serde_json::from_slice(json).map_err(|e| refuse(format!("{}; {expected}", json_mistake(&e))))?;
     let counted = [("model.vocab", &looked.model.vocab), ("model.merges", &looked.model.merges)];
@@ -237,7 +241,7 @@ fn parsed(place: &str, json: &[u8]) -> Result<tokenizers::Tokenizer, EncoderErro
         }
     }
     if looked.model.dropout.is_some_and(|share| share != 0.0) {
-        return Err(refuse("`model.dropout` is set, so that ids would be drawn by chance; set it to null".into()));
+        return Err(refuse("`model.dropout` is set, which makes the ids random; set it to null".into()));
     }
     let mut steps = (0, 0);
     check_normalizer(&looked.normalizer, &mut steps).map_err(refuse)?;
@@ -266,7 +270,10 @@ fn check_normalizer(step: &Value, met: &mut (usize, usize)) -> Result<(), String
             let longest = text("content").len().max(text("prepend").len());
             if met.1 > REPLACEMENTS.0 || longest > REPLACEMENTS.1 {
                 let (times, bytes) = REPLACEMENTS;
-                return Err(format!("`normalizer` replaces more than {times} times, or by more than {bytes} bytes"));
+                return Err(format!(
+                    "`normalizer` has a replacement that applies more than {times} times, or has more than {bytes} \
+                     bytes"
+                ));
             }
         }
         "Precompiled" => check_character_map(text("precompiled_charsmap"))?,
@@ -287,7 +294,7 @@ fn check_character_map(text: &str) -> Result<(), String> {
     let longest = rest[trie..].split(|byte| *byte == 0).map(<[u8]>::len).max().unwrap_or_default();
     if longest > MAPPED_BYTES {
         return Err(format!(
-            "`precompiled_charsmap` makes {longest} bytes of a character; expected at most {MAPPED_BYTES}"
+            "`precompiled_charsmap` maps a character to {longest} bytes; expected at most {MAPPED_BYTES}"
         ));
     }
     Ok(())
@@ -341,7 +348,7 @@ pub(crate) fn clip_from_parts(vocab: (&str, &[u8]), merges: (&str, &[u8])) -> Re
     let mut pairs = Vec::new();
     for line in lines {
         let Some((left, right)) = line.split_once(' ').filter(|(_, right)| !right.contains(' ')) else {
-            let what = format!("the line `{}` is no merge; expected two tokens", excerpt(line));
+            let what = format!("the line `{}` is not a merge; expected two tokens", excerpt(line));
             return Err(EncoderError::new(merges.0, what));
         };
         pairs.push(json!([left, right]));
@@ -415,22 +422,20 @@ mod tests {
             change(&mut file);
             file
         };
-        assert!(
-            refused(&clip(), &rules(), 6).contains("`b</w>` has the id 6, but the table of the weights has 6 rows")
-        );
+        assert!(refused(&clip(), &rules(), 6).contains("`b</w>` has id 6, but the embedding table has 6 rows"));
         let drawn = with(&|file| file["model"]["dropout"] = json!(0.1));
-        assert!(refused(&drawn, &rules(), 7).contains("drawn by chance"));
+        assert!(refused(&drawn, &rules(), 7).contains("makes the ids random"));
         let bare = with(&|file| file["post_processor"] = Value::Null);
         assert!(refused(&bare, &rules(), 7).contains("adds 0 tokens to a caption; expected 2"));
         let doubling = with(&|file| {
             let step = json!({"type": "Replace", "pattern": {"String": "a"}, "content": "aa"});
             file["normalizer"] = json!({"type": "Sequence", "normalizers": vec![step; 9]});
         });
-        assert!(refused(&doubling, &rules(), 7).contains("replaces more than 4 times"));
+        assert!(refused(&doubling, &rules(), 7).contains("applies more than 4 times"));
         // An empty trie, and a text of seventy bytes.
         let map = format!("AAAAAEFB{}", "QUFB".repeat(24));
         let wide = with(&|file| file["normalizer"] = json!({"type": "Precompiled", "precompiled_charsmap": map}));
-        assert!(refused(&wide, &rules(), 7).contains("of a character"), "{}", refused(&wide, &rules(), 7));
+        assert!(refused(&wide, &rules(), 7).contains("maps a character"), "{}", refused(&wide, &rules(), 7));
         let broken = with(&|file| file["normalizer"] = json!({"type": "Precompiled", "precompiled_charsmap": "////"}));
         assert!(refused(&broken, &rules(), 7).contains("is damaged"));
         let merge = with(&|file| file["model"]["merges"] = json!([["a", "zzz"]]));
@@ -438,13 +443,13 @@ mod tests {
         let long = with(&|file| file["model"]["vocab"]["a".repeat(1_025)] = json!(0));
         assert!(refused(&long, &rules(), 7).contains("`model.vocab` has a token of 1025 bytes; expected at most 1024"));
         let short = Rules { most: 2, ..rules() };
-        assert!(refused(&clip(), &short, 7).contains("leave no room"));
+        assert!(refused(&clip(), &short, 7).contains("leaves no room"));
         for text in ["", "{", "[]", "{\"model\": 3}", "\"\\ud800\"", &"[".repeat(10_000)] {
             let said = Tokenizer::new("t", text.as_bytes(), &rules(), 7).unwrap_err().to_string();
             assert!(said.starts_with("t: "), "{said}");
         }
         let merges = clip_from_parts(("v", clip()["model"]["vocab"].to_string().as_bytes()), ("m", b"a b c"));
-        assert!(merges.unwrap_err().to_string().contains("m: the line `a b c` is no merge"));
+        assert!(merges.unwrap_err().to_string().contains("m: the line `a b c` is not a merge"));
         let none = clip_from_parts(("v", b"{}"), ("m", b"")).unwrap_err().to_string();
         assert!(none.contains("v: no token `<|startoftext|>`"));
     }

@@ -76,7 +76,7 @@ impl StoredTensor {
         let bytes = self.read()?;
         let mut values = vec![0.0; bytes.len() / self.element.bytes()];
         if values.len() != self.shape.iter().product::<usize>() {
-            return Err(format!("{} numbers for the shape {:?}", values.len(), self.shape));
+            return Err(format!("has {} numbers for the shape {:?}", values.len(), self.shape));
         }
         widen(self.element, &bytes, &mut values);
         Ok(values)
@@ -143,7 +143,7 @@ impl Weights {
         let refuse = |what: String| EncoderError::at(path, what);
         let (file, bytes) = path.open().map_err(|e| refuse(e.to_string()))?;
         if bytes > limits::WEIGHTS_BYTES {
-            return Err(refuse(format!("has {bytes} bytes; at most {} are read", limits::WEIGHTS_BYTES)));
+            return Err(refuse(format!("has {bytes} bytes; expected at most {}", limits::WEIGHTS_BYTES)));
         }
         let mut first = Vec::new();
         file.take(9).read_to_end(&mut first).map_err(|e| refuse(e.to_string()))?;
@@ -152,7 +152,9 @@ impl Weights {
         match first.get(8) {
             Some(b'{') => weights.add_safetensors(path)?,
             Some(_) => weights.add_torch(path)?,
-            None => return Err(refuse(format!("has {bytes} bytes; expected a checkpoint of torch, or safetensors"))),
+            None => {
+                return Err(refuse(format!("has {bytes} bytes; expected a torch checkpoint or a safetensors file")));
+            }
         }
         Ok(weights)
     }
@@ -178,11 +180,11 @@ impl Weights {
                     let tensor = StoredTensor { element, shape, place: Place::Safe(Rc::clone(&source), offset) };
                     if self.tensors.insert(name.clone(), tensor).is_some() {
                         let name = excerpt(&name);
-                        return Err(refuse(format!("the tensor `{name}` is in another file too")));
+                        return Err(refuse(format!("the tensor `{name}` is also in another file")));
                     }
                 }
                 None => {
-                    self.others.insert(name, "no float of at most 32 bits".into());
+                    self.others.insert(name, "not a float of at most 32 bits".into());
                 }
             }
         }
@@ -211,7 +213,7 @@ impl Weights {
         }
         // A tensor may repeat one number, and several may share one storage.
         if declared > length.saturating_mul(2) {
-            return Err(refuse(format!("its tensors take {declared} bytes, the file has {length}")));
+            return Err(refuse(format!("its tensors declare {declared} bytes, but the file has {length}")));
         }
         Ok(())
     }
@@ -241,9 +243,9 @@ impl Weights {
                 Some(tensor) if tensor.shape == *shape => {
                     found.insert(format!("{prefix}{name}"), tensor);
                 }
-                Some(tensor) => missing.push(format!("`{name}` {shape:?} (there with the shape {:?})", tensor.shape)),
+                Some(tensor) => missing.push(format!("`{name}` {shape:?} (it has shape {:?})", tensor.shape)),
                 None => match self.others.get(name) {
-                    Some(what) => missing.push(format!("`{name}` {shape:?} (there as {what})")),
+                    Some(what) => missing.push(format!("`{name}` {shape:?} (it is {what})")),
                     None => missing.push(format!("`{name}` {shape:?}")),
                 },
             }
@@ -255,7 +257,7 @@ impl Weights {
         missing.truncate(SHOWN);
         let more = if all > SHOWN { format!(" and {} more", all - SHOWN) } else { String::new() };
         let what = format!(
-            "the weights are not those that `config.json` describes; missing: {}{more}; of others there are {}",
+            "the weights do not match `config.json`; missing: {}{more}; number of other tensors: {}",
             missing.join(", "),
             self.tensors.len()
         );
@@ -270,7 +272,7 @@ impl Weights {
 
 /// The reader's message about a pickle, as an excerpt, since it may quote the file.
 pub fn no_torch(error: &dyn std::fmt::Display) -> String {
-    format!("it cannot be read as a file of torch: {}", excerpt(&error.to_string()))
+    format!("cannot read it as a torch file: {}", excerpt(&error.to_string()))
 }
 
 /// Reads the names of the files in a list of shards, each once.
@@ -290,7 +292,7 @@ fn shards(path: &DataPath) -> Result<Vec<String>, EncoderError> {
     if let Some(name) =
         names.iter().find(|name| name.is_empty() || name.contains(['/', '\\', '\0']) || name.starts_with('.'))
     {
-        return Err(refuse(format!("`{}` is not the name of a file beside it", excerpt(name))));
+        return Err(refuse(format!("`{}` is not a file name in the same folder", excerpt(name))));
     }
     if names.is_empty() || names.len() > SHARDS {
         return Err(refuse(format!("names {} files; expected 1 to {SHARDS}", names.len())));
@@ -312,7 +314,7 @@ pub fn archive_length(path: &DataPath) -> Result<u64, String> {
     if file.read_exact(&mut magic).is_err() || &magic != b"PK" {
         return Ok(length);
     }
-    let no_archive = |e: &dyn std::fmt::Display| format!("its archive cannot be read: {}", excerpt(&e.to_string()));
+    let no_archive = |e: &dyn std::fmt::Display| format!("cannot read its archive: {}", excerpt(&e.to_string()));
     let mut archive = zip::ZipArchive::new(file).map_err(|e| no_archive(&e))?;
     let mut unpacked = 0_u64;
     for i in 0..archive.len() {
@@ -320,7 +322,7 @@ pub fn archive_length(path: &DataPath) -> Result<u64, String> {
     }
     if unpacked > length {
         return Err(format!(
-            "unpacks to {unpacked} bytes, but has {length}; expected an archive as `torch.save` writes it"
+            "unpacks to {unpacked} bytes, but has {length}; expected an uncompressed archive, as `torch.save` writes it"
         ));
     }
     Ok(length)
@@ -358,7 +360,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let index = folder.path().join("model.safetensors.index.json");
         for (text, part) in [
-            (r#"{"weight_map": {"a": "../x"}}"#, "`../x` is not the name of a file beside it"),
+            (r#"{"weight_map": {"a": "../x"}}"#, "`../x` is not a file name in the same folder"),
             (r#"{"weight_map": {"a": "..", "b": "x"}}"#, "`..` is not"),
             (r#"{"weight_map": {}}"#, "names 0 files"),
             (r#"{"weights": {}}"#, "expected `weight_map`"),
@@ -374,7 +376,7 @@ mod tests {
             std::fs::write(folder.path().join(name), file(&header, &[0x80, 0x3f])).unwrap();
         }
         let said = Weights::open(&DataPath::local(folder.path())).unwrap_err().to_string();
-        assert!(said.contains("`a` is in another file too"), "{said}");
+        assert!(said.contains("`a` is also in another file"), "{said}");
         let header = r#"{"b":{"dtype":"I64","shape":[1],"data_offsets":[0,8]}}"#;
         std::fs::write(folder.path().join("two"), file(header, &[0; 8])).unwrap();
         let mut weights = Weights::open(&DataPath::local(folder.path())).unwrap();

@@ -86,7 +86,7 @@ fn a_folder_without_its_tokenizer_file_is_read_from_vocabulary_and_merges() {
         assert_eq!(whole.rules().most, json(&folder.join("tokenizer_config.json"))["model_max_length"]);
         let said =
             EncoderFolder::open(&DataPath::local(&folder), &clip(TokenIds::OpenAi, 10_000)).unwrap_err().to_string();
-        assert!(said.contains("10000 tokens are asked for"), "{said}");
+        assert!(said.contains("10000 tokens are requested"), "{said}");
         let said = EncoderFolder::open(&DataPath::local(&folder), &Request { kind: Kind::T5, ..request })
             .unwrap_err()
             .to_string();
@@ -215,13 +215,16 @@ fn folders_that_lack_something_say_what() {
             |file: &'static str, text: &'static str| move |path: &Path| std::fs::write(path.join(file), text).unwrap();
         let nothing = |_: &Path| ();
         for (said, part) in [
-            (refused(&["tokenizer.json"], &nothing), "a `spiece.model` alone is not read: make one with"),
+            (refused(&["tokenizer.json"], &nothing), "`spiece.model` alone is not supported: create one with"),
             (refused(&["modules.json"], &nothing), "no `modules.json`; expected the layout of sentence-transformers"),
             (refused(&["config.json"], &nothing), "config.json: "),
             (refused(&["model.safetensors"], &nothing), "no `model.safetensors`, "),
             (refused(&["2_Dense/model.safetensors", "2_Dense/pytorch_model.bin"], &nothing), "2_Dense: no `model"),
-            (refused(&[], &with("config.json", "{\"model_type\": \"t5\"}")), "the weights are not those that"),
-            (refused(&[], &with("modules.json", "[{\"path\": \"../x\", \"type\": \"a\"}]")), "not a folder below it"),
+            (refused(&[], &with("config.json", "{\"model_type\": \"t5\"}")), "the weights do not match"),
+            (
+                refused(&[], &with("modules.json", "[{\"path\": \"../x\", \"type\": \"a\"}]")),
+                "not a folder below this one",
+            ),
             (refused(&[], &with("modules.json", "[{\"path\": \"\", \"type\": \"a\"}]")), "expected Pooling"),
             (refused(&[], &with("1_Pooling/config.json", "{\"pooling_mode_cls_token\": true}")), "expected the mean"),
             (refused(&[], &with("2_Dense/config.json", "{}")), "`in_features` is null"),

@@ -120,7 +120,7 @@ fn accept(endpoint: &Weak<Endpoint>, listener: &TcpListener) {
         let (number, stream) = match admitted {
             Ok(admitted) => admitted,
             Err(error) => {
-                tracing::warn!("accepting a peer failed: {error}");
+                tracing::warn!("cannot accept a peer's connection: {error}");
                 thread::sleep(Duration::from_millis(100));
                 continue;
             }
@@ -132,11 +132,11 @@ fn accept(endpoint: &Weak<Endpoint>, listener: &TcpListener) {
             match welcomed {
                 Ok(()) => {}
                 Err(error @ (HandshakeError::Secret(_) | HandshakeError::Ranks { .. })) => {
-                    tracing::warn!("turned a peer away: {error}");
+                    tracing::warn!("refused a peer: {error}");
                 }
                 // A peer that learned of the generation before this member will dial again; failed strangers are not
                 // worth a warning.
-                Err(error) => tracing::debug!("turned a connection away: {error}"),
+                Err(error) => tracing::debug!("refused a connection: {error}"),
             }
         });
     }

@@ -76,7 +76,7 @@ pub(crate) fn rendezvous(
                 if elapsed > limit || is_slow {
                     let elapsed = elapsed.as_secs_f32();
                     let reason =
-                        format!("{barrier}: it has taken {sent} of the state's {bytes} bytes after {elapsed:.0} s");
+                        format!("{barrier}: it received {sent} of {bytes} bytes of the state in {elapsed:.0} s");
                     mesh.lose(peer, LossCause::Slow, reason);
                     return Err(Halt::Peer);
                 }
@@ -107,7 +107,7 @@ pub(crate) fn adopt(
     let length = expect(mesh.next(source, &barrier, interrupt)?, Kind::StateLength, mesh, source)?.step;
     let wanted: u64 = room.iter().map(|piece| piece.len() as u64).sum();
     if length < wanted || length - wanted > MAX_BEHIND_STATE {
-        let what = format!("offers a state of {length} bytes, expected {wanted} and at most {MAX_BEHIND_STATE} more");
+        let what = format!("offers a state of {length} bytes; expected {wanted} and at most {MAX_BEHIND_STATE} more");
         return Err(disagree(mesh, &barrier, source, &what));
     }
     let mut room = Room::new(room);
@@ -117,7 +117,7 @@ pub(crate) fn adopt(
         there += frame.bytes().len() as u64;
         let Payload::Bytes(piece) = frame.payload else { unreachable!("a state's frames carry bytes") };
         if piece.is_empty() || there > length {
-            let what = format!("sends a state of {length} bytes in pieces of another length");
+            let what = format!("sends pieces that do not add up to its state of {length} bytes");
             return Err(disagree(mesh, &barrier, source, &what));
         }
         if directly {
@@ -277,7 +277,7 @@ fn receive_parts(
         if begin.step != contribution.step || begin.a != number(contribution.slices) {
             return Err(disagree(
                 peer,
-                format!("is at step {} with {} slices, not {}", begin.step, begin.a, contribution.slices),
+                format!("is at step {} with {} slices; expected {} slices", begin.step, begin.a, contribution.slices),
             ));
         }
         let (at, stored) = numbers(&begin).ok_or_else(|| disagree(peer, "sends a malformed greeting".to_owned()))?;
@@ -296,7 +296,7 @@ fn receive_parts(
         let at = usize::try_from(at).map_err(|_| disagree(peer, format!("has a buffer of {at} numbers")))?;
         let length = *received.length.get_or_insert(at);
         if at != length {
-            return Err(disagree(peer, format!("has a buffer of {at} numbers, not {length}")));
+            return Err(disagree(peer, format!("has a buffer of {at} numbers; expected {length}")));
         }
         let chunk = tree::share(length, own, size);
         for (n, node) in nodes.into_iter().enumerate() {
@@ -307,7 +307,7 @@ fn receive_parts(
                 came = at;
                 let place = (frame.a, frame.b) == (number(n), number(p));
                 let Some(part) = floats(frame).filter(|part| place && part.len() == range.len()) else {
-                    return Err(disagree(peer, format!("sends parts out of place at node {n}, piece {p}")));
+                    return Err(disagree(peer, format!("sends an unexpected part at node {n}, piece {p}")));
                 };
                 if numbers.is_empty() && range.len() == chunk.len() { numbers = part } else { numbers.extend(part) }
             }
@@ -332,7 +332,7 @@ fn gather(mesh: &Mesh, barrier: &str, step: u64, sum: &mut [f32], interrupt: Int
             let frame = expect(mesh.next(peer, barrier, interrupt)?, Kind::Sum, mesh, peer)?;
             let place = frame.b == number(p) && frame.step == step;
             let Some(part) = floats(frame).filter(|part| place && part.len() == range.len()) else {
-                return Err(disagree(mesh, barrier, peer, &format!("sends its sum out of place at piece {p}")));
+                return Err(disagree(mesh, barrier, peer, &format!("sends an unexpected sum at piece {p}")));
             };
             sum[range].copy_from_slice(&part);
         }
@@ -405,13 +405,14 @@ fn expect(frame: Frame, kind: Kind, mesh: &Mesh, peer: usize) -> Result<Frame, H
     if frame.kind == kind {
         return Ok(frame);
     }
-    let what = format!("sent a frame of kind {:?} where {kind:?} was due", frame.kind);
+    let what = format!("sent a frame of kind {:?}; expected {kind:?}", frame.kind);
     Err(disagree(mesh, &format!("generation {}", mesh.config.generation), peer, &what))
 }
 
 /// Gives up a peer whose messages do not match ours.
 pub(crate) fn disagree(mesh: &Mesh, barrier: &str, peer: usize, what: &str) -> Halt {
-    let reason = format!("{barrier}: `{}` {what}; is it the same build?", mesh.config.members[peer].worker);
+    let reason =
+        format!("{barrier}: `{}` {what}; use the same build for all workers", mesh.config.members[peer].worker);
     mesh.lose(peer, LossCause::Disagrees, reason.clone());
     Halt::Disagree(reason)
 }

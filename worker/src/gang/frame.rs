@@ -152,15 +152,15 @@ pub(crate) enum FrameError {
     Closed,
     #[error("the connection failed: {0}")]
     Io(#[source] io::Error),
-    #[error("not a frame of this build: it begins with `{}`, expected `STR4`; do both sides run the same build?", .0.escape_ascii())]
+    #[error("not a frame of this build: it starts with `{}`; expected `STR4`; use the same build for all workers", .0.escape_ascii())]
     Magic([u8; 4]),
-    #[error("a frame of unknown kind {0}; do both sides run the same build?")]
+    #[error("a frame has the unknown kind {0}; use the same build for all workers")]
     Kind(u8),
-    #[error("a frame of {found} bytes, at most {limit} are allowed here")]
+    #[error("a frame has {found} bytes; expected at most {limit}")]
     TooLong { found: u32, limit: usize },
-    #[error("a frame of {0} bytes cannot hold f32 numbers")]
+    #[error("a frame has {0} bytes, which is not a whole number of f32 values")]
     Misaligned(u32),
-    #[error("frame {0} of the connection is not what the peer sent: its tag does not match")]
+    #[error("frame {0} of the connection was changed on the way: its tag does not match")]
     Forged(u64),
 }
 

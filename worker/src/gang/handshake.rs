@@ -34,17 +34,17 @@ pub(crate) enum HandshakeError {
     Frame(#[from] FrameError),
     #[error(transparent)]
     Io(#[from] std::io::Error),
-    #[error("expected a frame of kind {expected:?}, found {found:?}")]
+    #[error("received a frame of kind {found:?}; expected {expected:?}")]
     Unexpected { expected: Kind, found: Kind },
-    #[error("a handshake frame does not parse: {0}")]
+    #[error("cannot parse a handshake frame: {0}")]
     Parse(#[from] serde_json::Error),
     #[error("the peer does not know the secret of generation {0}")]
     Secret(Generation),
-    #[error("no gang of task `{task}` at generation {generation} here")]
+    #[error("this worker is not in the gang of task `{task}` at generation {generation}")]
     Unknown { task: TaskId, generation: Generation },
     #[error("rank {from} may not dial rank {to} of this gang")]
     Ranks { from: usize, to: usize },
-    #[error("the connection was ended to make room for others")]
+    #[error("the connection was closed to make room for others")]
     Crowded,
     #[error("no randomness: {0}")]
     Random(getrandom::Error),
@@ -228,7 +228,7 @@ pub(crate) fn probe(address: &str) -> Result<(), HandshakeError> {
 
 /// Connects to the first IP address of `address` that accepts.
 pub(crate) fn connect(address: &str) -> Result<TcpStream, HandshakeError> {
-    let mut last = io::Error::new(io::ErrorKind::AddrNotAvailable, format!("`{address}` names no address"));
+    let mut last = io::Error::new(io::ErrorKind::AddrNotAvailable, format!("cannot resolve `{address}` to an address"));
     for socket in address.to_socket_addrs()? {
         match TcpStream::connect_timeout(&socket, PATIENCE) {
             Ok(stream) => return Ok(stream),

@@ -191,7 +191,7 @@ impl Mesh {
             peers.iter().enumerate().filter_map(silent).collect()
         };
         for rank in silent {
-            let reason = format!("{barrier}: no sign of life for {} s", self.timing.patience.as_secs_f32());
+            let reason = format!("{barrier}: no heartbeat for {} s", self.timing.patience.as_secs_f32());
             self.lose(rank, LossCause::Unreachable, reason);
         }
     }
@@ -471,16 +471,19 @@ impl Mesh {
                     Standing::Left if patience == Patience::WhileItLives => None,
                     Standing::Left => Some(Some(format!("{barrier}: it has left"))),
                     Standing::Unmet(why) if silent > self.timing.patience => {
-                        let why = why.as_deref().unwrap_or("it did not call");
-                        Some(Some(format!("{barrier}: not met within {} s: {why}", self.timing.patience.as_secs_f32())))
+                        let why = why.as_deref().unwrap_or("it did not connect");
+                        Some(Some(format!(
+                            "{barrier}: no connection within {} s: {why}",
+                            self.timing.patience.as_secs_f32()
+                        )))
                     }
                     Standing::Up if silent > self.timing.patience => {
-                        Some(Some(format!("{barrier}: no sign of life for {} s", self.timing.patience.as_secs_f32())))
+                        Some(Some(format!("{barrier}: no heartbeat for {} s", self.timing.patience.as_secs_f32())))
                     }
                     Standing::Up if peer.phase == Phase::Starting => {
-                        too_late(self.timing.start, "alive, but has not started")
+                        too_late(self.timing.start, "it is alive, but has not started")
                     }
-                    Standing::Up => too_late(self.timing.stall, "alive, but not there"),
+                    Standing::Up => too_late(self.timing.stall, "it is alive, but has not reached this barrier"),
                     Standing::Unmet(_) => None,
                 }
             };

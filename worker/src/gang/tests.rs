@@ -475,7 +475,7 @@ fn members_hold_their_state_until_rank_0_has_saved() {
     assert!(second.leads() && !third.leads(), "the next rank saves");
     thread::scope(|scope| {
         let hold = scope.spawn(|| third.hold());
-        gang.held(2).expect("a member").end("the coordinator has taken it back");
+        gang.held(2).expect("a member").end("the coordinator revoked the grant");
         assert!(matches!(hold.join().expect("no panic"), Err(ContextError::GrantEnded(_))), "once it is reported");
     });
 }

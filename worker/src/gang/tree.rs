@@ -66,7 +66,7 @@ fn sum_block(node: &Node, known: &[(Node, &[f32])], at: usize, out: &mut [f32], 
         out.copy_from_slice(&numbers[at..at + out.len()]);
         return;
     }
-    let middle = split(node).unwrap_or_else(|| panic!("slice {} is not among the sums at hand", node.start));
+    let middle = split(node).unwrap_or_else(|| panic!("no sum contains slice {}", node.start));
     let (left, right) = known.split_at(known.partition_point(|(node, _)| node.start < middle));
     sum_block(&(node.start..middle), left, at, out, scratch);
     if let [(only, numbers)] = right

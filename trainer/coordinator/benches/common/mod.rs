@@ -91,6 +91,10 @@ pub(crate) struct Worker {
     pub(crate) name: String,
     pub(crate) incarnation: Incarnation,
     pub(crate) connection: Connection,
+    /// True if it says that it is ready for gangs.
+    pub(crate) joins_gangs: bool,
+    /// Gang tasks of the last answer whose inputs it would fetch. It fetches nothing, so it is ready at once.
+    ready: Vec<TaskId>,
     /// Receipts by task and blob.
     uploaded: HashMap<(TaskId, Digest), String>,
 }
@@ -111,14 +115,23 @@ impl Worker {
             peer_address: "127.0.0.1:1".into(),
         };
         let joined: Joined = connection.post("/v1/workers", SECRET, &join).await?;
-        Ok(Self { name, incarnation: joined.incarnation, connection, uploaded: HashMap::new() })
+        Ok(Self {
+            name,
+            incarnation: joined.incarnation,
+            connection,
+            joins_gangs: true,
+            ready: Vec::new(),
+            uploaded: HashMap::new(),
+        })
     }
 
     /// Sends a heartbeat that is answered at once.
     pub(crate) async fn poll(&mut self) -> Result<Option<Assignment>> {
-        let poll = Poll { incarnation: self.incarnation, doing: vec![], ready: vec![], version: 0 };
+        let poll = Poll { incarnation: self.incarnation, doing: vec![], ready: self.ready.clone(), version: 0 };
         let desired: DesiredAssignments =
             self.connection.post(&format!("/v1/workers/{}/poll", self.name), SECRET, &poll).await?;
+        let joins_gangs = self.joins_gangs;
+        self.ready = desired.prepare.into_iter().filter(|_| joins_gangs).map(|prepare| prepare.task).collect();
         Ok(desired.assignments.into_iter().next())
     }
 

@@ -65,7 +65,7 @@ impl Deciding<'_> {
             };
             *count += u32::from(!drain_by);
             if *count > budget {
-                return Err(format!("gave up after {count} {what}; the last: {why}"));
+                return Err(format!("gave up after {count} {what}; the last one: {why}"));
             }
             Ok(task.release((!drain_by).then(|| now.after(policy.backoff(task.streak)))))
         });

@@ -67,7 +67,8 @@ impl Deciding<'_> {
         if !self.goes_on_without(task, &worker) {
             return Ok(false);
         }
-        tracing::warn!(task = %task.id, %worker, "its gang has made no step for {} s and waits for it; it leaves the gang", stall_ms / 1000);
+        tracing::warn!(task = %task.id, %worker, "the gang has made no step for {} s and waits for this worker; \
+            removing it from the gang", stall_ms / 1000);
         self.leave(key, i, &worker, LossCause::Unreachable);
         Ok(true)
     }

@@ -159,7 +159,7 @@ impl Deciding<'_> {
         let named: BTreeSet<String> = execution.settings.folders().into_iter().map(|folder| folder.field).collect();
         if !execution.resolves || named.iter().ne(digests.keys()) {
             let stage = &execution.stage;
-            return Err(Rejected::Conflict(format!("stage `{stage}` needs no digests, or names other files")));
+            return Err(Rejected::Conflict(format!("stage `{stage}` needs no digests, or digests of other files")));
         }
         self.change(key, i, |task| task.finish(canonical::digest(digests)));
         for (run, stage) in execution.users.iter().copied() {

@@ -155,7 +155,7 @@ fn check_pipeline(pipeline: &Pipeline, until: Option<&StageName>) -> Result<(), 
             }
         }
         if !seen.insert(&stage.name) {
-            return Err(Rejected::Invalid(format!("stage `{}` is in the pipeline twice", stage.name)));
+            return Err(Rejected::Invalid(format!("the pipeline has stage `{}` twice", stage.name)));
         }
     }
     match until {

@@ -147,7 +147,7 @@ fn found(state: &State, run: &Run, sweep: &Sweeping, place: usize) -> Option<Fou
     let Some(value) = known.metrics.get(metric) else {
         let names: Vec<&str> = known.metrics.keys().map(String::as_str).collect();
         let message = format!(
-            "`metric` of the sweep is `{metric}`, which its evaluation does not have; there is: {}",
+            "`metric` of the sweep is `{metric}`, which its evaluation does not report; it reports {}",
             if names.is_empty() { "nothing".to_owned() } else { names.join(", ") }
         );
         return Some(Found::End { key: *key, message });
@@ -167,8 +167,8 @@ fn concluded(run: &Run, sweep: &Sweeping) -> Status {
     let Some((trial, place)) = best else {
         let first = sweep.failures.iter().next();
         let why = first.map(|(trial, why)| format!("; trial {trial}: {why}")).unwrap_or_default();
-        let key = made().find_map(Status::key).unwrap_or_else(|| Digest::of(b"no trial began"));
-        let message = format!("none of the {} trials of the sweep was completed{why}", sweep.search.trials().len());
+        let key = made().find_map(Status::key).unwrap_or_else(|| Digest::of(b"no trial started"));
+        let message = format!("no trial of the {} trials of the sweep was completed{why}", sweep.search.trials().len());
         return Status::Failed { key, message };
     };
     let (Status::Done { key, known, attempt, .. }, Status::Done { known: evaluated, .. }) =
@@ -259,7 +259,7 @@ impl State {
 /// Summarises a sweep, such as `14 of 24 trials begun, 5 at rung 1, 1 failed`.
 pub(crate) fn in_words(sweep: &SweepView) -> String {
     let begun = sweep.trials.iter().filter(|trial| trial.state != TrialState::Waiting).count();
-    let mut words = format!("{begun} of {} trials begun", sweep.trials.len());
+    let mut words = format!("{begun} of {} trials started", sweep.trials.len());
     for rung in 1..sweep.rungs.len() {
         let at = |trial: &&TrialView| trial.steps > sweep.rungs[rung - 1];
         let count = sweep.trials.iter().filter(at).count();

@@ -178,7 +178,7 @@ impl ActorHandle {
         // A large pipeline takes a while, so it is parsed outside the threads that answer heartbeats.
         let read = blocking(move || {
             let pipeline: Pipeline = serde_json::from_value(submit.pipeline)
-                .map_err(|e| format!("the pipeline does not parse: {e}; was it made by another build?"))?;
+                .map_err(|e| format!("cannot parse the pipeline: {e}; use the same build for client and server"))?;
             pipeline.check()?;
             Ok(pipeline)
         });

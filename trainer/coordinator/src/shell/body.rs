@@ -61,7 +61,7 @@ impl<S: Sync, T: DeserializeOwned + Send + 'static> FromRequest<S> for Message<T
         };
         parsed
             .map(|message| Self(message, permit))
-            .map_err(|error| Failure::invalid(format!("the body does not parse: {error}")))
+            .map_err(|error| Failure::invalid(format!("cannot parse the body: {error}")))
     }
 }
 

@@ -95,16 +95,17 @@ impl CurveQuery {
                 }
                 other => {
                     let known = "`run`, `stage`, `key`, `x`, `from`, `to` and `buckets`";
-                    return Err(Failure::invalid(format!("there is no `{other}` of curves; there are {known}")));
+                    return Err(Failure::invalid(format!(
+                        "unknown parameter `{other}` of curves; known parameters: {known}"
+                    )));
                 }
             }
         }
         match query.runs.len() {
-            0 => Err(Failure::invalid("no curve was asked for".into()).hint("name a run: `?run=RUN&key=loss`")),
-            more if more > limits::CURVE_RUNS => Err(Failure::invalid(format!(
-                "curves of {more} runs are asked for; at most {} are",
-                limits::CURVE_RUNS
-            ))),
+            0 => Err(Failure::invalid("the query names no run".into()).hint("name a run: `?run=RUN&key=loss`")),
+            more if more > limits::CURVE_RUNS => {
+                Err(Failure::invalid(format!("the query has {more} runs; expected at most {}", limits::CURVE_RUNS)))
+            }
             _ => Ok(query),
         }
     }
@@ -136,8 +137,9 @@ pub(crate) async fn curves(
         curves.series.extend(CurveSeries::of(&run, stages));
         let most = limits::CURVE_CELLS / window.buckets;
         if curves.series.len() > most {
-            let message = format!("there are more than {most} curves, which is the most of {} buckets", window.buckets);
-            return Err(Failure::invalid(message).hint("name a `stage` or `key`s, or ask for fewer `buckets`"));
+            let message =
+                format!("there are more than {most} curves, the largest number with {} buckets", window.buckets);
+            return Err(Failure::invalid(message).hint("set `stage` or `key`, or use fewer `buckets`"));
         }
     }
     let accepts = headers.get(header::ACCEPT).and_then(|value| value.to_str().ok()).unwrap_or_default();
@@ -210,7 +212,7 @@ mod tests {
             ("x", "epoch", "`x` is `epoch`; expected `step`, `time` or `hours`"),
             ("to", "inf", "`to` is `inf`; expected a number"),
             ("buckets", "0", "`buckets` is `0`; expected a number from 1 to 4000"),
-            ("points", "5", "there is no `points` of curves"),
+            ("points", "5", "unknown parameter `points`"),
         ] {
             let refused = read(&[("run", "a"), (name, value)]).err().map(|failure| format!("{failure:?}"));
             assert!(refused.as_ref().is_some_and(|refused| refused.contains(says)), "{refused:?}");

@@ -102,7 +102,7 @@ async fn known(actor_handle: &ActorHandle, key: Digest) -> Result<Option<(Known,
     if let Some(flaw) = &flaw {
         tracing::warn!(%key, "a stage's value is incomplete in the store and is recomputed: {flaw}");
         if let Err(error) = actor_handle.store.doubt(flaw).await {
-            tracing::warn!(%key, %error, "cannot record the missing blob, which still counts as stored");
+            tracing::warn!(%key, %error, "cannot record that the blob is missing; the store still lists it");
         }
     }
     let known = Known { outputs: row.outputs, metrics: row.metrics };
@@ -165,7 +165,7 @@ fn bundles(blobs: &BlobStore, candidates: &[Candidate]) -> Result<(Vec<Digest>, 
         .iter()
         .map(|candidate| {
             let at = |e: &dyn std::fmt::Display| {
-                Unbundled::Refused(format!("the model of stage `{}` cannot be made: {e}", candidate.stage))
+                Unbundled::Refused(format!("cannot assemble the model of stage `{}`: {e}", candidate.stage))
             };
             let unread = |e: ManifestError| match e {
                 ManifestError::Blob(BlobError::Unreachable(why)) => Unbundled::Away(why),
@@ -225,7 +225,7 @@ pub(crate) async fn tick(actor_handle: Arc<ActorHandle>, every_ms: u64, mut stop
                 let kept = i64::try_from(actor_handle.allowances.history.as_millis()).unwrap_or(i64::MAX);
                 let now = i64::try_from(wall_clock().0).unwrap_or(i64::MAX);
                 if let Err(error) = actor_handle.store.prune_history(now.saturating_sub(kept)).await {
-                    tracing::warn!(%error, "old history stays");
+                    tracing::warn!(%error, "cannot delete old history");
                 }
             });
         }

@@ -24,7 +24,7 @@ pub(crate) async fn metrics(State(actor_handle): State<Arc<ActorHandle>>) -> Res
         Failure::new(
             StatusCode::INTERNAL_SERVER_ERROR,
             "internal",
-            format!("the server's numbers do not encode: {error}"),
+            format!("cannot encode the server's metrics: {error}"),
         )
     })?;
     Ok(([(header::CONTENT_TYPE, OPEN_METRICS)], text))
@@ -68,6 +68,6 @@ fn registry(actor_handle: &ActorHandle) -> Registry {
     registry.register_with_unit("database", "Size of the database and its log", Unit::Bytes, database);
     let trouble: Gauge = Gauge::default();
     trouble.set(i64::from(actor_handle.storage().is_some()));
-    registry.register("storage_trouble", "1 while the storage does not take or give what is asked", trouble);
+    registry.register("storage_trouble", "1 while the store cannot be read or written", trouble);
     registry
 }

@@ -170,6 +170,5 @@ pub(crate) fn process(headers: &HeaderMap) -> Result<Process, Failure> {
 
 fn json<T: DeserializeOwned>(headers: &HeaderMap, name: &str) -> Result<T, Failure> {
     let value = headers.get(name).ok_or_else(|| Failure::invalid(format!("header `{name}` is missing")))?;
-    serde_json::from_slice(value.as_bytes())
-        .map_err(|e| Failure::invalid(format!("header `{name}` does not parse: {e}")))
+    serde_json::from_slice(value.as_bytes()).map_err(|e| Failure::invalid(format!("cannot parse header `{name}`: {e}")))
 }

@@ -45,7 +45,9 @@ impl From<Refused> for StartError {
         match refused {
             Refused::Rejected(rejected) => Self::Rejected(rejected),
             Refused::Write(write) => Self::Store(write),
-            Refused::Stopped => Self::Rejected(Rejected::Conflict("it was stopped during its start".to_owned())),
+            Refused::Stopped => {
+                Self::Rejected(Rejected::Conflict("the server was stopped during its start".to_owned()))
+            }
             Refused::Failed(failure) => Self::Failed(failure),
         }
     }

@@ -73,7 +73,7 @@ fn a_worker_that_falls_silent_is_lost_and_its_task_is_tried_again() {
     let dataset = coordinator.assignment("a").expect("the only worker gets it");
     news(&mut coordinator);
     coordinator.happen(Event::LeaseExpired { worker: "a".into(), incarnation }).expect("taken");
-    let lost = "it was not heard for the length of its lease";
+    let lost = "it was silent until its lease expired";
     assert_eq!(news(&mut coordinator), [told(Lost, "a", lost), told(Retried, "a", "lost worker a")]);
     coordinator.happen(Event::WorkerBack { worker: "a".into() }).expect("taken");
     assert_eq!(news(&mut coordinator)[0], told(Returned, "a", ""));

@@ -65,7 +65,7 @@ fn a_stage_without_digests_gets_its_key_from_what_a_worker_finds() {
     assert!(said.contains("has no artifact"), "{said}");
     let other = TaskOutcome::Resolved { digests: BTreeMap::from([("words".to_owned(), Digest::of(b"x"))]) };
     let said = refused(&mut coordinator, &first, other);
-    assert!(said.contains("names other files"), "{said}");
+    assert!(said.contains("digests of other files"), "{said}");
 
     coordinator.report(&first, resolved(b"the folder"));
     let second = coordinator.assignment("a").expect("now the stage");

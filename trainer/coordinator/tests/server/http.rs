@@ -322,12 +322,12 @@ async fn curves_come_in_buckets_as_json_and_packed() -> TestResult {
     assert!(points[1].1.is_nan());
 
     for (query, expected, says) in [
-        (String::new(), 400, "no curve was asked for"),
+        (String::new(), 400, "the query names no run"),
         ("?run=none".to_owned(), 404, "is not known"),
         (format!("?run={run}&run=none"), 404, "is not known"),
         (format!("?run={run}&stage=none"), 404, "has no stage `none`"),
         (format!("?run={run}&buckets=many"), 400, "`buckets` is `many`"),
-        (format!("?run={run}&limit=5"), 400, "there is no `limit`"),
+        (format!("?run={run}&limit=5"), 400, "unknown parameter `limit`"),
     ] {
         let (status, answer) = client.try_call("GET", &format!("/v1/metrics{query}"), ()).await?;
         let error: ApiError = serde_json::from_slice(&answer)?;

@@ -76,11 +76,11 @@ impl<'a> Reader<'a> {
         let end = self.rest.find(['\n', '{', '}']).unwrap_or(self.rest.len());
         let name = self.rest[..end].trim();
         if name.is_empty() {
-            return self.fault("a joint without a name");
+            return self.fault("the joint has no name");
         }
         if name.len() > NAME_BYTES || name.contains(char::is_control) {
             return self.fault(format!(
-                "{} is no name of a joint; expected one line of at most {NAME_BYTES} bytes",
+                "{} is not a valid joint name; expected one line of at most {NAME_BYTES} bytes",
                 shown(name)
             ));
         }
@@ -90,14 +90,14 @@ impl<'a> Reader<'a> {
 
     fn number(&mut self, of: &str) -> Result<f64, Fault> {
         let word = self.word();
-        number(word).map_or_else(|| self.fault(format!("{} in {of}, expected a number", shown(word))), Ok)
+        number(word).map_or_else(|| self.fault(format!("{} in {of}; expected a number", shown(word))), Ok)
     }
 
     fn count(&mut self, of: &str) -> Result<usize, Fault> {
         let word = self.word();
         match word.parse() {
             Ok(count) => Ok(count),
-            Err(_) => self.fault(format!("{} as {of}, expected a whole number that can be counted to", shown(word))),
+            Err(_) => self.fault(format!("{} as {of}; expected a whole number", shown(word))),
         }
     }
 
@@ -144,7 +144,7 @@ fn hierarchy(reader: &mut Reader<'_>) -> Result<Vec<Node>, Fault> {
             }
             "MOTION" | "" => {
                 let name = excerpt(&nodes[joint].name);
-                return reader.fault(format!("the brace of `{name}` is never closed ({} open)", open.len()));
+                return reader.fault(format!("the brace of `{name}` is not closed ({} open)", open.len()));
             }
             _ => {
                 let expected = "expected OFFSET, CHANNELS, JOINT, End Site or `}`";
@@ -164,7 +164,7 @@ fn add(
     end: bool,
 ) -> Result<(), Fault> {
     if nodes.len() == MAX_NODES {
-        return reader.fault(format!("more than {MAX_NODES} joints and end sites; no more are read"));
+        return reader.fault(format!("more than {MAX_NODES} joints and end sites, the largest supported number"));
     }
     nodes.push(Node { name, parent, offset: [0.0; 3], channels: vec![], end });
     Ok(())
@@ -173,10 +173,11 @@ fn add(
 fn open_joint(reader: &mut Reader<'_>, nodes: &mut Vec<Node>, open: &mut Vec<usize>) -> Result<(), Fault> {
     let name = reader.name()?;
     if open.iter().any(|joint| nodes[*joint].name == name) {
-        return reader.fault(format!("joint `{}` lies inside a joint of the same name", excerpt(&name)));
+        return reader.fault(format!("joint `{}` is inside a joint with the same name", excerpt(&name)));
     }
     if open.len() == MAX_DEPTH {
-        return reader.fault(format!("joints are nested more than {MAX_DEPTH} deep; no more are read"));
+        return reader
+            .fault(format!("joints are nested more than {MAX_DEPTH} levels deep, the largest supported depth"));
     }
     add(reader, nodes, name, open.last().copied(), false)?;
     open.push(nodes.len() - 1);
@@ -204,7 +205,7 @@ fn channels(reader: &mut Reader<'_>, joint: &Node) -> Result<Vec<Channel>, Fault
     let count = reader.count("the number of CHANNELS")?;
     if count > Channel::NAMES.len() {
         return reader.fault(format!(
-            "`{}` has {count} channels, expected at most {}",
+            "`{}` has {count} channels; expected at most {}",
             excerpt(&joint.name),
             Channel::NAMES.len()
         ));
@@ -215,11 +216,11 @@ fn channels(reader: &mut Reader<'_>, joint: &Node) -> Result<Vec<Channel>, Fault
         let word = reader.word();
         let Some((_, channel)) = Channel::NAMES.iter().find(|(name, _)| name.eq_ignore_ascii_case(word)) else {
             let found = format!(
-                "CHANNELS {count} of `{}` is followed by {i} names of channels, then {}",
+                "CHANNELS {count} of `{}` is followed by {i} channel names, then {}",
                 excerpt(&joint.name),
                 shown(word)
             );
-            return Err((line, format!("{found}; expected {count} such as Xposition or Zrotation")));
+            return Err((line, format!("{found}; expected {count} names such as Xposition or Zrotation")));
         };
         if channels.contains(channel) {
             return reader.fault(format!("`{}` has the channel {} twice", excerpt(&joint.name), channel.name()));
@@ -234,9 +235,9 @@ fn motion(reader: &mut Reader<'_>, nodes: Vec<Node>) -> Result<Bvh, Fault> {
     let found = reader.word();
     match found.to_ascii_uppercase().as_str() {
         "MOTION" => {}
-        "}" => return reader.fault("one closing brace too many: the root is closed already; expected MOTION"),
-        "ROOT" => return reader.fault("a second ROOT; files with one skeleton are read"),
-        _ => return reader.fault(format!("{}, expected MOTION after the hierarchy", shown(found))),
+        "}" => return reader.fault("one closing brace too many: the root is already closed; expected MOTION"),
+        "ROOT" => return reader.fault("a second ROOT; expected a file with one skeleton"),
+        _ => return reader.fault(format!("{}; expected MOTION after the hierarchy", shown(found))),
     }
     label(reader, &["Frames"])?;
     let frames = reader.count("the number of frames")?;
@@ -250,18 +251,18 @@ fn motion(reader: &mut Reader<'_>, nodes: Vec<Node>) -> Result<Bvh, Fault> {
     let most = MAX_VALUES / channels.max(nodes.len());
     if frames > most {
         return reader.fault(format!(
-            "{frames} frames of {channels} channels, at most {most} are read; cut the recording into parts"
+            "the file has {frames} frames of {channels} channels; expected at most {most} frames; split the recording"
         ));
     }
     label(reader, &["Frame", "Time"])?;
     let word = reader.peek();
     let frame_time = reader.number("Frame Time")?;
     if frame_time <= 0.0 {
-        return reader.fault(format!("frame time {}, expected seconds above 0", shown(word)));
+        return reader.fault(format!("the frame time is {}; expected seconds above 0", shown(word)));
     }
     let seconds = frames as f64 * frame_time;
     if seconds > MAX_SECONDS {
-        return reader.fault(format!("{frames} frames last {seconds:.0} s, at most {MAX_SECONDS} s are read"));
+        return reader.fault(format!("{frames} frames last {seconds:.0} s; expected at most {MAX_SECONDS} s"));
     }
     let rate = nominal_rate(frame_time, last_digit(word));
     let values = rows(reader, frames, channels)?;
@@ -298,14 +299,17 @@ fn rows(reader: &Reader<'_>, frames: usize, channels: usize) -> Result<Vec<f64>,
                 return Err((line, format!("{} after the last of {frames} frames", shown(word))));
             }
             if i == channels {
-                return Err((line, format!("frame {frame} has more than {channels} numbers, one for each channel")));
+                return Err((
+                    line,
+                    format!("frame {frame} has more than {channels} numbers; expected one for each channel"),
+                ));
             }
             match number(word) {
                 Some(value) => values.push(value),
                 None => {
                     return Err((
                         line,
-                        format!("value {i} of frame {frame} is {}, expected a finite number", shown(word)),
+                        format!("value {i} of frame {frame} is {}; expected a finite number", shown(word)),
                     ));
                 }
             }
@@ -315,7 +319,7 @@ fn rows(reader: &Reader<'_>, frames: usize, channels: usize) -> Result<Vec<f64>,
             let frame = before / channels;
             return Err((
                 line,
-                format!("frame {frame} has {found} numbers, expected {channels}, one for each channel"),
+                format!("frame {frame} has {found} numbers; expected {channels}, one for each channel"),
             ));
         }
         line += 1;
@@ -367,20 +371,20 @@ mod tests {
         protocol::show_excerpts();
         for (from, to, part) in [
             ("HIERARCHY", "", "x.bvh:2: `ROOT`, expected `HIERARCHY`"),
-            ("yrotation", "yturn", "followed by 1 names of channels, then `yturn`"),
+            ("yrotation", "yturn", "followed by 1 channel names, then `yturn`"),
             ("yrotation", "xposition", "the channel Xposition twice"),
-            ("}}", "}", "x.bvh:3: the brace of `a b` is never closed (1 open)"),
+            ("}}", "}", "x.bvh:3: the brace of `a b` is not closed (1 open)"),
             ("}}", "}}}", "x.bvh:2: one closing brace too many"),
             ("End Site", "Ende", "`Ende` in `a b`, expected OFFSET"),
             ("Frames: 2", "Frames: 3", "x.bvh:8: the file ends after 2 of 3 frames"),
             ("Frames: 2", "Frames: 1", "x.bvh:7: `2` after the last of 1 frames"),
-            ("Frames: 2", "Frames: 99999999999999999999999", "whole number that can be counted to"),
+            ("Frames: 2", "Frames: 99999999999999999999999", "whole number"),
             ("Frames: 2", "Frames: 99999999999", "at most"),
             (".0333", "0", "expected seconds above 0"),
-            (".0333", "1e30", "at most 3600 s are read"),
+            (".0333", "1e30", "expected at most 3600 s"),
             ("-90", "1e39", "value 1 of frame 1 is `1e39`"),
             ("-90", "-90 3", "frame 1 has more than 2 numbers"),
-            ("2 -90", "2", "x.bvh:7: frame 1 has 1 numbers, expected 2"),
+            ("2 -90", "2", "x.bvh:7: frame 1 has 1 numbers; expected 2"),
         ] {
             let said = said(&SMALL.replacen(from, to, 1));
             assert!(said.contains(part), "{from} -> {to}: {said}");
@@ -391,7 +395,7 @@ mod tests {
         let many: String = (0..=MAX_NODES).map(|i| format!("JOINT j{i} {{}}\n")).collect();
         assert!(said(&format!("HIERARCHY ROOT r\n{{ {many} }}")).contains("more than 4096 joints"));
         let deep: String = (0..=MAX_DEPTH).map(|i| format!("JOINT j{i} {{\n")).collect();
-        assert!(said(&format!("HIERARCHY ROOT r\n{{ {deep}")).contains("more than 512 deep"));
+        assert!(said(&format!("HIERARCHY ROOT r\n{{ {deep}")).contains("more than 512 levels deep"));
     }
 
     proptest::proptest! {

@@ -41,10 +41,10 @@ struct Shape<'a> {
 
 fn by_shape(bvh: &Bvh) -> Result<JointMap, String> {
     let shape = Shape::new(bvh);
-    let pelvis = shape.fork(0, 4).ok_or("no node with two legs and a spine")?;
-    let (legs, rest) = shape.pair(pelvis, 4).ok_or("no two legs of four joints each")?;
-    let chest = rest.into_iter().find_map(|branch| shape.fork(branch, 2)).ok_or("no node with two arms and a neck")?;
-    let (arms, rest) = shape.pair(chest, 3).ok_or("no two arms of three joints each")?;
+    let pelvis = shape.fork(0, 4).ok_or("no node has two legs and a spine")?;
+    let (legs, rest) = shape.pair(pelvis, 4).ok_or("no two legs have four joints each")?;
+    let chest = rest.into_iter().find_map(|branch| shape.fork(branch, 2)).ok_or("no node has two arms and a neck")?;
+    let (arms, rest) = shape.pair(chest, 3).ok_or("no two arms have three joints each")?;
     let neck = *rest.first().ok_or("no neck between the arms")?;
 
     let legs = legs.map(|branch| shape.chain(branch));

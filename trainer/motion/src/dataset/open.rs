@@ -288,10 +288,7 @@ impl Dataset {
             let what = if path.exists() { "is not a folder" } else { "no such folder" };
             return Err(fail(vec![Problem::new(
                 ProblemKind::Missing,
-                format!(
-                    "{}: {what}; set dataset.path to the folder that holds new_joint_vecs/ and texts/",
-                    path.display()
-                ),
+                format!("{}: {what}; set dataset.path to the folder with new_joint_vecs/ and texts/", path.display()),
             )]));
         }
         let skeleton = Skeleton::of(format);
@@ -319,7 +316,7 @@ impl Dataset {
         });
         let listed: usize = lists.iter().map(|(_, ids)| ids.len()).sum();
         if listed > limits::CLIPS {
-            let what = format!("{}: its lists have {listed} clips, at most {} are read", path.display(), limits::CLIPS);
+            let what = format!("{}: its lists have {listed} clips; expected at most {}", path.display(), limits::CLIPS);
             problems.push(Problem::new(ProblemKind::Text, what));
         }
         if !problems.is_empty() {
@@ -467,7 +464,7 @@ impl Dataset {
 fn read_list(file: &DataPath) -> Result<Vec<String>, Vec<Problem>> {
     let content = file.read(limits::CLIP_LIST_BYTES).map_err(|e| {
         let (kind, hint) = match e.kind() {
-            std::io::ErrorKind::NotFound => (ProblemKind::Missing, "; expected a list with one clip id a line"),
+            std::io::ErrorKind::NotFound => (ProblemKind::Missing, "; expected a list with one clip id per line"),
             _ => (ProblemKind::Io, ""),
         };
         vec![Problem::new(kind, format!("{}: {e}{hint}", file.display()))]
@@ -480,7 +477,7 @@ fn read_list(file: &DataPath) -> Result<Vec<String>, Vec<Problem>> {
         .take(MANY_PROBLEMS)
         .map(|(n, id)| {
             let what = format!(
-                "{}:{n}: `{}` is not a clip id; expected a file name without folder",
+                "{}:{n}: `{}` is not a clip id; expected a file name without a folder",
                 file.display(),
                 excerpt(id)
             );
@@ -509,17 +506,17 @@ fn read_statistic(file: &DataPath, skeleton: &Skeleton, positive: bool) -> Resul
     let array = npy::read_any_float(file).map_err(|e| {
         let mut problem = Problem::from(e);
         if problem.kind == ProblemKind::Missing {
-            problem.what += "; a HumanML3D or KIT-ML folder holds Mean.npy and Std.npy over its features";
+            problem.what += "; a HumanML3D or KIT-ML folder has Mean.npy and Std.npy of its features";
         }
         problem
     })?;
     if array.shape != [skeleton.features] {
-        let what = format!("{}: shape {:?}, expected [{}]", file.display(), array.shape, skeleton.features);
+        let what = format!("{}: has shape {:?}; expected [{}]", file.display(), array.shape, skeleton.features);
         return Err(Problem::new(ProblemKind::Shape, what));
     }
     let wanted = if positive { "a positive number" } else { "a finite number" };
     if let Some(i) = array.data.iter().position(|v| !v.is_finite() || (positive && *v <= 0.0)) {
-        let what = format!("{}: value {} at index {i}, expected {wanted}", file.display(), array.data[i]);
+        let what = format!("{}: has value {} at index {i}; expected {wanted}", file.display(), array.data[i]);
         return Err(Problem::new(ProblemKind::NotFinite, what));
     }
     Ok(array.data)
@@ -573,7 +570,8 @@ fn load(root: &DataPath, id: &str, skeleton: &Skeleton) -> Loaded {
         return Loaded::Bad(vec![Problem::new(
             ProblemKind::NotFinite,
             format!(
-                "{}: {} in frame {}, column {}; make the clip's features again or take it off the lists",
+                "{}: has {} in frame {}, column {}; compute the clip's features again, or remove the clip from the \
+                 lists",
                 motion_file.display(),
                 array.data[at],
                 at / skeleton.features,
@@ -599,12 +597,12 @@ fn check_motion(file: &Path, array: npy::Array, skeleton: &Skeleton) -> Result<n
     match array.shape[..] {
         [_, width] if width == expected => Ok(array),
         [_, width] => {
-            let other = if width == 251 || width == 263 { "; is dataset.format the right one?" } else { "" };
-            let what = format!("{}: {width} features a frame, expected {expected}{other}", file.display());
+            let other = if width == 251 || width == 263 { "; check dataset.format" } else { "" };
+            let what = format!("{}: has {width} features per frame; expected {expected}{other}", file.display());
             Err(Problem::new(ProblemKind::Shape, what))
         }
         _ => {
-            let what = format!("{}: shape {:?}, expected [frames, {expected}]", file.display(), array.shape);
+            let what = format!("{}: has shape {:?}; expected [frames, {expected}]", file.display(), array.shape);
             Err(Problem::new(ProblemKind::Shape, what))
         }
     }

@@ -183,7 +183,7 @@ impl Dataset {
         let bad = |file: &str, what: String| PackError::Content { file: file.into(), what };
         let index = Index::fetched(fetch)?;
         if index.version != 1 {
-            return Err(bad(INDEX, format!("version {}, expected 1; made by a newer program?", index.version)));
+            return Err(bad(INDEX, format!("has format version {}; expected 1; use a newer build", index.version)));
         }
         let width = Skeleton::of(index.format).features;
         let mut clips: Vec<Clip> = Vec::with_capacity(index.clips.len());
@@ -195,22 +195,28 @@ impl Dataset {
                 let tensor = tensors.tensor(&tensor_name(clips.len())).map_err(|e| bad(&name, e.to_string()))?;
                 if tensor.dtype() != Dtype::F32 || tensor.shape() != [row.frames, width] {
                     let found = format!("clip {}: {:?} {:?}", row.id, tensor.dtype(), tensor.shape());
-                    return Err(bad(&name, format!("{found}, expected F32 [{}, {width}]", row.frames)));
+                    return Err(bad(&name, format!("is {found}; expected F32 [{}, {width}]", row.frames)));
                 }
                 let features = Floats::view(bytes.slice_ref(tensor.data()));
-                let features = features.ok_or_else(|| bad(&name, format!("clip {}: a broken number", row.id)))?;
+                let features = features.ok_or_else(|| bad(&name, format!("clip {}: invalid number", row.id)))?;
                 clips.push(Clip { id: row.id.clone(), frames: row.frames, features });
             }
         }
         let narrow = |values: &[f64]| values.iter().map(|v| *v as f32).collect::<Vec<_>>();
         let (mean, std) = (narrow(&index.mean), narrow(&index.std));
         if mean.len() != width || std.len() != width {
-            return Err(bad(INDEX, format!("statistics of {} and {} values, expected {width}", mean.len(), std.len())));
+            return Err(bad(
+                INDEX,
+                format!("statistics have {} and {} values; expected {width}", mean.len(), std.len()),
+            ));
         }
         for entry in &index.entries {
             let inside = clips.get(entry.clip).is_some_and(|c| entry.start + entry.len <= c.frames);
             if !inside || entry.captions.is_empty() || entry.captions.iter().any(|c| *c >= index.captions.len()) {
-                return Err(bad(INDEX, format!("entry {} points outside of its clip or the captions", entry.id)));
+                return Err(bad(
+                    INDEX,
+                    format!("entry {} refers to frames outside its clip, or to missing captions", entry.id),
+                ));
             }
         }
         Ok(Self { format: index.format, mean, std, clips, captions: index.captions, entries: index.entries })

@@ -65,6 +65,6 @@ pub(super) fn draw(
         }
         canvas.disc(to, 5.0, TOLD);
     }
-    let label = "from above: told (discs), drawn (line), a cell is 0.5 m";
+    let label = "from above: path (discs), motion (line), a cell is 0.5 m";
     font::draw(canvas, label, [12.0, top + 8.0], 1, INK);
 }

@@ -48,12 +48,13 @@ impl ControlHints {
         check_words(p, "hints.joints", &self.joints);
         let (low, high) = self.density;
         if !(low >= 0.0 && low <= high && high <= 100.0) {
-            let message =
-                format!("`hints.density` is [{low}, {high}]; expected percents from 0 to 100, the smaller first");
+            let message = format!(
+                "`hints.density` is [{low}, {high}]; expected percentages from 0 to 100, the smaller one first"
+            );
             p.add("hints.density", message, "published: [25, 25] (temporal) and [0, 100] (spatial)");
         }
         if high == 0.0 {
-            p.add("hints.density", "`hints.density` is [0, 0], so nothing is told", "published: [25, 25]");
+            p.add("hints.density", "`hints.density` is [0, 0], so there are no hints", "published: [25, 25]");
         }
     }
 }
@@ -137,7 +138,7 @@ impl DataFormat {
             ("twelve", Self::Kit) => Ok(TWELVE_KIT.to_vec()),
             (name, _) => names.iter().position(|known| *known == name).map(|joint| vec![joint]).ok_or_else(|| {
                 let (skeleton, names) = (self.skeleton(), names.join(", "));
-                format!("`{word}` is no joint of a skeleton of {skeleton}; its joints are {names}")
+                format!("a skeleton of {skeleton} has no joint `{word}`; its joints are {names}")
             }),
         }
     }
@@ -160,14 +161,14 @@ impl DataFormat {
 /// Checks a list of joints before the skeleton is known.
 pub(super) fn check_words(p: &mut Problems, field: &str, words: &[String]) {
     if words.is_empty() {
-        p.add(field, format!("`{field}` is empty; expected names of joints, `six`, `twelve` or `all`"), "");
+        p.add(field, format!("`{field}` is empty; expected joint names, `six`, `twelve` or `all`"), "");
     }
     let known = |word: &str| {
         SETS.contains(&word) || [DataFormat::Humanml3d, DataFormat::Kit].iter().any(|f| f.joints().contains(&word))
     };
     for (i, word) in words.iter().enumerate() {
         if !known(word) {
-            let message = format!("`{word}` is no joint; expected a joint's name, `six`, `twelve` or `all`");
+            let message = format!("`{word}` is not a joint; expected a joint name, `six`, `twelve` or `all`");
             p.add(&format!("{field}[{i}]"), message, &format!("joints: {}", DataFormat::Humanml3d.joints().join(", ")));
         } else if words[..i].contains(word) {
             p.add(&format!("{field}[{i}]"), format!("`{field}` lists `{word}` twice"), "");

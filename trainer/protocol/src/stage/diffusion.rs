@@ -64,18 +64,18 @@ impl Diffusion {
     pub(super) fn check(&self, p: &mut Problems) {
         let (first, last) = (self.beta_first, self.beta_last);
         if !(first > 0.0 && first <= last && last < 1.0) {
-            let message = format!("`diffusion` has betas from {first} to {last}; expected 0 < first <= last < 1");
+            let message = format!("the betas of `diffusion` are {first} to {last}; expected 0 < first <= last < 1");
             p.add("diffusion.beta_first", message, "published: .00085 to .012 (MLD), .0001 to .02 (StableMoFusion)");
         }
         if self.schedule == NoiseSchedule::Flow && self.prediction == Prediction::Noise {
-            let message = "a flow ends in pure noise, of which a predicted noise says nothing about the sample";
-            p.add("diffusion.prediction", message, "write `prediction: velocity`, or `sample`");
+            let message = "a flow ends in pure noise, where a predicted noise does not determine the sample";
+            p.add("diffusion.prediction", message, "write `prediction: velocity` or `prediction: sample`");
         }
         let uses_betas = matches!(self.schedule, NoiseSchedule::ScaledLinear | NoiseSchedule::Linear);
         let given = Self::default();
         if !uses_betas && (first, last) != (given.beta_first, given.beta_last) {
-            let message = "betas are given, but `cosine` and `flow` have none of their own";
-            p.add("diffusion.beta_first", message, "leave `beta_first` and `beta_last` out, or take a linear schedule");
+            let message = "`beta_first` and `beta_last` have no effect with the schedules `cosine` and `flow`";
+            p.add("diffusion.beta_first", message, "remove `beta_first` and `beta_last`, or use a linear schedule");
         }
     }
 }

@@ -100,7 +100,7 @@ impl Distillation {
         }
         if self.guidance_dim < 4 || !self.guidance_dim.is_multiple_of(2) {
             let message = format!("`guidance_dim` is {}; expected an even number of at least 4", self.guidance_dim);
-            p.add("guidance_dim", message, "half of it are sines, half cosines");
+            p.add("guidance_dim", message, "one half are sines, the other half cosines");
         }
         if self.grid().is_none() {
             let message = format!("`skip` is {}; expected a divisor of the 1000 timesteps", self.skip);

@@ -7,7 +7,7 @@ use crate::limits;
 pub(super) fn check_diffusion(p: &mut Problems, diffusion: &Diffusion, timesteps: usize) {
     diffusion.check(p);
     if diffusion.schedule == NoiseSchedule::Flow {
-        let message = "samplers of motion go along diffusions, and a flow is none";
+        let message = "this stage has no sampler for the schedule `flow`";
         p.add("diffusion.schedule", message, "write `schedule: cosine` or `schedule: linear`");
     }
     if !(2..=1000).contains(&timesteps) {
@@ -25,7 +25,8 @@ pub(super) fn check_frames(p: &mut Problems, max_frames: usize) {
 /// Refuses a network with more parameters than the limit.
 pub(super) fn check_parameters(p: &mut Problems, parameters: usize) {
     if parameters > limits::PARAMETERS {
-        let message = format!("it has {parameters} parameters or more; expected at most {}", limits::PARAMETERS);
-        p.add("network", message, "take fewer layers, or narrower ones");
+        let message =
+            format!("the network has at least {parameters} parameters; expected at most {}", limits::PARAMETERS);
+        p.add("network", message, "use fewer or narrower layers");
     }
 }

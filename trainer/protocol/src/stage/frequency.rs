@@ -128,12 +128,13 @@ impl FrequencyLosses {
             p.fraction(&format!("losses.{name}.to"), to, false);
             if from > to {
                 let message =
-                    format!("`losses.{name}` acts from {from} to {to}; expected `from` to be the smaller one");
+                    format!("`losses.{name}` has `from` {from} and `to` {to}; expected `from` to be the smaller one");
                 p.add(&format!("losses.{name}.from"), message, "0 is no noise, 1 is all noise");
             }
         }
         if !(-1.0..=1.0).contains(&semantic.threshold) {
-            let message = format!("`losses.semantic.threshold` is {}; expected a cosine, -1 to 1", semantic.threshold);
+            let message =
+                format!("`losses.semantic.threshold` is {}; expected a cosine from -1 to 1", semantic.threshold);
             p.add("losses.semantic.threshold", message, "");
         }
     }

@@ -161,10 +161,10 @@ impl<'a> Neighbours<'a> {
                 format!("`vae` is `{vae}`{shape}, but `{latents}` was encoded with `{other}`{other_shape}")
             } else {
                 format!(
-                    "`{field}` works on latents of `{vae}`{shape}, but `{latents}` was encoded with `{other}`{other_shape}"
+                    "`{field}` uses latents of `{vae}`{shape}, but `{latents}` was encoded with `{other}`{other_shape}"
                 )
             };
-            p.add(field, message, "latents of another VAE mean other motions; name the same VAE in both places");
+            p.add(field, message, "latents have a meaning only with their own VAE; use the same VAE in both places");
         }
     }
 
@@ -173,7 +173,7 @@ impl<'a> Neighbours<'a> {
         if let (Some(data), Some(other)) = (self.dataset_of(latents), self.dataset_of(text))
             && data != other
         {
-            let message = format!("`{text}` embeds the captions of `{other}`, but `{latents}` are of `{data}`");
+            let message = format!("`{text}` embeds the captions of `{other}`, but `{latents}` encodes `{data}`");
             p.add("text", message, &format!("add a `text.embed` stage with `dataset: {data}`"));
         }
     }
@@ -183,7 +183,7 @@ impl<'a> Neighbours<'a> {
         if let Some(data) = self.dataset_of(latents)
             && data != dataset
         {
-            let message = format!("`{latents}` are of the clips of `{data}`, but `dataset` is `{dataset}`");
+            let message = format!("`{latents}` encodes the clips of `{data}`, but `dataset` is `{dataset}`");
             p.add("dataset", message, &format!("write `dataset: {data}`"));
         }
     }
@@ -194,11 +194,11 @@ impl<'a> Neighbours<'a> {
             && ours != theirs
         {
             let message = format!(
-                "`{name}` is for skeletons of {}, but the clips of `{dataset}` have {}",
+                "`{name}` has skeletons of {}, but the clips of `{dataset}` have {}",
                 theirs.skeleton(),
                 ours.skeleton()
             );
-            p.add(field, message, "features of one skeleton mean nothing on another; name stages of one data set");
+            p.add(field, message, "features depend on the skeleton; use stages of the same dataset");
         }
     }
 
@@ -207,12 +207,17 @@ impl<'a> Neighbours<'a> {
     pub(crate) fn same_codes(&self, p: &mut Problems, (field, name): (&str, &str), encoder: &str) {
         let decoded = |kind| self.read_by(name, kind).filter(|other| *other != encoder);
         if let Some(other) = decoded(ArtifactKind::Tokenizer) {
-            let message = format!("`{name}` reads the codes of `{other}`, but what it is to decode is of `{encoder}`");
-            p.add(field, message, "tokens of another codebook mean other motions; train both on one tokenizer");
+            let message =
+                format!("`{name}` decodes the codes of `{other}`, but its input has the codes of `{encoder}`");
+            p.add(
+                field,
+                message,
+                "tokens have a meaning only with their own tokenizer; train both with the same tokenizer",
+            );
         } else if let Some(other) = decoded(ArtifactKind::Vae) {
             let message =
-                format!("`{name}` reads the latents of `{other}`, but what it is to decode is of `{encoder}`");
-            p.add(field, message, "latents of another VAE mean other motions; train both on one VAE");
+                format!("`{name}` decodes the latents of `{other}`, but its input has the latents of `{encoder}`");
+            p.add(field, message, "latents have a meaning only with their own VAE; train both with the same VAE");
         }
     }
 
@@ -221,7 +226,7 @@ impl<'a> Neighbours<'a> {
         if let Some(data) = self.dataset_of(text)
             && data != dataset
         {
-            let message = format!("`{text}` embeds the captions of `{data}`, but the clips are of `{dataset}`");
+            let message = format!("`{text}` embeds the captions of `{data}`, but the clips are those of `{dataset}`");
             p.add("text", message, &format!("add a `text.embed` stage with `dataset: {dataset}`"));
         }
     }
@@ -242,10 +247,10 @@ impl<'a> Neighbours<'a> {
         let (what, why) = match family {
             Family::Mld => return,
             Family::Lcm { .. } | Family::Pcm { .. } => {
-                ("a student", "a student has guidance built in, and cannot be asked without it")
+                ("a student", "a student has guidance built in and cannot predict without it")
             }
             Family::Autoregressive | Family::Masked | Family::Mmm | Family::Features { .. } => {
-                ("no latent diffusion", "only such a model gives latents to learn from")
+                ("not a latent diffusion model", "distillation needs the latents of such a model")
             }
         };
         let kind = settings.kind();

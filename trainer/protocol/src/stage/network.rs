@@ -50,7 +50,7 @@ impl Network {
         let parameters = self.width.saturating_mul(wide).saturating_mul(self.layers);
         if parameters > limits::PARAMETERS && parameters < usize::MAX {
             let message = format!("its layers have {parameters} parameters; expected at most {}", limits::PARAMETERS);
-            p.add("network", message, "take fewer layers, or narrower ones");
+            p.add("network", message, "use fewer or narrower layers");
         }
         if self.layers > 0 && self.layers.is_multiple_of(2) {
             let message = format!("`network.layers` is {}; expected an odd number", self.layers);
@@ -58,7 +58,7 @@ impl Network {
         }
         if self.heads > 0 && !self.width.is_multiple_of(self.heads) {
             let (heads, width) = (self.heads, self.width);
-            let message = format!("`network.heads` is {heads}, which does not divide `network.width`, {width}");
+            let message = format!("`network.heads` is {heads}, which does not divide `network.width` ({width})");
             p.add("network.heads", message, "");
         }
         p.fraction("network.dropout", self.dropout, true);
@@ -101,7 +101,7 @@ impl LatentShape {
         p.positive("latent.tokens", self.tokens);
         p.positive("latent.dim", self.dim);
         if self.tokens.saturating_mul(self.dim) > 1 << 20 {
-            let message = format!("a latent of {}x{} is larger than any motion", self.tokens, self.dim);
+            let message = format!("the latent is {}x{}; expected at most 1048576 numbers", self.tokens, self.dim);
             p.add("latent.tokens", message, "published: 1x256 and 16x32");
         }
     }

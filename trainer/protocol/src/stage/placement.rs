@@ -23,7 +23,7 @@ impl Placement {
         let w = self.workers;
         p.positive("workers.min", w.min);
         if w.max != 0 && w.max < w.min {
-            let message = format!("`workers.max` is {}, below `workers.min`, {}", w.max, w.min);
+            let message = format!("`workers.max` is {}, which is less than `workers.min` ({})", w.max, w.min);
             p.add("workers.max", message, "0 sets no upper bound");
         }
         let keep = &self.checkpoint.keep;
@@ -35,8 +35,8 @@ impl Placement {
                 "",
             );
         } else if keep.best == 0 && keep.metric != Keep::default().metric {
-            let message = format!("`checkpoint.keep.metric` is `{}`, but no best are kept", keep.metric);
-            p.add("checkpoint.keep.metric", message, "set `checkpoint.keep.best` to how many");
+            let message = format!("`checkpoint.keep.metric` is `{}`, but `checkpoint.keep.best` is 0", keep.metric);
+            p.add("checkpoint.keep.metric", message, "set `checkpoint.keep.best` to the number of checkpoints to keep");
         }
     }
 }
@@ -142,7 +142,7 @@ impl Keep {
             return Ok(());
         }
         Err(format!(
-            "`checkpoint.keep.metric` is `{}`, which is not saved with its checkpoints; there is: {}",
+            "`checkpoint.keep.metric` is `{}`, which checkpoints do not record; they record {}",
             self.metric,
             if saved.is_empty() { "nothing".to_owned() } else { saved.join(", ") }
         ))

@@ -107,7 +107,11 @@ impl Sampler {
             p.add("sampler.timesteps", format!("timestep {t} is out of range; expected 0 to {last}"), "");
         }
         if self.timesteps.windows(2).any(|pair| pair[0] < pair[1]) {
-            p.add("sampler.timesteps", "`sampler.timesteps` rise; expected the noisiest first", "");
+            p.add(
+                "sampler.timesteps",
+                "`sampler.timesteps` are not in descending order; expected the noisiest first",
+                "",
+            );
         }
         if !self.timesteps.is_empty() && self.timesteps.len() != self.steps {
             let entries = self.timesteps.len();
@@ -198,21 +202,19 @@ impl Family {
     pub(super) fn check(&self, model: &str, sampler: &Sampler, p: &mut Problems) {
         let steps = sampler.steps;
         if matches!(self, Self::Autoregressive | Self::Mmm) && sampler.guidance != 0.0 {
-            let message = format!("`sampler.guidance` is {}, but {model} has none", sampler.guidance);
+            let message = format!("`sampler.guidance` is {}, but {model} has no guidance", sampler.guidance);
             p.add("sampler.guidance", message, "write `guidance: 0`");
         }
         if !sampler.timesteps.is_empty() && !matches!(self, Self::Lcm { .. }) {
-            let message = format!("`sampler.timesteps` are for LCM students, and {model} is none");
-            p.add("sampler.timesteps", message, "leave them out");
+            let message = format!("`sampler.timesteps` are for LCM students, and {model} is not one");
+            p.add("sampler.timesteps", message, "remove them");
         }
         if self.solver(sampler.solver).is_none() {
             let message = format!("`sampler.solver` is `{}`, which {model} does not have", sampler.solver.name());
             let help = match self {
-                Self::Mld => "take `ddim`, `dpm-solver` or `dpm-solver++`",
-                Self::Autoregressive | Self::Masked | Self::Mmm => {
-                    "tokens are drawn, not solved for; leave the solver out"
-                }
-                _ => "a student draws by its own jumps; leave the solver out",
+                Self::Mld => "use `ddim`, `dpm-solver` or `dpm-solver++`",
+                Self::Autoregressive | Self::Masked | Self::Mmm => "a token generator has no solver; remove the key",
+                _ => "a student has no solver; remove the key",
             };
             p.add("sampler.solver", message, help);
         }
@@ -235,12 +237,13 @@ impl Family {
                 at_most(timesteps - usize::from(even && *timesteps > 1), &format!("{model} has {timesteps} timesteps"));
             }
             Self::Autoregressive => {
-                at_most(1, &format!("{model} draws a token after the other until it ends"));
+                at_most(1, &format!("{model} generates one token after another until the motion ends"));
             }
             Self::Pcm { phases, .. } if *phases == steps => {}
             Self::Pcm { phases, .. } => {
                 let message = format!(
-                    "`sampler.steps` is {steps}, but {model} has {phases} phase(s); a PCM student makes one step a phase"
+                    "`sampler.steps` is {steps}, but {model} has {phases} phase(s); a PCM student takes one step per \
+                     phase"
                 );
                 p.add("sampler.steps", message, &format!("write `steps: {phases}`"));
             }
@@ -334,7 +337,7 @@ mod tests {
         let mdm = Family::Features { timesteps: 50, solver: Solver::Ddpm };
         let solved = |solver, steps| Sampler { solver, ..sampler(steps, &[]) };
         for (family, sampler, word) in [
-            (&lcm, solved(Solver::Ddim, 1), "its own jumps"),
+            (&lcm, solved(Solver::Ddim, 1), "a student has no solver"),
             (&Family::Mld, solved(Solver::SdeDpmSolverPp, 10), "`sde-dpm-solver++`"),
             (&mdm, sampler(51, &[]), "1 to 50"),
             (&mdm, solved(Solver::DpmSolverPp, 50), "1 to 49"),

@@ -189,7 +189,7 @@ impl<'a> Ref<'a> {
     pub fn dataset(field: &'static str, path: &'a mut String, format: DataFormat) -> Self {
         let (read, target) = (!path.is_empty(), Target::Dataset(format));
         let origin = match format {
-            DataFormat::Humanml3d => "HumanML3D, made from AMASS as github.com/EricGuo5513/HumanML3D says",
+            DataFormat::Humanml3d => "HumanML3D, built from AMASS as described in github.com/EricGuo5513/HumanML3D",
             DataFormat::Kit => "KIT-ML, linked in github.com/EricGuo5513/HumanML3D",
         };
         Self { field: field.into(), name: path, target, read, measured: false, files: &[], origin, part: None }

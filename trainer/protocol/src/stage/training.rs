@@ -21,8 +21,9 @@ impl Batch {
     /// Checks that all slices have equal size; `field` is the field of `global`.
     pub(super) fn check_division(self, p: &mut Problems, field: &str) {
         if self.slices > 0 && !self.global.is_multiple_of(self.slices) {
-            let message = format!("`{field}` is {}, which {} slices do not divide", self.global, self.slices);
-            p.add(field, message, "a slice is one forward and backward pass; all have the same size");
+            let message =
+                format!("`{field}` is {}, which is not a multiple of the {} slices", self.global, self.slices);
+            p.add(field, message, "a slice is one forward and backward pass, and all slices have the same size");
         }
     }
 }

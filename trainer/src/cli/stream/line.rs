@@ -49,7 +49,7 @@ pub(super) fn parse(number: u64, text: &str, form: &Form) -> Result<Line, String
     let mut waypoints_value = None;
     let request = if text.starts_with('{') {
         let mut fields: Map<String, Value> =
-            serde_json::from_str(text).map_err(|error| refuse(format!("is no JSON object: {error}")))?;
+            serde_json::from_str(text).map_err(|error| refuse(format!("is not a JSON object: {error}")))?;
         waypoints_value = fields.remove("waypoints");
         requests::parse("line", &Value::Object(fields).to_string(), true)
     } else {
@@ -57,15 +57,13 @@ pub(super) fn parse(number: u64, text: &str, form: &Form) -> Result<Line, String
     };
     // The parsed text has only this line.
     let mut requests = request.map_err(|error| refuse(error.to_string().replacen("line:1: ", "", 1)))?;
-    let request = requests.pop().ok_or_else(|| refuse("holds no sentence".into()))?;
+    let request = requests.pop().ok_or_else(|| refuse("has no sentence".into()))?;
     let skeleton = form.skeleton;
     let mut frames = request.length.map(|length: Length| length.frames(skeleton.fps));
     let mut waypoints = Vec::new();
     if let Some(value) = waypoints_value {
         if !form.controlled {
-            return Err(refuse(
-                "has waypoints, but the model has no control part, and so cannot be told where to go".into(),
-            ));
+            return Err(refuse("has waypoints, but the model has no control part, so it cannot follow a path".into()));
         }
         waypoints =
             waypoints::of_json(&value, skeleton, &form.joints).map_err(|why| refuse(format!("waypoints: {why}")))?;
@@ -73,7 +71,8 @@ pub(super) fn parse(number: u64, text: &str, form: &Form) -> Result<Line, String
         let frames = *frames.get_or_insert(end);
         if let Some(outside) = waypoints.iter().find(|waypoint| waypoint.frame >= frames) {
             return Err(refuse(format!(
-                "the waypoint of `{}` at {:.2} s is outside of the sentence, whose {frames} frames end at {:.2} s; expected a length of at least {end} frames",
+                "the waypoint of `{}` at {:.2} s is outside the sentence, whose {frames} frames end at {:.2} s; \
+                 expected a length of at least {end} frames",
                 skeleton.names[outside.joint],
                 outside.frame as f64 / skeleton.fps,
                 frames.saturating_sub(1) as f64 / skeleton.fps
@@ -92,7 +91,7 @@ pub(super) fn next(input: &mut impl BufRead) -> Option<Result<String, String>> {
     match input.by_ref().take(MOST_BYTES as u64 + 1).read_until(b'\n', &mut bytes) {
         Ok(0) => None,
         Ok(_) if bytes.len() > MOST_BYTES => Some(Err(format!("is longer than {MOST_BYTES} bytes"))),
-        Ok(_) => Some(String::from_utf8(bytes).map_err(|_| "is no text in UTF-8".to_owned())),
+        Ok(_) => Some(String::from_utf8(bytes).map_err(|_| "is not UTF-8 text".to_owned())),
         Err(error) => Some(Err(format!("cannot be read: {error}"))),
     }
 }
@@ -127,11 +126,11 @@ mod tests {
     fn mistakes_are_named_with_the_line() {
         protocol::show_excerpts();
         for (text, controlled, words) in [
-            ("walks#soon", true, &["line 3: `soon` is no length"][..]),
-            ("{\"caption\": \"a\"", true, &["line 3: is no JSON object"]),
+            ("walks#soon", true, &["line 3: `soon` is not a length"][..]),
+            ("{\"caption\": \"a\"", true, &["line 3: is not a JSON object"]),
             (r#"{"text": "a"}"#, true, &["line 3:", "`text`"]),
             (r#"{"caption": "a", "waypoints": [[0, 0, 1]]}"#, true, &["line 3: waypoints: path[0]", "[t, x, y, z]"]),
-            (r#"{"caption": "a", "waypoints": {"tail": [[0, 0, 1, 0]]}}"#, true, &["`tail` is no joint"]),
+            (r#"{"caption": "a", "waypoints": {"tail": [[0, 0, 1, 0]]}}"#, true, &["`tail` is not a joint"]),
             (r#"{"caption": "a", "waypoints": [[0, 0, 1, 0], [0.1, 9, 1, 0]]}"#, true, &["m/s"]),
             (
                 r#"{"caption": "a", "seconds": 1, "waypoints": [[3, 0, 1, 0]]}"#,

@@ -125,7 +125,7 @@ pub(super) async fn listen(
     let mut interrupt = signal(SignalKind::interrupt()).map_err(failed)?;
     let mut terminate = signal(SignalKind::terminate()).map_err(failed)?;
     let (Some(address), Some(file)) = (args.listen, &args.listen_token_file) else {
-        return Err(Problem::usage("`--listen` wants an address and `--listen-token-file`"));
+        return Err(Problem::usage("`--listen` needs an address and `--listen-token-file`"));
     };
     let config = args.endpoint.config(address, Tokens::read(file)?, insecure)?;
     // Report errors before the model is loaded.
@@ -196,7 +196,7 @@ async fn send(sink: &mut Sink, text: String) -> std::result::Result<(), End> {
         Ok(Ok(())) => Ok(()),
         Ok(Err(_)) => Err(End::Gone),
         Err(_) => {
-            tracing::debug!("a client that reads nothing is dropped");
+            tracing::debug!("dropping a client that does not read");
             Err(End::Gone)
         }
     }
@@ -217,8 +217,9 @@ impl StreamServer {
     /// Accepts a connection if there is a place.
     fn admit(self: Arc<Self>, upgrade: WebSocketUpgrade) -> Response {
         if self.places.available_permits() == 0 {
-            let message = format!("this server draws {} streams at once, and does", self.streams);
-            let hint = Some("try again when one has ended; `--streams N` takes more".to_owned());
+            let message = format!("this server runs at most {} streams at once, and all are in use", self.streams);
+            let hint =
+                Some("try again when a stream has ended, or start the server with a larger `--streams`".to_owned());
             let error = ApiError { code: "busy".to_owned(), message, hint };
             return (StatusCode::SERVICE_UNAVAILABLE, Json(error)).into_response();
         }
@@ -264,8 +265,8 @@ impl StreamServer {
         let line = loop {
             let next = tokio::select! {
                 next = lines.recv() => next,
-                () = leave.notified() => return Err(End::Close(close_code::AGAIN, "others wait to begin".into())),
-                () = &mut silence => return Err(End::Close(close_code::POLICY, "no sentence came within a minute".into())),
+                () = leave.notified() => return Err(End::Close(close_code::AGAIN, "other clients are waiting".into())),
+                () = &mut silence => return Err(End::Close(close_code::POLICY, "no sentence arrived within a minute".into())),
             };
             match next {
                 Some(Ok(line)) => break line,
@@ -274,7 +275,7 @@ impl StreamServer {
             }
         };
         let Ok(place) = Arc::clone(&self.places).try_acquire_owned() else {
-            return Err(End::Close(close_code::AGAIN, "every place was taken meanwhile".into()));
+            return Err(End::Close(close_code::AGAIN, "all streams are in use".into()));
         };
         Ok((line, place))
     }
@@ -316,7 +317,7 @@ impl StreamServer {
                 Ok(drawn) => drawn,
                 Err(what) => {
                     tell(sink, what).await?;
-                    return Err(End::Close(close_code::ERROR, "the model cannot go on".into()));
+                    return Err(End::Close(close_code::ERROR, "the model cannot continue".into()));
                 }
             };
             course.drawn(&segment, took);
@@ -361,7 +362,7 @@ impl StreamServer {
         match timeout(SILENCE, lines.recv()).await {
             Ok(Some(line)) => Ok(Some(line)),
             Ok(None) => Err(End::Gone),
-            Err(_) => Err(End::Close(close_code::POLICY, "no sentence came within a minute".into())),
+            Err(_) => Err(End::Close(close_code::POLICY, "no sentence arrived within a minute".into())),
         }
     }
 }

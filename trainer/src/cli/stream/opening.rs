@@ -7,9 +7,9 @@ use burn::tensor::Device;
 use clap::Args;
 use motion::Skeleton;
 use protocol::Seed;
-use stages::parts::control::ControlOptions;
 use stages::generate::Generator;
 use stages::generate::stream::{BLEND, MotionStream, Settings};
+use stages::parts::control::ControlOptions;
 
 use super::super::endpoint_args::EndpointArgs;
 use super::super::model::{self, Found};
@@ -61,7 +61,7 @@ pub(in crate::cli) struct StreamArgs {
 
 fn rate(text: &str) -> std::result::Result<f64, String> {
     let value = text.parse::<f64>().ok().filter(|rate| (0.1..=1000.0).contains(rate));
-    value.ok_or_else(|| format!("`{text}` is no rate; expected 0.1 to 1000 frames per second"))
+    value.ok_or_else(|| format!("`{text}` is not a frame rate; expected 0.1 to 1000 frames per second"))
 }
 
 impl StreamArgs {

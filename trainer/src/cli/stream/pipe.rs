@@ -222,8 +222,8 @@ pub(super) fn run(
         }
     }
     match end? {
-        End::Quiet if !pipe.course.has_begun() => Err(Problem::usage("standard input: holds no sentence")
-            .hint("give a sentence a line, such as `a person walks`")),
+        End::Quiet if !pipe.course.has_begun() => Err(Problem::usage("standard input: has no sentence")
+            .hint("write one sentence per line, such as `a person walks`")),
         End::Quiet => Ok(0),
         End::Line(what) => Err(Problem::usage(format!("standard input: {what}"))),
     }

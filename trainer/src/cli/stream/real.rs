@@ -42,7 +42,7 @@ pub(super) fn read(path: &Path, skeleton: &'static Skeleton) -> Result<Real> {
     match usual(&all) {
         Some(usual) if all.len() >= LEAST => Ok(Real { name, usual }),
         _ => Err(Problem::usage(format!(
-            "`{}`: has {} places to measure jumps at; expected at least {LEAST}, some seconds of motion",
+            "`{}`: jumps can be measured at {} frames only; expected at least {LEAST}, some seconds of motion",
             path.display(),
             all.len()
         ))),

@@ -3,8 +3,8 @@
 use std::time::{Duration, Instant};
 
 use serde_json::{Value, json};
-use stages::metrics::junction::{Jump, JunctionMeter, usual};
 use stages::generate::stream::{Joining, Segment};
+use stages::metrics::junction::{Jump, JunctionMeter, usual};
 
 /// Running mean and maximum of many values.
 #[derive(Debug, Clone, Copy, Default)]
@@ -178,8 +178,9 @@ impl Meter {
         let Self { frames, segments, latency, .. } = self;
         let (sustained, rate) = (self.sustained(), self.rate());
         let mut text = format!(
-            "{frames} frames in {segments} segment(s); {sustained:.0} frames a second, {:.1} times real time (drawing alone {rate:.0}, {:.1} times)\n\
-             {:.0} ms from a sentence to its first frame in the mean of {}, {:.0} ms at worst",
+            "{frames} frames in {segments} segment(s); {sustained:.0} frames per second, {:.1} times real time \
+             (generation alone {rate:.0}, {:.1} times)\n{:.0} ms from a sentence to its first frame on average over \
+             {}, {:.0} ms at most",
             sustained / self.fps,
             rate / self.fps,
             1e3 * latency.mean(),
@@ -188,7 +189,8 @@ impl Meter {
         );
         if self.overlap.count > 0 {
             text += &format!(
-                "\njoined by {} over {:.0} frame(s); joints were up to {:.1} cm off at the junctions, {:.1} in the mean, which faded",
+                "\njoined by {} over {:.0} frame(s); joints differed by up to {:.1} cm at the junctions before \
+                 blending, {:.1} cm on average",
                 self.joining.name(),
                 self.overlap.mean(),
                 100.0 * self.offset.largest,
@@ -197,7 +199,8 @@ impl Meter {
         }
         if let (Some(worst), Some(real)) = (self.worst(), self.against()) {
             text += &format!(
-                "\n{} of {} junctions are below the 99th percentile of {} ({:.2} m/s and {:.1} m/s2 a frame); the worst jumps by {:.2} m/s and {:.1} m/s2",
+                "\n{} of {} junctions are below the 99th percentile of {} ({:.2} m/s and {:.1} m/s2 per frame); the \
+                 largest jump is {:.2} m/s and {:.1} m/s2",
                 self.smooth(&real),
                 self.junctions.junctions().len(),
                 real.name,
@@ -210,7 +213,7 @@ impl Meter {
         if self.missed.count > 0 {
             let (mean, worst) = (100.0 * self.missed.mean(), 100.0 * self.missed.largest);
             text += &format!(
-                "\n{} positions told: {mean:.1} cm off in the mean, {worst:.1} cm at worst",
+                "\n{} target positions: {mean:.1} cm off on average, {worst:.1} cm at most",
                 self.missed.count
             );
         }

@@ -171,7 +171,7 @@ fn change(stage: &StageView, before: StageState) -> Option<String> {
         StageState::Ready if stage.wants_workers.is_some() => return None,
         StageState::Ready => stage.message.clone()?,
         StageState::Running if before == StageState::Running => return None,
-        StageState::Running if progress.done > 0 => format!("goes on at {}", count(stage)),
+        StageState::Running if progress.done > 0 => format!("continues at {}", count(stage)),
         StageState::Running => {
             let workers: Vec<&str> = stage.workers.iter().map(protocol::WorkerId::as_str).collect();
             format!("started{}{}", if workers.is_empty() { "" } else { " on " }, workers.join(", "))
@@ -266,7 +266,7 @@ mod tests {
     fn changes_are_told_once() {
         let line = |state, done| change(&stage(state, done), StageState::Waiting);
         assert_eq!(line(StageState::Running, 0).unwrap(), "           vae  started on w1, w2");
-        assert_eq!(line(StageState::Running, 40).unwrap(), "           vae  goes on at 40 of 100 steps");
+        assert_eq!(line(StageState::Running, 40).unwrap(), "           vae  continues at 40 of 100 steps");
         assert_eq!(
             line(StageState::Ran, 100).unwrap(),
             "           vae  done: 100 of 100 steps in 12 s  loss 0.2500  grad_norm 0.5000"
@@ -322,13 +322,13 @@ mod tests {
     fn a_jump_of_the_loss_is_explained_where_it_happens() {
         let (mut progress, start) = (progress(), Instant::now());
         let mut lines = |done| progress.stage(&stage(StageState::Running, done), start);
-        assert_eq!(lines(10), ["           vae  goes on at 10 of 100 steps"]);
+        assert_eq!(lines(10), ["           vae  continues at 10 of 100 steps"]);
         assert_eq!(lines(50), [""; 0]);
-        let joins = "the terms on joints and feet join the loss";
+        let joins = "the loss includes the terms on joints and feet";
         assert_eq!(lines(52), [format!("           vae  from step 50 of 100: {joins} (`loss.joint_from`)")]);
         assert_eq!(lines(60), [""; 0]);
         let mut later = self::progress();
         let lines = later.stage(&stage(StageState::Running, 70), start);
-        assert_eq!(lines, ["           vae  goes on at 70 of 100 steps"], "it joined long ago");
+        assert_eq!(lines, ["           vae  continues at 70 of 100 steps"], "it joined long ago");
     }
 }

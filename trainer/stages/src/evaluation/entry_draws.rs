@@ -60,8 +60,7 @@ impl EntryDraws {
     ) -> Result<Self, StageError> {
         let blobs = cx.blobs();
         let refuse = |text: String| Err(StageError::Input(text));
-        let (_, manifest) = artifacts::input(cx, "dataset", ArtifactKind::Dataset)?;
-        let dataset = artifacts::dataset(&*blobs, &manifest)?;
+        let dataset = artifacts::input_dataset(cx)?;
         let (evaluator, manifest) = artifacts::input(cx, "evaluator", ArtifactKind::Evaluator)?;
         let trained = TrainedEvaluator::read(&*blobs, &manifest, &cx.device())?;
         let (mut entries, mut taken) = (dataset.entries_of(split), split);
@@ -73,19 +72,21 @@ impl EntryDraws {
         }
         if entries.len() < POOL {
             let instead = match taken {
-                Split::All => "there are no more in the dataset",
+                Split::All => "the dataset has no more",
                 Split::Test => "set `split: all`, or `all_if_small: true`",
-                Split::Train | Split::Val => "set `split: all`, `split: test` for a last look, or `all_if_small: true`",
+                Split::Train | Split::Val => {
+                    "set `split: all`, `split: test` (for final results only) or `all_if_small: true`"
+                }
             };
             return refuse(format!(
-                "the split `{}` has {} entries, R-precision ranks a motion among {POOL}; {instead}",
+                "the split `{}` has {} entries, but R-precision needs pools of {POOL}; {instead}",
                 word(&taken),
                 entries.len()
             ));
         }
         trained.check(&dataset, &entries)?;
         if repeats == 0 {
-            return refuse("`repeats` is 0, expected at least 1".into());
+            return refuse("`repeats` is 0; expected at least 1".into());
         }
         Ok(Self { seed: cx.task().seed, dataset, entries, split: taken, trained, evaluator })
     }
@@ -135,7 +136,8 @@ impl EntryDraws {
         let (ours, theirs) = (generator.format(), self.dataset.format);
         if ours != theirs {
             return Err(StageError::Input(format!(
-                "`model` draws motions of `{}`, the dataset has `{}`; measure it on the format that it was trained on",
+                "`model` generates motions in format `{}`, but the dataset has format `{}`; use a dataset in the \
+                 model's format",
                 ours.name(),
                 theirs.name()
             )));
@@ -175,8 +177,8 @@ impl EntryDraws {
         let (samples, width) = (self.entries.len(), self.trained.width());
         (samples < FEW * width).then(|| {
             format!(
-                "FID is taken of {samples} motions in {width} dimensions; it is then larger than of many, and compares only with FIDs of as \
-                 many motions in the same evaluator"
+                "FID is taken of {samples} motions in {width} dimensions; it is then larger than of many, and compares \
+                 only with FIDs of as many motions in the same evaluator"
             )
         })
     }
@@ -188,7 +190,7 @@ impl EntryDraws {
         }
         if self.split != asked {
             cx.log(&format!(
-                "the split `{}` is too small for pools of {POOL}: measured on all {} entries",
+                "the split `{}` is too small for pools of {POOL}; all {} entries are measured",
                 word(&asked),
                 self.entries.len()
             ));
@@ -206,9 +208,9 @@ pub(crate) fn skates(features: &[f32], skeleton: &Skeleton) -> f32 {
 /// Refuses metrics that are not finite.
 pub(crate) fn finite(metrics: &BTreeMap<String, f64>) -> Result<(), StageError> {
     match metrics.iter().find(|(_, value)| !value.is_finite()) {
-        Some((name, value)) => {
-            Err(StageError::Input(format!("`{name}` is {value}: embeddings are not finite; train the evaluator anew")))
-        }
+        Some((name, value)) => Err(StageError::Input(format!(
+            "`{name}` is {value}: the embeddings are not finite; train the evaluator again"
+        ))),
         None => Ok(()),
     }
 }

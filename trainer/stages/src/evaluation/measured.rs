@@ -17,13 +17,12 @@ pub(crate) fn measured(
     sampler: &Sampler,
 ) -> Result<(Dataset, Box<dyn MotionGenerator>), StageError> {
     let blobs = cx.blobs();
-    let (_, manifest) = artifacts::input(cx, "dataset", ArtifactKind::Dataset)?;
-    let dataset = artifacts::dataset(&*blobs, &manifest)?;
+    let dataset = artifacts::input_dataset(cx)?;
     let (_, manifest) = artifacts::input(cx, "model", ArtifactKind::Model)?;
     let model = generator::open(&manifest, &*blobs, &cx.device())?;
     generator::check_sampler(&*model, sampler)?;
     if model.format() != dataset.format {
-        return Err(StageError::Input("`model` draws motions of another skeleton than `dataset` has".into()));
+        return Err(StageError::Input("`model` and `dataset` have different skeletons".into()));
     }
     Ok((dataset, model))
 }

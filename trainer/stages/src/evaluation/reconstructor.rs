@@ -54,7 +54,7 @@ impl Reconstructor {
     pub(crate) fn check_frames(&self, id: &str, frames: usize) -> Result<(), StageError> {
         match self {
             Self::Tokenizer(tokenizer, _) if frames < tokenizer.unit() => Err(StageError::Input(format!(
-                "clip `{id}` has {frames} frames, a token stands for {}; leave it out of the split",
+                "clip `{id}` has {frames} frames, but one token stands for {} frames; remove the clip from the split",
                 tokenizer.unit()
             ))),
             _ => Ok(()),

@@ -15,7 +15,7 @@ pub const REPORT_FILE: &str = "report.json";
 
 /// The error for an evaluation on a split without entries.
 pub(crate) fn no_entries(split: Split) -> StageError {
-    StageError::Input(format!("the split `{}` has no entries; set `split` to one that has", word(&split)))
+    StageError::Input(format!("the split `{}` has no entries; set `split` to one that has entries", word(&split)))
 }
 
 /// The model and sampler of an evaluation, or null for real motion. Every report contains them, so that its reader

@@ -97,7 +97,9 @@ impl Generator {
         if let Some(lengths) = &lengths
             && (lengths.meta().format, lengths.meta().text_dim) != (model.format(), model.text().dim())
         {
-            return Err(StageError::Input("the model's length estimator is for other data or another encoder".into()));
+            return Err(StageError::Input(
+                "the model's length estimator was trained on another format or another text encoder".into(),
+            ));
         }
         Ok(Self { model, lengths, sampler: parts.sampler })
     }
@@ -160,9 +162,9 @@ impl Generator {
         let kept: Vec<bool> = (0..pieces).map(stays).collect();
         let drawn = kept.iter().filter(|kept| !**kept).count();
         if drawn == 0 || drawn == pieces {
-            let what = if pieces == 0 || drawn == 0 { "nothing is left to draw" } else { "nothing stays" };
+            let what = if pieces == 0 || drawn == 0 { "nothing is left to generate" } else { "nothing stays" };
             return Err(StageError::Input(format!(
-                "{what}: the motion has {pieces} whole pieces of {unit} frames, of which {} lie inside of what is kept",
+                "{what}: the motion has {pieces} units of {unit} frames, and the kept spans cover {} of them",
                 pieces - drawn
             )));
         }

@@ -188,7 +188,7 @@ impl MotionStream {
         let overlap = stream.overlap(longest, usize::MAX);
         if overlap >= longest {
             return Err(StageError::Input(format!(
-                "an overlap of {overlap} frames leaves nothing new of segments of at most {longest} frames"
+                "with an overlap of {overlap} frames, segments of at most {longest} frames have no new frames"
             )));
         }
         Ok(stream)
@@ -214,7 +214,7 @@ impl MotionStream {
     /// The errors of the model; also if there are waypoints and the model has no control part.
     pub fn draw(&mut self, generator: &Generator, ask: &Ask) -> Result<Segment, StageError> {
         if !ask.waypoints.is_empty() && self.joining != Joining::Control {
-            return Err(StageError::Input("the model has no control part, and so cannot be told where to go".into()));
+            return Err(StageError::Input("the model has no control part, so it cannot follow a path".into()));
         }
         let seed = Seed(Stream::new(self.settings.seed, "stream/segment", self.segments, 0).bits());
         let total = match ask.frames {
@@ -229,7 +229,7 @@ impl MotionStream {
         let frames = (drawn.len() / width).saturating_sub(overlap).min(ask.frames.unwrap_or(usize::MAX));
         if frames == 0 {
             return Err(StageError::Input(format!(
-                "the model drew {} frames, of which {overlap} are those that were there already",
+                "the model generated {} frames; expected more than the {overlap} frames of the overlap",
                 drawn.len() / width
             )));
         }

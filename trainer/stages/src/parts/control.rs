@@ -137,7 +137,7 @@ impl TrainedControl {
         let trajectory = weights::load_under(trajectory, blobs, manifest, TRAJECTORY_PREFIX, what)?;
         if meta.feedback > limits::FEEDBACK_ROUNDS {
             let (found, most) = (meta.feedback, limits::FEEDBACK_ROUNDS);
-            let why = format!("the control part asks for {found} rounds of feedback; expected at most {most}");
+            let why = format!("the control part has {found} rounds of feedback; expected at most {most}");
             return Err(StageError::Input(why));
         }
         let feedback = meta.feedback(denoiser, &mut blank);

@@ -63,7 +63,7 @@ pub fn publish(
     words: &Words,
 ) -> Result<Digest, StageError> {
     let mut draft = Draft::new(cx, ArtifactKind::Evaluator, to_meta(meta));
-    weights::add(&mut draft, entries, values)?;
+    weights::add(&mut draft, (entries, values))?;
     words.write(&mut draft)?;
     draft.finish(cx)
 }
@@ -166,8 +166,8 @@ impl TrainedEvaluator {
         let ours = self.meta.format;
         if dataset.format != ours {
             return Err(StageError::Input(format!(
-                "the evaluator was made for `{}` skeletons ({} features), the dataset has `{}` ({}); train one on this data, or import the one \
-                 that was published for it",
+                "the evaluator expects `{}` skeletons ({} features), but the dataset has `{}` ({}); train an evaluator \
+                 on this data, or import the one published for it",
                 word(&ours),
                 self.meta.mean.len(),
                 word(&dataset.format),
@@ -187,9 +187,10 @@ impl TrainedEvaluator {
                 (group.map(|i| ((mean[i] - f64::from(self.meta.mean[i])) / own(i)).powi(2)).sum::<f64>() / n).sqrt();
             if ratio.abs() > MOST_RATIO.ln() || shift > MOST_SHIFT {
                 return Err(StageError::Input(format!(
-                    "the features are on another scale than the evaluator's: their {what} deviate {:.3} times as much and their mean is \
-                     off by {shift:.2} deviations (expected within {MOST_RATIO} times and {MOST_SHIFT}); hand over features that are not \
-                     normalised, in the unit that the evaluator was trained in, or train an evaluator on this data",
+                    "the features do not have the evaluator's scale: the standard deviation of their {what} is {:.3} \
+                     times the evaluator's, and their mean differs by {shift:.2} deviations (expected at most \
+                     {MOST_RATIO} times and {MOST_SHIFT}); use features that are not normalised and have the \
+                     evaluator's unit, or train an evaluator on this data",
                     ratio.exp()
                 )));
             }

@@ -186,7 +186,8 @@ impl Field {
             let theirs: FlowMeta = artifacts::meta(theirs, "the flow decoder of `init`")?;
             if theirs.prediction != self.prediction {
                 return Err(StageError::Input(format!(
-                    "the network of `init` gives the {}, but the one that is trained here gives the {}; name a decoder of the same `prediction`",
+                    "the network of `init` predicts the {}, but this stage trains one that predicts the {}; use a \
+                     decoder with the same `prediction`",
                     theirs.prediction.name(),
                     self.prediction.name()
                 )));
@@ -267,10 +268,10 @@ impl FlowDecoder {
         if meta.fits.get(role) != Some(&encoder) {
             let what = match meta.fits.contains_key(role) {
                 true => format!("another {role}"),
-                false => meta.fits.keys().map(|other| format!("a {other}, not of a {role}")).collect(),
+                false => meta.fits.keys().map(|other| format!("a {other} instead of a {role}")).collect(),
             };
             return Err(StageError::Input(format!(
-                "the flow decoder was trained on the codes of {what}; name the one that it was trained with"
+                "the flow decoder was trained with {what}; use the {role} that it was trained with"
             )));
         }
         let device = device.clone().inner();

@@ -45,7 +45,7 @@ impl Lengths {
         if meta.unit != LengthEstimator::UNIT {
             let (found, known) = (meta.unit, LengthEstimator::UNIT);
             return Err(StageError::Input(format!(
-                "the length estimator counts {found} frames a class; this build knows {known}"
+                "the length estimator has {found} frames per class; expected {known}"
             )));
         }
         let device = device.clone().inner();

@@ -41,8 +41,9 @@ pub fn part(blobs: &dyn Blobs, model: &Model, role: &Role, kind: ArtifactKind) -
 /// Reads a manifest from the blobs of an artifact; `what` names it in errors.
 pub fn manifest(blobs: &dyn Blobs, digest: Digest, what: &str) -> Result<Manifest, StageError> {
     let bytes = blobs.get(digest).map_err(artifacts::blob_error)?;
-    serde_json::from_slice(&bytes)
-        .map_err(|e| StageError::Context(ContextError::Corrupt(format!("{what}, {digest}, is not a manifest: {e}"))))
+    serde_json::from_slice(&bytes).map_err(|e| {
+        StageError::Context(ContextError::Corrupt(format!("cannot parse the manifest {digest} of {what}: {e}")))
+    })
 }
 
 /// Uploads a model with the generator `generator` and these parts, whose files are already uploaded.

@@ -67,7 +67,7 @@ impl MotionDenoiserMeta {
     pub fn timesteps(&self) -> Result<usize, StageError> {
         match self.family {
             Family::Features { timesteps, .. } => Ok(timesteps),
-            _ => Err(StageError::Input("the denoiser is one of latents, not of motion".into())),
+            _ => Err(StageError::Input("the denoiser is for latents; expected a denoiser of motion features".into())),
         }
     }
 
@@ -330,7 +330,7 @@ impl MotionDenoiser {
                 dpm(&DpmPath::karras(schedule, steps, Last::Repeated), Form::StochasticData)
             }
             Some(Solver::Own) | None => {
-                return Err(StageError::Input(format!("there is no solver `{}`", drawing.sampler.solver.name())));
+                return Err(StageError::Input(format!("this model has no solver `{}`", drawing.sampler.solver.name())));
             }
         })
     }

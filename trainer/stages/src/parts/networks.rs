@@ -131,7 +131,9 @@ impl Autoencoder {
             return Ok(());
         }
         let (ours, theirs) = (word(&self.meta.format), word(&format));
-        Err(StageError::Input(format!("the VAE was trained on `{ours}` features, the dataset has `{theirs}` features")))
+        Err(StageError::Input(format!(
+            "the VAE was trained on `{ours}` features, but the dataset has `{theirs}` features"
+        )))
     }
 
     /// Computes `(x - mean) / std` with the statistics of the training data, in place.
@@ -299,9 +301,7 @@ impl Denoiser {
                 })
             }
             Family::Autoregressive | Family::Masked | Family::Mmm | Family::Features { .. } => {
-                return Err(StageError::Input(
-                    "the denoiser says that it draws something else than latents, which it does not".into(),
-                ));
+                return Err(StageError::Input("expected a latent denoiser; the manifest names another family".into()));
             }
             Family::Pcm { skip, phases, .. } => {
                 let mut eps = self.student(conditions, sampler, batch, steering);

@@ -128,7 +128,7 @@ impl TrainedTokenizer {
         }
         let (ours, theirs) = (word(&self.meta.format), word(&format));
         Err(StageError::Input(format!(
-            "the tokenizer was trained on `{ours}` features, the dataset has `{theirs}` features"
+            "the tokenizer was trained on `{ours}` features, but the dataset has `{theirs}` features"
         )))
     }
 
@@ -221,11 +221,11 @@ impl Tokens {
         let all: usize = meta.lengths.iter().sum();
         if ids.shape != [all, meta.quantizers] || meta.splits.len() != meta.lengths.len() {
             let (found, wanted) = (&ids.shape, [all, meta.quantizers]);
-            return Err(bad(format!("`ids` has shape {found:?}, the manifest says {wanted:?}")));
+            return Err(bad(format!("`ids` has shape {found:?}; the manifest declares {wanted:?}")));
         }
         let codes = meta.codes as i64;
         if let Some(id) = ids.values.iter().find(|id| !(0..codes).contains(*id)) {
-            return Err(bad(format!("id {id} is no code; there are {codes}")));
+            return Err(bad(format!("id {id} is not a code; the tokenizer has {codes} codes")));
         }
         let begin = |at: &mut usize, len: &usize| {
             let first = *at;

@@ -15,9 +15,10 @@ use checkpoint::model::{Model, part_of_kind};
 use models::flat::{self, Entry};
 use models::names;
 use protocol::{ArtifactKind, Digest, Manifest};
+use serde::Serialize;
 use serde_json::Value;
 
-use crate::artifacts::{self, MODEL_FILE};
+use crate::artifacts::{self, MODEL_FILE, to_meta};
 use crate::context::{AttemptContext, ContextError, GangContext, StageError};
 use crate::parts::{self, model_error};
 
@@ -61,6 +62,19 @@ impl WarmStart {
         };
         let file = artifacts::open(&*blobs, &part, MODEL_FILE)?;
         Ok(Self(Some(Weights { digest, part, file, taken: 0, matrices: 0, fresh: Vec::new(), known: BTreeSet::new() })))
+    }
+
+    /// Loads into the only network of a training the weights of `init` that fit it; `meta` is that of the new artifact.
+    pub(crate) fn begin<M: Module>(
+        cx: &mut dyn GangContext,
+        kind: ArtifactKind,
+        network: M,
+        meta: &impl Serialize,
+    ) -> Result<M, StageError> {
+        let mut start = Self::find(cx, kind)?;
+        let network = start.take(network, "")?;
+        start.finish(cx, meta)?;
+        Ok(network)
     }
 
     /// The manifest of the source, if `init` is set, so that a kind can check more than names and shapes.
@@ -107,14 +121,15 @@ impl WarmStart {
     ///
     /// # Errors
     /// If nothing fitted.
-    pub(crate) fn finish(self, cx: &mut dyn GangContext, meta: &Value) -> Result<(), StageError> {
+    pub(crate) fn finish(self, cx: &mut dyn GangContext, meta: &impl Serialize) -> Result<(), StageError> {
         let Some(Weights { digest, part, file, taken, matrices, fresh, known }) = self.0 else { return Ok(()) };
         let there = names::tensors(file.bytes(), &mut |offset, out| file.read_at(offset, out));
         let there = there.map_err(artifacts::blob_error)?.map_err(corrupt)?;
         if matrices == 0 {
             return Err(StageError::Input(format!(
-                "nothing of `{INIT}` fits: none of its {} tensors, biases and the like aside, has a name and a shape of what is trained here; \
-                 expected such as {}, and it has such as {}; name what was trained by this kind, in this form",
+                "`{INIT}` does not match this network: of its {} tensors, no weight matrix has the name and shape of \
+                 one here; expected for example {}, found for example {}; use the output of a stage of this kind with \
+                 the same `network`",
                 there.len(),
                 fresh.first().map_or("none", String::as_str),
                 there.first().map_or_else(|| "none".into(), |entry| format!("{} {:?}", entry.name, entry.shape)),
@@ -124,7 +139,7 @@ impl WarmStart {
             return Ok(());
         }
         let (kind, all) = (part.kind.noun(), taken + fresh.len());
-        cx.log(&format!("begins with {taken} of {all} tensors of `{INIT}`, {kind}, {}", digest.short()));
+        cx.log(&format!("starts with {taken} of {all} tensors from `{INIT}`, {kind}, {}", digest.short()));
         list(cx, "fresh", &fresh);
         let unused: Vec<String> = there
             .iter()
@@ -132,9 +147,12 @@ impl WarmStart {
             .map(|entry| format!("{} {:?}", entry.name, entry.shape))
             .collect();
         list(cx, "not used", &unused);
-        let differs = differing(&part.meta, meta);
+        let differs = differing(&part.meta, &to_meta(meta));
         if !differs.is_empty() {
-            cx.log(&format!("`{INIT}` differs in {}; what it learned under those is gone on from", differs.join(", ")));
+            cx.log(&format!(
+                "`{INIT}` was trained with another {}; training continues from its weights",
+                differs.join(", ")
+            ));
         }
         Ok(())
     }

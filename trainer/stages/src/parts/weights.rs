@@ -13,7 +13,7 @@ use crate::context::{AttemptContext, ContextError, StageError};
 pub const CONSTANTS_FILE: &str = "constants.safetensors";
 
 /// Uploads weights as a file of an artifact.
-pub fn add(draft: &mut Draft, entries: &[Entry], values: &[f32]) -> Result<(), StageError> {
+pub fn add(draft: &mut Draft, (entries, values): (&[Entry], &[f32])) -> Result<(), StageError> {
     draft.add_pieces(MODEL_FILE, &Weights::new(entries, values).pieces())
 }
 
@@ -27,10 +27,10 @@ pub fn publish(
     cx: &mut dyn AttemptContext,
     kind: ArtifactKind,
     meta: serde_json::Value,
-    (entries, values): (&[Entry], &[f32]),
+    weights: (&[Entry], &[f32]),
 ) -> Result<Digest, StageError> {
     let mut draft = Draft::new(cx, kind, meta);
-    add(&mut draft, entries, values)?;
+    add(&mut draft, weights)?;
     draft.finish(cx)
 }
 

@@ -85,7 +85,7 @@ impl Words {
         let data = folder.join("our_vab_data.npy");
         let array = npy::read_any_float(&data).map_err(|e| StageError::Input(e.to_string()))?;
         let [rows, WORD_WIDTH] = array.shape[..] else {
-            return Err(bad(&data, format!("has shape {:?}, expected [words, {WORD_WIDTH}]", array.shape)));
+            return Err(bad(&data, format!("has shape {:?}; expected [words, {WORD_WIDTH}]", array.shape)));
         };
         let file = folder.join("our_vab_idx.pkl");
         let wanted = "expected a pickled dict from word to row";
@@ -110,14 +110,17 @@ impl Words {
                 }
                 PickleValue::Int(row) => {
                     let word = excerpt(&word);
-                    return Err(bad(&file, format!("`{word}` has the row {row}, but there are {rows} vectors")));
+                    return Err(bad(
+                        &file,
+                        format!("the word `{word}` has row {row}, but the file of vectors has {rows} rows"),
+                    ));
                 }
                 _ => return Err(bad(&file, format!("`{}` has no row; {wanted}", excerpt(&word)))),
             }
         }
         for word in ["sos", "eos", UNKNOWN] {
             if !index.contains_key(word) {
-                return Err(bad(&file, format!("has no word `{word}`, which every caption needs")));
+                return Err(bad(&file, format!("lacks the word `{word}`, which every caption needs")));
             }
         }
         Ok(Self::Vocabulary { vectors: array.data.into(), index })
@@ -159,7 +162,11 @@ impl Words {
         let index: HashMap<String, usize> = serde_json::from_slice(&artifacts::file(blobs, manifest, INDEX_FILE)?)
             .map_err(|e| bad(format!("{INDEX_FILE}: {e}")))?;
         let words = Self::Vocabulary { vectors, index };
-        if words.meta() == *meta { Ok(words) } else { Err(bad("they are not those of its manifest".into())) }
+        if words.meta() == *meta {
+            Ok(words)
+        } else {
+            Err(bad("their digest differs from the one in its manifest".into()))
+        }
     }
 
     /// Vector and class of a token `word/POS`.

@@ -74,7 +74,7 @@ impl Checkpoint {
         let found = Self { file: file.clone(), weights };
         let count = found.weights.tensors().len() + found.weights.others().len();
         if count > TENSORS {
-            return Err(found.refuse(format!("{count} tensors; expected at most {TENSORS}")));
+            return Err(found.refuse(format!("it has {count} tensors; expected at most {TENSORS}")));
         }
         Ok(found)
     }
@@ -87,10 +87,10 @@ impl Checkpoint {
         self.find(places, marker).ok_or_else(|| {
             let groups = self.groups(|_| true);
             let has = match groups.is_empty() {
-                true => "no weights at all".to_owned(),
+                true => "no weights".to_owned(),
                 false => format!("`{}`", excerpts(groups.keys().map(String::as_str), SHOWN)),
             };
-            self.refuse(format!("it holds no {what}, which has a tensor `{marker}`; it holds {has}"))
+            self.refuse(format!("it has no {what}: the tensor `{marker}` is missing; it has {has}"))
         })
     }
 
@@ -150,7 +150,7 @@ impl Found<'_> {
         let shape = self.tensor(name).map(|tensor| &tensor.shape[..]).unwrap_or_default();
         // With an axis of 0 the other axes cost nothing and may be any number.
         if shape.contains(&0) {
-            return Err(self.refuse(format!("`{}{name}` has shape {shape:?}, which holds nothing", self.prefix)));
+            return Err(self.refuse(format!("`{}{name}` has shape {shape:?}, which has no elements", self.prefix)));
         }
         let missing = || self.refuse(format!("no tensor `{}{name}` with {} axes", self.prefix, axis + 1));
         shape.get(axis).copied().ok_or_else(missing)
@@ -184,13 +184,13 @@ impl Found<'_> {
                 Some(tensor) if tensor.shape == entry.shape => {}
                 Some(tensor) => {
                     wrong.push(format!(
-                        "`{}{name}` has shape {:?}, expected {:?}",
+                        "`{}{name}` has shape {:?}; expected {:?}",
                         self.prefix, tensor.shape, entry.shape
                     ));
                 }
                 None => {
                     let other = self.checkpoint.weights.others().get(&format!("{}{name}", self.prefix));
-                    let there = other.map_or_else(String::new, |what| format!(" (there as {what})"));
+                    let there = other.map_or_else(String::new, |what| format!(" (it is {what})"));
                     wrong.push(format!("`{}{name}` {:?} is missing{there}", self.prefix, entry.shape));
                 }
             }
@@ -209,14 +209,14 @@ impl Found<'_> {
             if CONSTANTS.iter().any(|end| name.ends_with(end)) {
                 constants.push((Entry { name: name.to_owned(), shape: tensor.shape.clone() }, tensor));
             } else if heads.contains(head) {
-                wrong.push(format!("`{begin}{}` {:?} is not of this network", excerpt(name), tensor.shape));
+                wrong.push(format!("`{begin}{}` {:?} is not part of this network", excerpt(name), tensor.shape));
             }
         }
         if !wrong.is_empty() {
             let count = wrong.len();
             wrong.truncate(SHOWN);
             let more = if count > SHOWN { format!(" and {} more", count - SHOWN) } else { String::new() };
-            return Err(self.refuse(format!("its tensors make no whole network: {}{more}", wrong.join("; "))));
+            return Err(self.refuse(format!("its tensors do not match the network: {}{more}", wrong.join("; "))));
         }
         self.read(entries, &names, constants)
     }

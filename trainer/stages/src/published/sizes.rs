@@ -134,7 +134,8 @@ fn divided(found: &Found<'_>, width: usize, heads: usize) -> Result<usize> {
     if heads > 0 && width.is_multiple_of(heads) {
         return Ok(heads);
     }
-    Err(found.refuse(format!("it is {width} wide, which {heads} attention heads do not divide; set `heads`")))
+    Err(found
+        .refuse(format!("its width is {width}, which is not a multiple of the {heads} attention heads; set `heads`")))
 }
 
 /// An axis of a tensor minus `less`. Refuses a result below 1.
@@ -181,7 +182,9 @@ pub fn of_denoiser(found: &Found<'_>, tokens: usize, heads: usize) -> Result<Den
     // less one.
     for (what, dim, least) in [("time", time_dim, 2), ("guidance", guidance_dim.unwrap_or(4), 4)] {
         if dim < least || !dim.is_multiple_of(2) {
-            return Err(found.refuse(format!("its {what} is {dim} numbers; expected an even number, at least {least}")));
+            return Err(
+                found.refuse(format!("its {what} has {dim} numbers; expected an even number, at least {least}"))
+            );
         }
     }
     Ok(DenoiserConfig {
@@ -206,9 +209,7 @@ pub fn of_trajectory(found: &Found<'_>, heads: usize) -> Result<TrajectoryConfig
     let projection = found.has("latent_proj.weight");
     let coordinates = found.dim("skel_embedding.weight", 1)?;
     if !coordinates.is_multiple_of(3) {
-        return Err(
-            found.refuse(format!("`skel_embedding.weight` reads {coordinates} coordinates; expected three a joint"))
-        );
+        return Err(found.refuse(format!("`skel_embedding.weight` has {coordinates} inputs; expected three per joint")));
     }
     Ok(TrajectoryConfig {
         joints: coordinates / 3,
@@ -253,13 +254,14 @@ pub fn of_tokenizer(found: &Found<'_>) -> Result<TokenizerSizes> {
     let first = if single { "quantizer.codebook" } else { "quantizer.layers.0.codebook" };
     let depth = found.count("encoder.model.2.1.model");
     if !(1..=DEPTH).contains(&depth) {
-        return Err(found.refuse(format!("a level of {depth} residual blocks; expected 1 to {DEPTH}")));
+        return Err(found.refuse(format!("a level has {depth} residual blocks; expected 1 to {DEPTH}")));
     }
     let books = (0..BLOCKS).take_while(|q| found.has(&format!("quantizer.layers.{q}.codebook"))).count();
     let taps = found.dim("encoder.model.2.0.weight", 2)?;
     if taps != 2 * STRIDE || !found.has(&format!("encoder.model.{}.weight", LEVELS + 2)) {
-        return Err(found
-            .refuse(format!("its encoder has not {LEVELS} levels that halve the frames, as all published ones have")));
+        return Err(
+            found.refuse(format!("its encoder does not halve the frames {LEVELS} times, as all published encoders do"))
+        );
     }
     Ok(TokenizerSizes {
         features: found.dim("encoder.model.0.weight", 1)?,
@@ -290,13 +292,14 @@ pub fn of_masked(found: &Found<'_>, quantizers: usize, heads: usize) -> Result<M
 /// Sizes of MoMask's residual transformer, with shared weights as published.
 pub fn of_residual(found: &Found<'_>, heads: usize) -> Result<MomaskConfig> {
     if found.has("output_proj_bias") {
-        return Err(found
-            .refuse("its output tables are not shared with its inputs; published residual transformers share them"));
+        return Err(
+            found.refuse("its output tables differ from its input tables; published residual transformers share them")
+        );
     }
     let (width, layers, feed_forward) = blocks(found, "seqTransEncoder.layers")?;
     let quantizers = found.dim("quant_emb.weight", 1)?;
     if quantizers < 3 {
-        return Err(found.refuse(format!("it is of {quantizers} codebooks; expected at least 3")));
+        return Err(found.refuse(format!("it has {quantizers} codebooks; expected at least 3")));
     }
     Ok(MomaskConfig {
         codes: without(found, "token_embed_weight_", 1, 1)?,
@@ -365,7 +368,7 @@ pub fn of_mmm(found: &Found<'_>, longest: usize, heads: usize) -> Result<MmmConf
 pub fn of_mdm(found: &Found<'_>, heads: usize) -> Result<MdmConfig> {
     let (width, layers, feed_forward) = blocks(found, "seqTransEncoder.layers")?;
     if !width.is_multiple_of(2) {
-        return Err(found.refuse(format!("it is {width} wide; expected an even number")));
+        return Err(found.refuse(format!("its width is {width}; expected an even number")));
     }
     Ok(MdmConfig {
         features: found.dim("input_process.poseEmbedding.weight", 1)?,
@@ -391,12 +394,11 @@ pub fn of_unet(found: &Found<'_>, attention: (usize, usize)) -> Result<UnetConfi
     } else if has("0.weight") {
         (Projection::Transposed, dim("0.weight", 0)?)
     } else {
-        return Err(found.refuse(format!(
-            "`{projection}` is none of those that decoders are trained with here: stack, repeat, transposed"
-        )));
+        return Err(found
+            .refuse(format!("the projection `{projection}` is not supported; expected stack, repeat or transposed")));
     };
     if found.has("net.time_mlp.0.weights") {
-        return Err(found.refuse("its time has frequencies of its own; published ones have fixed frequencies"));
+        return Err(found.refuse("its time embedding has learned frequencies; published networks have fixed ones"));
     }
     let blocks = (0..BLOCKS).take_while(|i| found.has(&format!("net.downs.0.{i}.mlp.1.weight"))).count();
     Ok(UnetConfig {

@@ -161,7 +161,7 @@ impl Tries<'_> {
         let measures = stage.settings.output().kind == ArtifactKind::Report;
         let read = stage.inputs.iter().filter(|input| !(measures && input.field == "teacher"));
         let known = read.map(|input| {
-            let untried = || StageError::Input(format!("`{}` was not tried", input.stage));
+            let untried = || StageError::Input(format!("stage `{}` was not estimated", input.stage));
             Ok((input.field.clone(), *self.outputs.get(&input.stage).ok_or_else(untried)?))
         });
         known.collect()
@@ -200,7 +200,7 @@ impl Tries<'_> {
         let mut cx = self.solo(stage, settings, inputs);
         let given = |outcome| match outcome {
             Outcome::Finished { output, .. } => Ok(output),
-            Outcome::Yielded { at } => Err(StageError::Fault(format!("it stopped after {at} steps"))),
+            Outcome::Yielded { at } => Err(StageError::Fault(format!("the stage stopped after {at} steps"))),
         };
         let output = match shape {
             Shape::Plain | Shape::Registry => given(kinds::run_alone(&mut cx)?)?,
@@ -286,7 +286,7 @@ fn trainings(stage: &PipelineStage) -> f64 {
 
 /// The settings with one slice of few examples and few steps, and the number of such slices in a batch.
 fn reduced_training(settings: &StageSettings) -> Result<(StageSettings, f64), StageError> {
-    let Some(training) = settings.training() else { return Err(StageError::Fault("it does not train".into())) };
+    let Some(training) = settings.training() else { return Err(StageError::Fault("the stage does not train".into())) };
     let examples = training.batch.global.clamp(1, EXAMPLES);
     let share = training.batch.global as f64 / examples as f64;
     let mut json = to_json(settings)?;

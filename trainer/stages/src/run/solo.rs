@@ -96,7 +96,8 @@ impl AttemptContext for Solo {
     }
     fn manifest(&self, digest: Digest) -> Result<Manifest, ContextError> {
         let bytes = self.blobs.get(digest).map_err(|e| ContextError::Corrupt(e.to_string()))?;
-        serde_json::from_slice(&bytes).map_err(|e| ContextError::Corrupt(format!("{digest} is not a manifest: {e}")))
+        serde_json::from_slice(&bytes)
+            .map_err(|e| ContextError::Corrupt(format!("cannot parse the manifest {digest}: {e}")))
     }
     fn put_manifest(&mut self, manifest: &Manifest) -> Result<Digest, ContextError> {
         self.blobs.put(manifest.to_bytes()).map_err(|e| ContextError::Storage(e.to_string()))

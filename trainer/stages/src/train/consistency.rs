@@ -69,17 +69,16 @@ impl Distiller {
         let manifest = parts::part(&*blobs, &base, &Role::DENOISER, ArtifactKind::Denoiser)?;
         let teacher_meta: DenoiserMeta = artifacts::meta(&manifest, "the teacher")?;
         if teacher_meta.family != Family::Mld {
-            return Err(StageError::Input("`teacher` is a student; name a `train.mld` stage".into()));
+            return Err(StageError::Input("`teacher` is a student; expected a `train.mld` stage".into()));
         }
         if teacher_meta.fits.get(&Role::VAE) != Some(&data.vae()) {
             return Err(StageError::Input(
-                "`latents` were made by another VAE than the teacher was trained on; name the teacher's latents".into(),
+                "`latents` were encoded with another VAE than the teacher's; use the teacher's latents".into(),
             ));
         }
         if teacher_meta.fits.get(&Role::TEXT) != Some(&data.text_meta().text) {
             return Err(StageError::Input(
-                "`text` was embedded with another encoder than the teacher was trained with; name the teacher's `text`"
-                    .into(),
+                "`text` was embedded with another encoder than the teacher's; use the teacher's `text`".into(),
             ));
         }
         let device = cx.device();

@@ -13,7 +13,6 @@ use checkpoint::model::Parts;
 use models::diffusion::{Schedule, affine, unzip};
 use models::kernels::Dropout;
 use models::losses::{FrameWeights, Pointwise};
-use models::names::to_bytes;
 use models::networks::Init;
 use protocol::ArtifactKind;
 use protocol::artifact::Role;
@@ -22,13 +21,13 @@ use protocol::stage::{FrequencyLosses, Positions, StageSpec, Training};
 use super::data::features::{FeatureData, Rules};
 use super::frequency::{FrequencyTerms, LOW_FREQUENCY, Predicted, SEMANTIC, clean};
 use super::network::{dropout_seed, group, slice_result};
-use super::{Average, GroupPlan, Losses, Objective, SliceResult, TrainState, Trained, train};
-use crate::artifacts::{Draft, MODEL_FILE, to_meta};
+use super::{Average, GroupPlan, Losses, Objective, SliceResult, TrainState, train};
+use crate::artifacts::{Draft, to_meta};
 use crate::context::{GangContext, Outcome, StageError};
 use crate::generate::generator::FEATURE_DIFFUSION;
-use crate::parts;
 use crate::parts::motion_networks::{Architecture, MotionDenoiserMeta, MotionNetwork};
 use crate::parts::warm_start::WarmStart;
+use crate::parts::{self, weights};
 
 /// Name of the loss term that every diffusion has.
 const DENOISING: &str = "denoising";
@@ -132,9 +131,7 @@ pub(crate) fn run<N: MotionNetwork>(
     let tracked = cx.device().autodiff();
     let purpose = format!("{}/init", cx.task().name);
     let mut init = Init::new(cx.task().seed, &purpose, Positions::Uniform, &tracked);
-    let mut start = WarmStart::find(cx, ArtifactKind::Denoiser)?;
-    let network = start.take(make(&meta, &mut init), "")?;
-    start.finish(cx, &to_meta(&meta))?;
+    let network = WarmStart::begin(cx, ArtifactKind::Denoiser, make(&meta, &mut init), &meta)?;
     let mut objective = Features {
         data,
         network,
@@ -148,17 +145,12 @@ pub(crate) fn run<N: MotionNetwork>(
         seed: dropout_seed(cx),
         device: cx.device(),
     };
-    match train(&mut objective, recipe.training, cx)? {
-        Trained::Yielded { at } => Ok(Outcome::Yielded { at }),
-        Trained::Finished { state, metrics } => {
-            let bytes = to_bytes(&state.groups[0].entries, state.result(0));
-            let mut denoiser = Draft::new(cx, ArtifactKind::Denoiser, to_meta(&meta));
-            denoiser.add(MODEL_FILE, bytes)?;
-            let parts = BTreeMap::from([(Role::DENOISER, denoiser.into_manifest()), (Role::TEXT, text_part)]);
-            let output = parts::publish_model(cx, FEATURE_DIFFUSION, meta.format, &parts)?;
-            Ok(Outcome::Finished { output, metrics })
-        }
-    }
+    train(&mut objective, recipe.training, cx)?.publish(|state| {
+        let mut denoiser = Draft::new(cx, ArtifactKind::Denoiser, to_meta(&meta));
+        weights::add(&mut denoiser, state.trained(0))?;
+        let parts = BTreeMap::from([(Role::DENOISER, denoiser.into_manifest()), (Role::TEXT, text_part)]);
+        parts::publish_model(cx, FEATURE_DIFFUSION, meta.format, &parts)
+    })
 }
 
 /// The family of the models of `settings`.

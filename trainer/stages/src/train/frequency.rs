@@ -83,7 +83,8 @@ impl FrequencyTerms {
         {
             let (ours, theirs) = (word(&format), word(&evaluator.meta().format));
             return Err(StageError::Input(format!(
-                "`{}` embeds motions of `{theirs}`, the clips are of `{ours}`; train one on these clips",
+                "`{}` embeds motions in format `{theirs}`, but the clips have format `{ours}`; train an evaluator on \
+                 these clips",
                 FrequencyLosses::EVALUATOR
             )));
         }

@@ -28,11 +28,11 @@ use std::collections::BTreeMap;
 use burn::tensor::Device;
 use protocol::message::StageTask;
 use protocol::stage::Training;
+use protocol::{ArtifactKind, Digest};
+use serde_json::json;
 
 use crate::artifacts::Draft;
-use crate::context::{Adopted, ContextError, Exchange, GangContext, Rendezvous, StageError};
-use protocol::ArtifactKind;
-use serde_json::json;
+use crate::context::{Adopted, ContextError, Exchange, GangContext, Outcome, Rendezvous, StageError};
 
 use group::Gradients;
 
@@ -118,6 +118,22 @@ pub enum Trained {
         /// Number of steps applied.
         at: u64,
     },
+}
+
+impl Trained {
+    /// The outcome of the stage. `publish` uploads the artifact that is made of the last state.
+    ///
+    /// # Errors
+    /// The error of `publish`.
+    pub fn publish(
+        self,
+        publish: impl FnOnce(&TrainState) -> Result<Digest, StageError>,
+    ) -> Result<Outcome, StageError> {
+        match self {
+            Self::Yielded { at } => Ok(Outcome::Yielded { at }),
+            Self::Finished { state, metrics } => Ok(Outcome::Finished { output: publish(&state)?, metrics }),
+        }
+    }
 }
 
 /// Trains to the last step (of the schedule, or of a rung that stops earlier), or until a stop is requested.
@@ -227,7 +243,7 @@ pub fn train(
             match saved {
                 Ok(()) => (saved_at, save_is_due) = (Some(state.step), false),
                 Err(StageError::Context(ContextError::Unavailable(why))) if !cx.can_save() => {
-                    cx.log(&format!("the checkpoint after step {} is put off: {why}", state.step));
+                    cx.log(&format!("the checkpoint after step {} is delayed: {why}", state.step));
                 }
                 Err(error) => return Err(error),
             }
@@ -243,7 +259,7 @@ fn check_size(bytes: u64, most: u64) -> Result<(), StageError> {
     }
     let gib = |bytes: u64| bytes as f64 / f64::from(1 << 30);
     Err(StageError::Input(format!(
-        "the state of this training is one file of {:.1} GiB, expected at most {:.1} GiB; use a smaller `network`, or no `ema`",
+        "the training state is a file of {:.1} GiB; expected at most {:.1} GiB; use a smaller `network`, or no `ema`",
         gib(file),
         gib(most)
     )))
@@ -264,12 +280,12 @@ fn begin(
             if let Some(manifest) = checkpoint {
                 restore(state, &manifest, cx)?;
                 (applied, saved_at) = (Some(state.step), Some(state.step));
-                cx.log(&format!("goes on from the checkpoint after step {}", state.step));
+                cx.log(&format!("continues from the checkpoint after step {}", state.step));
             } else if continues {
                 let (_, manifest) = crate::artifacts::input(cx, STATE_INPUT, ArtifactKind::Checkpoint)?;
                 restore(state, &manifest, cx)?;
                 applied = Some(state.step);
-                cx.log(&format!("goes on from the rung that ended after step {}", state.step));
+                cx.log(&format!("continues from the rung that ended after step {}", state.step));
             }
         }
         let met = meet(state, applied, cx)?;
@@ -356,7 +372,8 @@ impl Layout {
         if found != (wanted, self.terms, self.sums.clone()) {
             let (gradients, terms, sums) = found;
             return Err(StageError::Fault(format!(
-                "a slice gave gradients of {gradients:?} values, {terms} terms and sums of {sums:?}; the plan has {:?}, {} and {:?}",
+                "a slice has gradients of {gradients:?} values, {terms} terms and sums of {sums:?}; the plan has {:?}, \
+                 {} and {:?}",
                 self.gradients, self.terms, self.sums
             )));
         }
@@ -432,7 +449,7 @@ fn keep(state: &mut TrainState, accelerator: Option<&Device>) {
 }
 
 /// What a checkpoint's manifest says. Workers of two builds may save one step, so it names none of them.
-fn meta(state: &TrainState, config: protocol::Digest, seed: protocol::Seed) -> serde_json::Value {
+fn meta(state: &TrainState, config: Digest, seed: protocol::Seed) -> serde_json::Value {
     json!({
         "step": state.step,
         "settings": config,
@@ -442,12 +459,7 @@ fn meta(state: &TrainState, config: protocol::Digest, seed: protocol::Seed) -> s
     })
 }
 
-fn save(
-    state: &mut TrainState,
-    config: protocol::Digest,
-    recent: &Recent,
-    cx: &mut dyn GangContext,
-) -> Result<(), StageError> {
+fn save(state: &mut TrainState, config: Digest, recent: &Recent, cx: &mut dyn GangContext) -> Result<(), StageError> {
     state.fetch();
     let meta = meta(state, config, cx.task().seed);
     let mut draft = Draft::new(cx, ArtifactKind::Checkpoint, meta);
@@ -502,7 +514,7 @@ mod tests {
     #[test]
     fn a_checkpoint_says_nothing_of_the_build_that_saved_it() {
         let state = TrainState::new(Vec::new(), Vec::new());
-        let meta = meta(&state, protocol::Digest::of(b"settings"), protocol::Seed(1));
+        let meta = meta(&state, Digest::of(b"settings"), protocol::Seed(1));
         let keys: Vec<&str> = meta.as_object().expect("an object").keys().map(String::as_str).collect();
         assert_eq!(keys, ["buffers", "groups", "seed", "settings", "step"]);
         assert!(!meta.to_string().contains(env!("CARGO_PKG_VERSION")), "{meta}");

@@ -39,7 +39,7 @@ pub(crate) fn slice_result<M: Module>(
     terms: &[&'static str],
 ) -> Result<SliceResult, StageError> {
     let total = losses.total().ok_or_else(|| {
-        StageError::Input("every weight of the loss is 0, so there is nothing to learn; set one".into())
+        StageError::Input("every weight of the loss is 0, so nothing is learned; set at least one above 0".into())
     })?;
     let gradients = vec![slice_gradient(module, total)];
     Ok(SliceResult { gradients, terms: losses.values(terms), ..SliceResult::default() })

@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use burn::tensor::Device;
 use bytemuck::{cast_slice, cast_slice_mut};
 use checkpoint::{Blob, BlobError};
+use models::flat::Entry;
 use safetensors::Dtype;
 use safetensors::tensor::{Metadata, TensorInfo};
 
@@ -133,29 +134,32 @@ impl TrainState {
         let wrong = |text: String| RestoreError::Wrong(text);
         let mut length = [0; 8];
         if saved.bytes() < 8 {
-            return Err(wrong(format!("{} bytes are no tensors", saved.bytes())));
+            return Err(wrong(format!("the file has {} bytes; expected at least 8", saved.bytes())));
         }
         saved.read_at(0, &mut length)?;
         let length = u64::from_le_bytes(length);
         if length > HEADER_BYTES || length > saved.bytes() - 8 {
-            return Err(wrong(format!("a header of {length} bytes in {} bytes", saved.bytes())));
+            return Err(wrong(format!("the header declares {length} bytes, but the file has {} bytes", saved.bytes())));
         }
         let mut json = vec![0; usize::try_from(length).unwrap_or_default()];
         saved.read_at(8, &mut json)?;
         let metadata: Metadata = serde_json::from_slice(&json).map_err(|e| wrong(e.to_string()))?;
         let end = metadata.data_len();
         if end as u64 != saved.bytes() - 8 - length {
-            return Err(wrong(format!("tensors of {end} bytes in {} bytes", saved.bytes() - 8 - length)));
+            return Err(wrong(format!(
+                "the header declares tensors of {end} bytes, but the file has {} bytes of data",
+                saved.bytes() - 8 - length
+            )));
         }
         let place = |name: &str, dtype: Dtype, values: usize| {
             let info = metadata.info(name).ok_or_else(|| {
                 let mut there: Vec<String> = metadata.tensors().into_keys().collect();
                 there.sort();
-                wrong(format!("no tensor `{name}`; there are {there:?}"))
+                wrong(format!("no tensor `{name}`; the file has {there:?}"))
             })?;
             if info.dtype != dtype || info.shape != [values] {
                 return Err(wrong(format!(
-                    "`{name}` is {:?} {:?}, expected {dtype:?} [{values}]",
+                    "`{name}` is {:?} {:?}; expected {dtype:?} [{values}]",
                     info.dtype, info.shape
                 )));
             }
@@ -175,7 +179,7 @@ impl TrainState {
             let strange = |name: &String| name != "step" && !places.contains_key(name);
             let mut strange: Vec<String> = metadata.tensors().into_keys().filter(strange).collect();
             strange.sort();
-            return Err(wrong(format!("tensors that this plan has no place for: {strange:?}")));
+            return Err(wrong(format!("this plan does not have the tensors {strange:?}")));
         }
         for (name, values) in self.values_mut() {
             saved.read_at(places[&name], cast_slice_mut(values))?;
@@ -216,6 +220,16 @@ impl TrainState {
         debug_assert!(self.is_fetched());
         let group = &self.groups[index];
         group.average.as_ref().unwrap_or(&group.params)
+    }
+
+    /// Names and shapes of group `index`, and the result of its training.
+    pub fn trained(&self, index: usize) -> (&[Entry], &[f32]) {
+        (&self.groups[index].entries, self.result(index))
+    }
+
+    /// Like [`trained`](Self::trained), with the parameters although an average is kept.
+    pub fn online(&self, index: usize) -> (&[Entry], &[f32]) {
+        (&self.groups[index].entries, self.params(index))
     }
 }
 

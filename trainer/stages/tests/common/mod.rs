@@ -126,7 +126,7 @@ pub(crate) fn begin_again(bench: &mut Bench, links: Vec<Link>, outputs: &BTreeMa
         bench.forget(name);
         let ran = bench.run(name, &settings, &inputs).unwrap_or_else(|e| panic!("{name}: {e}"));
         let said = ran.told.log.join("\n");
-        assert!(said.contains("begins with") && !said.contains("fresh: "), "{name}: {said}");
+        assert!(said.contains("starts with") && !said.contains("fresh: "), "{name}: {said}");
         assert_ne!(ran.output(), outputs[name], "{name}");
         count += 1;
     }

@@ -56,7 +56,7 @@ fn what_makes_no_whole_network_is_refused_with_all_that_is_wrong() {
         "`decoder.norm.bias` [",
         "is missing",
         "`final_layer.bias` has shape [5], expected [263]",
-        "`encoder.input_blocks.0.norm9.bias` [2] is not of this network",
+        "`encoder.input_blocks.0.norm9.bias` [2] is not part of this network",
     ] {
         assert!(said.contains(part), "{part}: {said}");
     }
@@ -72,11 +72,11 @@ fn what_makes_no_whole_network_is_refused_with_all_that_is_wrong() {
     );
     assert!(wide.contains("and ") && wide.contains(" more"), "{wide}");
     let heads = refused(&|_| {}, &ImportModel { heads: 7, ..settings.clone() });
-    assert!(heads.contains("7 attention heads do not divide; set `heads`"), "{heads}");
+    assert!(heads.contains("not a multiple of the 7 attention heads; set `heads`"), "{heads}");
     let kit = refused(&|_| {}, &ImportModel { format: DataFormat::Kit, ..settings.clone() });
     assert!(kit.contains("263 features") && kit.contains("set `format`"), "{kit}");
     let other = refused(&|_| {}, &ImportModel { part: ImportedPart::Tokenizer, ..settings.clone() });
-    assert!(other.contains("it holds no tokenizer, which has a tensor `encoder.model.0.weight`"), "{other}");
+    assert!(other.contains("it has no tokenizer: the tensor `encoder.model.0.weight` is missing"), "{other}");
     let extra = |all: &mut BTreeMap<String, (Vec<usize>, Vec<f32>)>| {
         all.insert("text_encoder.x".into(), (vec![1], vec![0.0]));
         all.insert("t2m_textencoder.hidden".into(), (vec![1], vec![0.0]));
@@ -97,7 +97,7 @@ fn nothing_of_a_file_is_run_and_none_but_weights_are_read() {
     let long_header = [&(1_u64 << 60).to_le_bytes()[..], b"{}"].concat();
     for (name, bytes, words) in [
         ("pickle.tar", pickle, "expected a dict"),
-        ("short.ckpt", b"PK".to_vec(), "has 2 bytes; expected a checkpoint"),
+        ("short.ckpt", b"PK".to_vec(), "has 2 bytes; expected a torch checkpoint"),
         ("long.safetensors", long_header, "header"),
         ("no.ckpt", b"PK\x03\x04 is no archive at all".to_vec(), "no.ckpt: "),
     ] {
@@ -124,7 +124,7 @@ fn what_is_of_another_kind_or_of_another_vae_is_refused() {
     assert!(said.contains("write `part: lcm`"), "{said}");
     let narrow = world.text(12);
     let said = world.import(&settings, &[("vae", vae), ("text", narrow)]).unwrap_err();
-    assert!(said.contains("768 numbers a caption, `text` gives 12"), "{said}");
+    assert!(said.contains("768 numbers per caption, but `text` has 12"), "{said}");
     // Another VAE of the same size: one number differs.
     let (from, to) = (folder.join("weights.safetensors"), world.folder.path().join("other.safetensors"));
     changed(&from, &to, &|all| all.get_mut("vae.final_layer.bias").expect("it").1[0] += 1.0);
@@ -133,5 +133,5 @@ fn what_is_of_another_kind_or_of_another_vae_is_refused() {
         crate::world::vae(&mut world, &file, &config["vae"]).output()
     };
     let said = world.import(&settings, &[("vae", other), ("text", text)]).unwrap_err();
-    assert!(said.contains("the VAE in it") && said.contains("the numbers are others"), "{said}");
+    assert!(said.contains("the VAE in it") && said.contains("the values differ"), "{said}");
 }

@@ -44,7 +44,7 @@ fn a_state_arrives_where_it_belongs_however_it_is_cut() {
         scope.spawn(|| exchange::rendezvous(&ahead, Some(5), &[&state[..100]], &|| None).expect("sent"));
         assert_eq!(exchange::rendezvous(&behind, None, &[], &|| None), Ok(Met::Behind(0, 5)));
         let refused = exchange::adopt(&behind, 0, &mut [&mut [0; 101]], true, &|| None);
-        assert!(matches!(&refused, Err(Halt::Disagree(why)) if why.contains("100 bytes, expected 101")), "{refused:?}");
+        assert!(matches!(&refused, Err(Halt::Disagree(why)) if why.contains("100 bytes; expected 101")), "{refused:?}");
     });
     [ahead, behind].into_iter().for_each(|mesh| mesh.close(None));
 }

@@ -120,7 +120,7 @@ async fn a_token_that_was_revoked_meanwhile_promotes_nothing() -> TestResult {
     let view = ended(&lab, &run).await?;
     assert!(view.owner.promotes && view.owner.to_string() == "alice (motion)", "{:?}", view.owner);
     // The artifacts are not models, so this error shows that the token was accepted.
-    assert!(why(&view).contains("cannot be made"), "{}", why(&view));
+    assert!(why(&view).contains("cannot assemble"), "{}", why(&view));
     for (change, words) in [("", "no token of `alice` is still valid"), ("expires=2020-01-01", "no token of `alice`")] {
         let without = lines(|kind| match kind.name {
             "alice" if change.is_empty() => None,

@@ -122,7 +122,7 @@ impl StageSpec for DataFeatures {
         let map_is_file = self.map_is_file();
         let mut refs = vec![
             Ref::folder("path", &mut self.path)
-                .holding(&[], "recordings of your own, or `trainer data sample --format bvh`"),
+                .holding(&[], "use your own recordings, or those of `trainer data sample --format bvh`"),
             Ref::folder("captions", &mut self.captions),
             Ref::folder("target", &mut self.target),
         ];
@@ -135,16 +135,16 @@ impl StageSpec for DataFeatures {
 
     fn check(&self, p: &mut Problems) {
         if self.path.trim().is_empty() {
-            p.add("path", "`path` is missing: the folder with recordings", "");
+            p.add("path", "`path` is missing; set it to the folder with the recordings", "");
         }
         p.fraction("val", self.val, true);
         p.fraction("test", self.test, true);
         if (0.0..1.0).contains(&self.val) && (0.0..1.0).contains(&self.test) && self.val + self.test >= 1.0 {
-            p.add("test", "`val` and `test` leave no clips to train on; expected a sum below 1", "");
+            p.add("test", "`val` and `test` leave no training clips; expected a sum below 1", "");
         }
         if self.format == DataFormat::Kit && self.target.is_empty() && !self.path.is_empty() {
-            let help = "name a `.npy` of 21 offsets or lengths";
-            p.add("target", "`target` is missing: the uniform skeleton of KIT-ML is not public", help);
+            let help = "set it to a `.npy` file with 21 offsets or lengths";
+            p.add("target", "`target` is missing; the uniform skeleton of KIT-ML is not public", help);
         }
         p.shards(self.shards);
     }

@@ -33,7 +33,7 @@ impl StageSpec for DataOpen {
 
     fn check(&self, p: &mut Problems) {
         if self.path.trim().is_empty() {
-            p.add("path", "`path` is missing: the folder with `new_joint_vecs`, `texts` and `train.txt`", "");
+            p.add("path", "`path` is missing; set it to the folder with `new_joint_vecs`, `texts` and `train.txt`", "");
         }
     }
 

@@ -43,7 +43,7 @@ impl StageSpec for DataSynthetic {
         p.fraction("val", self.val, true);
         p.fraction("test", self.test, true);
         if (0.0..1.0).contains(&self.val) && (0.0..1.0).contains(&self.test) && self.val + self.test >= 1.0 {
-            p.add("test", "`val` and `test` leave no clips to train on; expected a sum below 1", "");
+            p.add("test", "`val` and `test` leave no training clips; expected a sum below 1", "");
         }
     }
 

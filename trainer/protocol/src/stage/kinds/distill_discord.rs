@@ -113,7 +113,7 @@ impl StageSpec for DistillDiscord {
         stages.same_skeleton(p, (field, encoder), &self.dataset);
         stages.same_codes(p, ("teacher", &self.teacher), encoder);
         if stages.stage(&self.teacher).is_some_and(|teacher| teacher.get::<Self>().is_some()) {
-            let message = format!("`{}` is a student itself", self.teacher);
+            let message = format!("`{}` is a student", self.teacher);
             p.add("teacher", message, "name a `train.discord` stage");
         }
         FlowPrediction::check_init(stages, p, &self.init, FlowPrediction::of_stage(stages, &self.teacher));

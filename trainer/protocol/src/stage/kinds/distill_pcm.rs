@@ -61,14 +61,14 @@ impl StageSpec for DistillPcm {
         {
             let (phases, skip) = (self.phases, self.distillation.skip);
             let message = format!("`phases` is {phases}, but the grid of `skip` {skip} has only {grid} points");
-            p.add("phases", message, "take fewer phases or a smaller `skip`");
+            p.add("phases", message, "use fewer phases or a smaller `skip`");
         }
         p.not_negative("adversarial", self.adversarial);
         p.not_negative("discriminator_lr", self.discriminator_lr);
         self.discriminator_optimizer.check(p, "discriminator_optimizer");
         if self.alternate && self.adversarial == 0.0 {
-            let message = "`alternate` is true, but without `adversarial` there is no discriminator to take turns with";
-            p.add("alternate", message, "leave it out, or set `adversarial`");
+            let message = "`alternate` is true, but without `adversarial` there is no discriminator to alternate with";
+            p.add("alternate", message, "remove `alternate`, or set `adversarial`");
         }
     }
 

@@ -97,11 +97,15 @@ impl StageSpec for EvaluateControl {
     fn check(&self, p: &mut Problems) {
         check_words(p, "joints", &self.joints);
         if self.percent.is_empty() && self.frames.is_empty() {
-            p.add("percent", "`percent` and `frames` are both empty, so nothing is told", "published: `percent: [25]`");
+            p.add(
+                "percent",
+                "`percent` and `frames` are both empty, so there are no hints",
+                "published: `percent: [25]`",
+            );
         }
         for (i, percent) in self.percent.iter().enumerate() {
             if !(*percent > 0.0 && *percent <= 100.0) {
-                let message = format!("`percent` has {percent}; expected numbers above 0, up to 100");
+                let message = format!("`percent` has {percent}; expected numbers above 0 and at most 100");
                 p.add(&format!("percent[{i}]"), message, "");
             }
         }
@@ -133,15 +137,14 @@ impl StageSpec for EvaluateControl {
                 && ours != theirs
             {
                 let (theirs, ours) = (theirs.skeleton(), ours.skeleton());
-                let message =
-                    format!("`{name}` is for skeletons of {theirs}, but the clips of `{dataset}` have {ours}");
-                p.add(field, message, "measure a model on the format that it was trained on");
+                let message = format!("`{name}` has skeletons of {theirs}, but the clips of `{dataset}` have {ours}");
+                p.add(field, message, "use a dataset in the model's format");
             }
         }
         if stages.evaluator_of_model(model) == Some(evaluator) {
             let message =
-                format!("`{model}` was trained to agree with `{evaluator}`, so that its metrics would flatter it");
-            p.add("evaluator", message, "train another evaluator, under another name, to measure with");
+                format!("`{evaluator}` was part of the training loss of `{model}`, so its metrics would be biased");
+            p.add("evaluator", message, "train a second evaluator and measure with that one");
         }
         check_skeleton(p, "joints", &self.joints, ours);
         stages.check_sampler(p, model, &self.sampler);

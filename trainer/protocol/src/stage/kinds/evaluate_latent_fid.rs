@@ -98,13 +98,13 @@ impl StageSpec for EvaluateLatentFid {
             }
         }
         let without = match stages.family(&self.model) {
-            Some(Family::Features { .. }) => Some("diffuses motion itself"),
-            Some(family) if family.draws_tokens() => Some("draws tokens"),
+            Some(Family::Features { .. }) => Some("generates motion features"),
+            Some(family) if family.draws_tokens() => Some("generates tokens"),
             _ => None,
         };
         if let Some(how) = without {
             let message = format!("`{}` {how} and has no latents", self.model);
-            p.add("model", message, "measure it with `evaluate.t2m`");
+            p.add("model", message, "use `evaluate.t2m`");
         }
         stages.check_sampler(p, &self.model, &self.sampler);
     }

@@ -91,28 +91,32 @@ impl StageSpec for EvaluateRecognition {
 
     fn check(&self, p: &mut Problems) {
         const HELP: &str =
-            "such as `activities: [{name: walk, words: [walks, walking]}, {name: run, words: [runs, running]}]`";
+            "for example `activities: [{name: walk, words: [walks, walking]}, {name: run, words: [runs, running]}]`";
         if self.activities.len() < 2 {
             p.add(
                 "activities",
-                format!("{} activities; expected at least two to tell apart", self.activities.len()),
+                format!("`activities` has {} entries; expected at least two", self.activities.len()),
                 HELP,
             );
         }
         for (i, activity) in self.activities.iter().enumerate() {
             let name = &activity.name;
             if name.is_empty() || self.activities[..i].iter().any(|other| other.name == *name) {
-                p.add("activities", format!("`{name}` is no name of its own"), "give each activity another name");
+                p.add(
+                    "activities",
+                    format!("the activity name `{name}` is empty or used twice"),
+                    "give each activity a name of its own",
+                );
             }
             if activity.words.is_empty() || activity.words.iter().any(|words| words.split_whitespace().next().is_none())
             {
-                p.add("activities", format!("`{name}` has no words, or an empty one"), HELP);
+                p.add("activities", format!("`{name}` has no words, or an empty word"), HELP);
             }
         }
         self.sampler.check(p);
         p.positive("motions", self.motions);
         if self.split == Split::Train {
-            p.add("split", "`train` is what the classifier learns from", "use `val`, `test` or `all`");
+            p.add("split", "the classifier is trained on the split `train`", "use `val`, `test` or `all`");
         }
     }
 

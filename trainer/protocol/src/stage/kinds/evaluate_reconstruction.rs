@@ -70,9 +70,8 @@ impl StageSpec for EvaluateReconstruction {
 
     fn check(&self, p: &mut Problems) {
         if self.decoder_steps > 0 && self.decoder.is_empty() {
-            let message =
-                format!("`decoder_steps` is {}, but there is no `decoder` that makes them", self.decoder_steps);
-            p.add("decoder_steps", message, "name the stage of a flow decoder");
+            let message = format!("`decoder_steps` is {}, but `decoder` is missing", self.decoder_steps);
+            p.add("decoder_steps", message, "set `decoder` to the stage of a flow decoder");
         }
         p.shards(self.shards);
     }

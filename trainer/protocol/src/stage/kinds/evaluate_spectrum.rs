@@ -57,8 +57,8 @@ impl StageSpec for EvaluateSpectrum {
 
     fn check(&self, p: &mut Problems) {
         if self.bands.is_empty() || !self.bands.windows(2).all(|pair| pair[0] < pair[1]) {
-            let message = format!("`bands` is {:?}; expected frequencies in hertz, the lowest first", self.bands);
-            p.add("bands", message, "such as [0.5, 1, 2, 4]");
+            let message = format!("`bands` is {:?}; expected frequencies in hertz in ascending order", self.bands);
+            p.add("bands", message, "for example [0.5, 1, 2, 4]");
         }
         self.bands.iter().for_each(|band| p.above_zero("bands", *band));
         self.sampler.check(p);
@@ -68,15 +68,15 @@ impl StageSpec for EvaluateSpectrum {
     fn check_neighbours(&self, stages: &Neighbours<'_>, p: &mut Problems) {
         let model = &self.model;
         if stages.family(model).is_some_and(|family| family.draws_tokens()) {
-            p.add("model", format!("`{model}` draws tokens, and has no denoising steps"), "");
+            p.add("model", format!("`{model}` generates tokens and has no denoising steps"), "");
         }
         if let (Some(ours), Some(theirs)) = (stages.format(&self.dataset), stages.format(model))
             && ours != theirs
         {
             let (theirs, ours) = (theirs.skeleton(), ours.skeleton());
             let message =
-                format!("`{model}` makes motions of {theirs}, but the clips of `{}` have {ours}", self.dataset);
-            p.add("model", message, "measure a model on the format that it was trained on");
+                format!("`{model}` generates motions of {theirs}, but the clips of `{}` have {ours}", self.dataset);
+            p.add("model", message, "use a dataset in the model's format");
         }
         stages.check_sampler(p, model, &self.sampler);
     }

@@ -160,24 +160,24 @@ impl StageSpec for EvaluateT2m {
         if self.generates() {
             self.sampler.check(p);
         } else if !self.length.is_empty() {
-            let message = "`length` says how long a model's motions are, but no model is measured";
-            p.add("length", message, "leave it out");
+            let message = "`length` sets the length of a model's motions, but no model is measured";
+            p.add("length", message, "remove it");
         }
         self.check_subject(p);
         if self.perturbed > 0.0 && !self.generates() {
-            let message = "`perturbed` changes what a model is told, but no model is measured";
-            p.add("perturbed", message, "leave it out");
+            let message = "`perturbed` changes the captions of a model, but no model is measured";
+            p.add("perturbed", message, "remove it");
         }
         p.positive("repeats", self.repeats);
         if self.pools.is_empty() {
             p.add(
                 "pools",
-                "`pools` is empty; expected how many motions a caption's own is ranked among",
-                "such as [32]",
+                "`pools` is empty; expected the number of motions that are ranked for a caption",
+                "for example [32]",
             );
         }
         if let Some((i, pool)) = self.pools.iter().enumerate().find(|(i, pool)| self.pools[..*i].contains(pool)) {
-            p.add("pools", format!("`pools` has {pool} twice, the second time at place {}", i + 1), "");
+            p.add("pools", format!("`pools` has {pool} twice; remove entry {}", i + 1), "");
         }
         p.shards(self.shards);
         let MultiModality { captions, samples, pairs } = self.multimodality;
@@ -187,7 +187,7 @@ impl StageSpec for EvaluateT2m {
             limits::EVALUATED_MOTIONS,
         );
         if captions > 0 && !(1..=samples).contains(&pairs) {
-            let message = format!("`multimodality.pairs` is {pairs}; expected 1 to `samples`, {samples}");
+            let message = format!("`multimodality.pairs` is {pairs}; expected 1 to {samples}, the value of `samples`");
             p.add("multimodality.pairs", message, "");
         }
     }
@@ -216,22 +216,23 @@ impl StageSpec for EvaluateT2m {
         let model = &self.model;
         if stages.evaluator_of_model(model) == Some(evaluator) {
             let message =
-                format!("`{model}` was trained to agree with `{evaluator}`, so that its metrics would flatter it");
-            p.add("evaluator", message, "train another evaluator, under another name, to measure with");
+                format!("`{evaluator}` was part of the training loss of `{model}`, so its metrics would be biased");
+            p.add("evaluator", message, "train a second evaluator and measure with that one");
         }
         if let (Some(ours), Some(theirs)) = (stages.format(dataset), stages.format(model))
             && ours != theirs
         {
             let message = format!(
-                "`{model}` makes motions of {}, but the clips of `{dataset}` have {}",
+                "`{model}` generates motions of {}, but the clips of `{dataset}` have {}",
                 theirs.skeleton(),
                 ours.skeleton()
             );
-            p.add("model", message, "measure a model on the format that it was trained on");
+            p.add("model", message, "use a dataset in the model's format");
         }
         if !self.length.is_empty() && stages.family(model) == Some(Family::Autoregressive) {
-            let message = format!("`{model}` decides itself how long a motion is, so `{}` is not asked", self.length);
-            p.add("length", message, "leave it out");
+            let message =
+                format!("`{model}` decides the length of a motion itself, so `{}` has no effect", self.length);
+            p.add("length", message, "remove it");
         }
         stages.check_sampler(p, model, &self.sampler);
     }
@@ -268,16 +269,16 @@ impl EvaluateT2m {
         if self.real && self.reconstructs() {
             let field = if self.vae.is_empty() { "tokenizer" } else { "vae" };
             let message = format!(
-                "`real` measures the clips themselves, `{field}` what it makes of them; expected one of the two"
+                "`real` measures clips, but `{field}` measures reconstructions of clips; expected only one of the two"
             );
-            p.add(field, message, "make a stage of each");
+            p.add(field, message, "use one stage for each");
         }
         if !self.vae.is_empty() && !self.tokenizer.is_empty() {
-            let message = "`vae` and `tokenizer` both reconstruct; expected one of them";
-            p.add("tokenizer", message, "make a stage of each");
+            let message = "`vae` and `tokenizer` are both set; expected only one of them";
+            p.add("tokenizer", message, "use one stage for each");
         }
         if self.tokenizer.is_empty() && !self.decoder.is_empty() {
-            p.add("decoder", "`decoder` decodes tokens, but there is no `tokenizer`; expected both", "");
+            p.add("decoder", "`decoder` is set, but `tokenizer` is missing; expected both", "");
         }
     }
 }

@@ -46,7 +46,7 @@ impl StageSpec for ImportEvaluator {
 
     fn check(&self, p: &mut Problems) {
         if self.path.trim().is_empty() {
-            p.add("path", "`path` is missing: the folder with `text_mot_match/model/finest.tar`", "");
+            p.add("path", "`path` is missing; set it to the folder with `text_mot_match/model/finest.tar`", "");
         }
     }
 

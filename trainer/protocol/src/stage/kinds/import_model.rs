@@ -12,10 +12,11 @@ use crate::stage::{
 
 /// Names of the statistics in published folders.
 const STATISTICS: [&str; 2] = ["mean.npy|Mean.npy", "std.npy|Std.npy"];
-const STATISTICS_ORIGIN: &str = "mean and deviation of the features that the model was trained on: those of the data set (MotionLCM, MDM), \
-                                 or the folder `meta` beside the weights (MoMask, T2M-GPT)";
+const STATISTICS_ORIGIN: &str = "the mean and standard deviation of the features that the model was trained on: those \
+    of the dataset (MotionLCM, MDM), or the folder `meta` beside the weights (MoMask, T2M-GPT)";
 const HINT_STATISTICS: [&str; 2] = ["Mean_raw.npy", "Std_raw.npy"];
-const HINT_ORIGIN: &str = "mean and deviation of the joints that OmniControl and MotionLCM normalise hints with, `humanml_spatial_norm` there";
+const HINT_ORIGIN: &str = "the mean and standard deviation that OmniControl and MotionLCM normalise hints with, their \
+    folder `humanml_spatial_norm`";
 
 /// Network to import from the file; it decides the output of the stage.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
@@ -266,30 +267,35 @@ impl StageSpec for ImportModel {
         let part = self.part;
         let missing = |path: &str| path.trim().is_empty();
         if missing(&self.path) {
-            p.add("path", "`path` is missing: the file with the weights", &format!("download {}", part.origin()));
+            p.add(
+                "path",
+                "`path` is missing; set it to the file with the weights",
+                &format!("download {}", part.origin()),
+            );
         }
         if part.reads().statistics && !missing(&self.statistics) && !missing(&self.dataset) {
-            let message = "`statistics` and `dataset` are both given, and both say what was subtracted from features";
-            p.add("statistics", message, "leave one of them out");
+            let message = "`statistics` and `dataset` are both set, and both define how features are normalised";
+            p.add("statistics", message, "remove one of them");
         }
         if part.reads().statistics && missing(&self.statistics) && missing(&self.dataset) {
-            let help = format!("give {STATISTICS_ORIGIN}; or write `dataset: dataset`");
-            p.add("statistics", "`statistics` is missing: the folder with `mean.npy` and `std.npy`", &help);
+            let help = format!("set it to {STATISTICS_ORIGIN}; or write `dataset: dataset`");
+            p.add("statistics", "`statistics` is missing; expected the folder with `mean.npy` and `std.npy`", &help);
         }
         if part == ImportedPart::Control {
             if missing(&self.hint_statistics) {
-                let message = "`hint_statistics` is missing: the folder with `Mean_raw.npy` and `Std_raw.npy`";
-                p.add("hint_statistics", message, &format!("give {HINT_ORIGIN}"));
+                let message = "`hint_statistics` is missing; expected the folder with `Mean_raw.npy` and `Std_raw.npy`";
+                p.add("hint_statistics", message, &format!("set it to {HINT_ORIGIN}"));
             }
             self.hints.check(p);
         }
         if part != ImportedPart::Momask && !missing(&self.residual) {
-            let message = format!("`residual` is given, but `{}` has one file", part.name());
-            p.add("residual", message, "leave it out");
+            let message = format!("`residual` is set, but `{}` has only one file", part.name());
+            p.add("residual", message, "remove it");
         }
         let (low, high) = self.guidance;
         if !(low >= 0.0 && low <= high && high.is_finite()) {
-            let message = format!("`guidance` is [{low}, {high}]; expected numbers of 0 or more, the smaller first");
+            let message =
+                format!("`guidance` is [{low}, {high}]; expected numbers of 0 or more, the smaller one first");
             p.add("guidance", message, "published: [5, 15]");
         }
         if self.skip == 0 || !1000usize.is_multiple_of(self.skip) {
@@ -302,8 +308,8 @@ impl StageSpec for ImportModel {
     fn check_neighbours(&self, stages: &Neighbours<'_>, p: &mut Problems) {
         let model = &self.model;
         if self.part == ImportedPart::Control && stages.family(model).is_some_and(|family| !family.draws_latents()) {
-            let message = format!("`{model}` is no latent diffusion, and only such a model has a ControlNet");
-            p.add("model", message, "name the stage that imports or trains the model that it controls");
+            let message = format!("`{model}` is not a latent diffusion model; a ControlNet needs one");
+            p.add("model", message, "set it to the stage that imports or trains the controlled model");
         }
     }
 

@@ -38,15 +38,15 @@ impl StageSpec for ModelDecoder {
     fn check_neighbours(&self, stages: &Neighbours<'_>, p: &mut Problems) {
         let (model, decoder) = (&self.model, &self.decoder);
         if matches!(stages.family(model), Some(Family::Features { .. })) {
-            let message = format!("`{model}` draws motion itself, and there is nothing that `{decoder}` could decode");
-            p.add("model", message, "name a model of tokens or of latents");
+            let message = format!("`{model}` generates motion features, so `{decoder}` has nothing to decode");
+            p.add("model", message, "use a model that generates tokens or latents");
         }
         if let (Some(ours), Some(theirs)) = (stages.format(model), stages.format(decoder))
             && ours != theirs
         {
             let (ours, theirs) = (ours.skeleton(), theirs.skeleton());
-            let message = format!("`{decoder}` decodes motions of {theirs}, but `{model}` draws those of {ours}");
-            p.add("decoder", message, "train the decoder on the data set of the model");
+            let message = format!("`{decoder}` decodes motions of {theirs}, but `{model}` generates motions of {ours}");
+            p.add("decoder", message, "train the decoder on the model's dataset");
         } else if let Some(encoder) = stages.tokenizer_of_model(model).or_else(|| stages.vae_of_model(model)) {
             stages.same_codes(p, ("decoder", decoder), encoder);
         }

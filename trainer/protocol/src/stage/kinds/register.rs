@@ -75,17 +75,19 @@ impl StageSpec for Register {
 
     fn check(&self, p: &mut Problems) {
         if self.model.is_empty() {
-            p.add("model", "`model` is missing: the name under which versions are registered", "");
+            p.add("model", "`model` is missing; set it to the name of the registered model", "");
         } else if !is_name(&self.model) {
-            let message =
-                format!("`{}` is not a model name; expected letters, digits, `.`, `_`, `-`, at most 64", self.model);
+            let message = format!(
+                "`{}` is not a valid model name; expected letters, digits, `.`, `_` or `-`, at most 64 characters",
+                self.model
+            );
             p.add("model", message, "");
         }
         if self.from.is_empty() {
             p.add(
                 "from",
-                "`from` is missing: the training stages whose models become versions",
-                "such as `from: [lcm, pcm]`",
+                "`from` is missing; set it to the stages whose models are registered",
+                "for example `from: [lcm, pcm]`",
             );
         }
         for (i, stage) in self.from.iter().enumerate() {
@@ -94,7 +96,7 @@ impl StageSpec for Register {
             }
         }
         if self.metric.trim().is_empty() {
-            p.add("metric", "`metric` is empty; expected the metric that decides which version is best", "");
+            p.add("metric", "`metric` is empty; expected the metric that ranks versions", "");
         }
         if let Some(sampler) = &self.sampler {
             sampler.check(p);
@@ -105,14 +107,14 @@ impl StageSpec for Register {
     fn check_neighbours(&self, stages: &Neighbours<'_>, p: &mut Problems) {
         for (i, from) in self.from.iter().enumerate() {
             if !stages.measures(from) && (self.from.len() > 1 || !self.promote.to.is_empty()) {
-                let message = format!("no `evaluate.*` stage looks at `{from}`, so `{}` cannot judge it", self.metric);
+                let message = format!("no `evaluate.*` stage evaluates `{from}`, so its `{}` is unknown", self.metric);
                 let help = format!("add a stage such as `{{kind: evaluate.latent_fid, model: {from}}}`");
                 p.add(&format!("from[{i}]"), message, &help);
             }
             if let Some(given) = stages.metrics_of(from)
                 && !given.contains(&self.metric)
             {
-                let message = format!("no evaluation of `{from}` gives `{}`, by which `metric` judges", self.metric);
+                let message = format!("no evaluation of `{from}` reports `{}`, the value of `metric`", self.metric);
                 p.add("metric", message, &one_of(&self.metric, &given));
             }
             match &self.sampler {
@@ -137,7 +139,7 @@ fn one_of(wanted: &str, given: &BTreeSet<String>) -> String {
     let listed = names.iter().take(LISTED).map(|name| format!("`{name}`")).collect::<Vec<_>>().join(", ");
     let near = nearest(wanted, names.iter().map(|name| name.as_str()));
     let meant = near.map(|near| format!("did you mean `{near}`? ")).unwrap_or_default();
-    let listed = format!("{meant}name one of {listed}");
+    let listed = format!("{meant}use one of {listed}");
     if more > 0 { format!("{listed} and {more} more") } else { listed }
 }
 
@@ -150,11 +152,11 @@ fn alike(a: &str, b: &str) -> usize {
 const LISTED: usize = 12;
 
 /// Advice for evaluations that differ.
-const SAY_WHICH: &str = "say which one the model is drawn with, such as `sampler: {steps: 1, guidance: 2}`";
+const SAY_WHICH: &str = "set the sampler of the version, for example `sampler: {steps: 1, guidance: 2}`";
 
 /// Message for evaluations of `from` with different samplers, without an explicit one.
 fn undecided(from: &str, differ: &str) -> String {
-    format!("the evaluations of `{from}` draw from it in different ways ({differ}), and a version has one")
+    format!("the evaluations of `{from}` use different samplers ({differ}), but a version has one sampler")
 }
 
 impl Register {
@@ -166,7 +168,7 @@ impl Register {
             let metric = gate.split(['<', '>']).next().unwrap_or_default().trim();
             if !given.contains(metric) {
                 let message =
-                    format!("the gate `{gate}` asks for `{metric}`, which no evaluation of a candidate gives");
+                    format!("the gate `{gate}` needs `{metric}`, but no evaluation of a candidate reports it");
                 p.add(&format!("promote.require[{i}]"), message, &one_of(metric, &given));
             }
         }
@@ -197,16 +199,23 @@ impl Register {
 impl Promote {
     fn check(&self, p: &mut Problems) {
         if !self.to.is_empty() && !is_name(&self.to) {
-            let message = format!("`{}` is not an alias; expected letters, digits, `.`, `_`, `-`, at most 64", self.to);
+            let message = format!(
+                "`{}` is not a valid alias; expected letters, digits, `.`, `_` or `-`, at most 64 characters",
+                self.to
+            );
             p.add("promote.to", message, "");
         }
         if self.to.is_empty() && !self.require.is_empty() {
-            p.add("promote.require", "`promote.require` has gates, but `promote.to` names no alias", "");
+            p.add(
+                "promote.require",
+                "`promote.require` has gates, but `promote.to` is missing; set it to an alias",
+                "",
+            );
         }
         for gate in self.require.iter().filter(|gate| !is_gate(gate)) {
             let message =
                 format!("`{gate}` is not a gate; expected a metric, one of <= >= < >, and a number or an alias");
-            p.add("promote.require", message, "such as \"latent_fid <= 0.3\"");
+            p.add("promote.require", message, "for example \"latent_fid <= 0.3\"");
         }
     }
 }

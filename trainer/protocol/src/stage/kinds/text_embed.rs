@@ -153,16 +153,16 @@ impl StageSpec for TextEmbed {
         let (_, origin) = self.encoder.folder();
         // `--set text.encoder=hashed` tries a recipe without its encoder; the other settings then have no effect.
         if self.encoder != TextEncoder::Hashed && self.path.trim().is_empty() {
-            let message = format!("`path` is missing: the folder with the encoder `{name}`");
+            let message = format!("`path` is missing; set it to the folder with the encoder `{name}`");
             p.add("path", message, &format!("download {origin}"));
         }
-        let unused = |field: &str| format!("`{field}` is given, but `{name}` has no choice there");
+        let unused = |field: &str| format!("`{field}` is set, but the encoder `{name}` does not use it");
         if !matches!(self.encoder, TextEncoder::Clip | TextEncoder::Hashed) {
             if self.output != ClipOutput::Projected {
-                p.add("output", unused("output"), "leave it out");
+                p.add("output", unused("output"), "remove it");
             }
             if self.ids != ClipIds::HuggingFace {
-                p.add("ids", unused("ids"), "leave it out");
+                p.add("ids", unused("ids"), "remove it");
             }
         }
         if (1..=2).contains(&self.max_tokens) {

@@ -171,7 +171,8 @@ impl StageSpec for TrainControl {
         }
         let (low, high) = self.guidance;
         if !(low >= 0.0 && low <= high && high.is_finite()) {
-            let message = format!("`guidance` is [{low}, {high}]; expected numbers of 0 or more, the smaller first");
+            let message =
+                format!("`guidance` is [{low}, {high}]; expected numbers of 0 or more, the smaller one first");
             p.add("guidance", message, "published: [5, 15] (v2) and [6.5, 6.5] (v1)");
         }
         if self.skip == 0 || !1000usize.is_multiple_of(self.skip) {
@@ -188,12 +189,12 @@ impl StageSpec for TrainControl {
     fn check_neighbours(&self, stages: &Neighbours<'_>, p: &mut Problems) {
         let model = &self.model;
         if stages.family(model).is_some_and(|family| !family.draws_latents()) {
-            let message = format!("`{model}` is no latent diffusion, and only such a model has a ControlNet");
-            p.add("model", message, "name a `train.mld`, `distill.lcm` or `distill.pcm` stage");
+            let message = format!("`{model}` is not a latent diffusion model; a ControlNet needs one");
+            p.add("model", message, "use a `train.mld`, `distill.lcm` or `distill.pcm` stage");
         }
         if stages.stage(model).is_some_and(|stage| stage.kind() == Self::KIND) {
-            let message = format!("`{model}` has a control part already");
-            p.add("model", message, "name the stage whose model it controls");
+            let message = format!("`{model}` already has a control part");
+            p.add("model", message, "use the stage of the model that the control part controls");
         }
         stages.same_vae(p, ("model", stages.vae_of_model(model)), &self.latents);
         stages.same_data(p, &self.latents, &self.text);

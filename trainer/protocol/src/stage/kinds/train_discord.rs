@@ -65,15 +65,11 @@ impl FlowPrediction {
             && ours != theirs
         {
             let message = format!(
-                "`init` is `{init}`, whose network gives the {}, but the one that is trained here gives the {}",
+                "`init` is `{init}`, whose network predicts the {}, but this stage trains one that predicts the {}",
                 theirs.name(),
                 ours.name()
             );
-            p.add(
-                "init",
-                message,
-                "what the one learned says nothing to the other; name a decoder of the same `prediction`",
-            );
+            p.add("init", message, "use a decoder with the same `prediction`");
         }
     }
 }
@@ -233,13 +229,13 @@ impl StageSpec for TrainDiscord {
         if parameters > limits::PARAMETERS {
             let message =
                 format!("its layers have up to {parameters} parameters; expected at most {}", limits::PARAMETERS);
-            p.add("network", message, "take fewer layers, or narrower ones");
+            p.add("network", message, "use fewer or narrower layers");
         }
         if width < 4 || !width.is_multiple_of(2) {
             p.add("network.width", format!("`network.width` is {width}; expected an even number of at least 4"), "");
         }
         if self.backbone == FlowBackbone::Dit && heads > 0 && !width.is_multiple_of(heads) {
-            let message = format!("`network.heads` is {heads}, which does not divide `network.width`, {width}");
+            let message = format!("`network.heads` is {heads}, which does not divide `network.width` ({width})");
             p.add("network.heads", message, "");
         }
         p.fraction("network.dropout", dropout, true);

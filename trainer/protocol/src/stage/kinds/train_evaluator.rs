@@ -148,8 +148,9 @@ impl StageSpec for TrainEvaluator {
         self.training.check(p);
         let batch = self.training.batch;
         if batch.slices > 0 && batch.global / batch.slices < 2 {
-            let message = format!("a slice of {} and {} slices has no two captions", batch.global, batch.slices);
-            p.add("batch.slices", message, "captions are told apart within a slice; take fewer slices");
+            let message =
+                format!("a batch of {} in {} slices has fewer than two captions per slice", batch.global, batch.slices);
+            p.add("batch.slices", message, "the loss compares captions within a slice; use fewer slices");
         }
     }
 
@@ -162,7 +163,7 @@ impl StageSpec for TrainEvaluator {
     }
 
     fn loss_changes(&self) -> Vec<LossChange> {
-        let what = "movements are trained; from here the loss is that of matching captions and motions";
+        let what = "the movement phase has ended; the loss now matches captions and motions";
         LossChange::behind(self.movement.until, self.training.steps, what, "movement.until").into_iter().collect()
     }
 }
@@ -171,11 +172,15 @@ impl MovementPhase {
     fn check(&self, p: &mut Problems, slices: usize) {
         p.fraction("movement.until", self.until, true);
         if self.until == 0.0 {
-            p.add("movement.until", "`movement.until` is 0; movements must be trained before they are matched", "");
+            p.add(
+                "movement.until",
+                "`movement.until` is 0; expected a number above 0, because the movement phase comes first",
+                "",
+            );
         }
         if self.window < 8 {
             let message = format!("`movement.window` is {}; expected at least 8 frames", self.window);
-            p.add("movement.window", message, "two movements of four frames, so that they have a difference");
+            p.add("movement.window", message, "a window needs two movements of four frames each");
         }
         if self.batch != 0 {
             Batch { global: self.batch, slices }.check_division(p, "movement.batch");

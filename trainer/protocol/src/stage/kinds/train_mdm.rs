@@ -49,7 +49,7 @@ impl MdmNetwork {
         }
         if self.heads > 0 && !self.width.is_multiple_of(self.heads) {
             let message =
-                format!("`network.heads` is {}, which does not divide `network.width`, {}", self.heads, self.width);
+                format!("`network.heads` is {}, which does not divide `network.width` ({})", self.heads, self.width);
             p.add("network.heads", message, "");
         }
         if !self.width.is_multiple_of(2) {

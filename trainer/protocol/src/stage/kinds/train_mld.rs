@@ -88,7 +88,7 @@ impl StageSpec for TrainMld {
         self.losses.check(p);
         p.fraction("decoded", self.decoded, false);
         if self.losses.any() && self.decoded == 0.0 {
-            p.add("decoded", "`decoded` is 0, so that `losses` never act", "take a share above 0");
+            p.add("decoded", "`decoded` is 0, so `losses` have no effect", "set it above 0");
         }
         self.training.check(p);
     }
@@ -102,10 +102,11 @@ impl StageSpec for TrainMld {
             && !encoder.survives_relu()
         {
             let message = format!(
-                "`text_relu` deletes every negative coordinate, and with `{}` half of the words are just one such coordinate",
+                "`text_relu` sets negative coordinates to 0, and half of the words of `{}` have a single, negative \
+                 coordinate",
                 encoder.name()
             );
-            p.add("text_relu", message, "leave it out, as MotionLCM v2 does, or embed with another encoder");
+            p.add("text_relu", message, "remove it, as MotionLCM v2 does, or embed with another encoder");
         }
     }
 

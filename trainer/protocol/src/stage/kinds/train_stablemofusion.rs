@@ -82,14 +82,16 @@ impl StableMoFusionNetwork {
         }
         for channels in self.multipliers.iter().map(|m| self.width.saturating_mul(*m)) {
             if !channels.is_multiple_of(PARTS) {
-                let message = format!("a level has {channels} channels, which {PARTS} heads and groups do not divide");
+                let message = format!(
+                    "a level has {channels} channels; expected a multiple of {PARTS}, the number of heads and groups"
+                );
                 p.add("network.width", message, "");
                 break;
             }
         }
         if self.text_heads > 0 && !self.text.is_multiple_of(self.text_heads) {
             let (heads, text) = (self.text_heads, self.text);
-            let message = format!("`network.text_heads` is {heads}, which does not divide `network.text`, {text}");
+            let message = format!("`network.text_heads` is {heads}, which does not divide `network.text` ({text})");
             p.add("network.text_heads", message, "");
         }
         if !self.time.is_multiple_of(2) {

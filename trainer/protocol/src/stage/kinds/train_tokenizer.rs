@@ -182,13 +182,13 @@ impl StageSpec for TrainTokenizer {
         let parameters = width.saturating_mul(width).saturating_mul(squares);
         if parameters > limits::PARAMETERS {
             let message =
-                format!("its convolutions have some {parameters} weights; expected at most {}", limits::PARAMETERS);
-            p.add("network", message, "take fewer blocks, or narrower ones");
+                format!("its convolutions have about {parameters} weights; expected at most {}", limits::PARAMETERS);
+            p.add("network", message, "use fewer or narrower blocks");
         }
         let reach = u32::try_from(depth).ok().and_then(|depth| growth.checked_pow(depth));
         if reach.is_none_or(|reach| reach > 10_000) {
             let message =
-                format!("dilations grow to `network.growth` to the power of `network.depth`, {growth}^{depth}");
+                format!("the largest dilation is `network.growth` to the power of `network.depth`, {growth}^{depth}");
             p.add("network.growth", message, "expected at most 10000 frames");
         }
         p.fraction("network.dropout", self.network.dropout, true);

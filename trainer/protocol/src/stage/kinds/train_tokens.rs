@@ -72,11 +72,11 @@ impl TokenNetwork {
         let parameters = self.width.saturating_mul(wide).saturating_mul(self.layers).saturating_mul(2);
         if parameters > limits::PARAMETERS {
             let message = format!("its layers have {parameters} parameters; expected at most {}", limits::PARAMETERS);
-            p.add("network", message, "take fewer layers, or narrower ones");
+            p.add("network", message, "use fewer or narrower layers");
         }
         if self.heads > 0 && !self.width.is_multiple_of(self.heads) {
             let (heads, width) = (self.heads, self.width);
-            let message = format!("`network.heads` is {heads}, which does not divide `network.width`, {width}");
+            let message = format!("`network.heads` is {heads}, which does not divide `network.width` ({width})");
             p.add("network.heads", message, "");
         }
         p.fraction("network.dropout", self.dropout, true);
@@ -169,18 +169,17 @@ impl StageSpec for TrainTokens {
         p.fraction("corruption", self.corruption, false);
         if self.generator == TokenGenerator::Masked && self.guidance_dropout > 0.5 {
             let message = format!("`guidance_dropout` is {}; expected at most 0.5", self.guidance_dropout);
-            p.add("guidance_dropout", message, "the network of the layers above the first has twice as much");
+            p.add("guidance_dropout", message, "the residual transformer uses twice this value");
         }
         p.fraction("guidance_dropout", self.guidance_dropout, false);
         let TokenNetwork { width, layers, feed_forward, word_blocks, .. } = self.network;
         if self.generator != TokenGenerator::Masked && width > 0 && !feed_forward.is_multiple_of(width) {
-            let message = format!(
-                "`network.feed_forward` is {feed_forward}, no multiple of `network.width`, {width}; expected one"
-            );
+            let message =
+                format!("`network.feed_forward` is {feed_forward}; expected a multiple of `network.width` ({width})");
             p.add("network.feed_forward", message, "published: four times the width");
         }
         if self.generator == TokenGenerator::Mmm && word_blocks > layers {
-            let message = format!("`network.word_blocks` is {word_blocks}, of `network.layers`, {layers}");
+            let message = format!("`network.word_blocks` is {word_blocks}, but `network.layers` is {layers}");
             p.add("network.word_blocks", message, "expected at most as many; published: 2 of 9");
         }
         self.training.check(p);
@@ -195,7 +194,7 @@ impl StageSpec for TrainTokens {
             p.add(
                 "tokenizer",
                 message,
-                "tokens of another codebook mean other motions; name the same tokenizer in both places",
+                "tokens have a meaning only with their own tokenizer; use the same tokenizer in both places",
             );
         }
         stages.same_data(p, &self.tokens, &self.text);
@@ -209,12 +208,12 @@ impl StageSpec for TrainTokens {
             (TokenGenerator::Autoregressive | TokenGenerator::Mmm, Some(many)) if many > 1 => {
                 let word = if self.generator == TokenGenerator::Mmm { "mmm" } else { "autoregressive" };
                 let message = format!("`generator` is `{word}`, but `{tokenizer}` has {many} codebooks; expected 1");
-                p.add("generator", message, "write `generator: masked`, or `quantizers: 1` at the tokenizer");
+                p.add("generator", message, "write `generator: masked`, or set `quantizers: 1` in the tokenizer");
             }
             (TokenGenerator::Masked, Some(2)) => {
                 let message =
                     format!("`generator` is `masked`, but `{tokenizer}` has 2 codebooks; expected 1, or at least 3");
-                p.add("generator", message, "the network of the layers above the first shares tables between them");
+                p.add("generator", message, "the residual transformer shares tables between its layers");
             }
             _ => {}
         }

@@ -148,9 +148,9 @@ impl StageSpec for TrainVae {
     fn loss_changes(&self) -> Vec<LossChange> {
         let steps = self.training.steps;
         let weighted = self.loss.joint > 0.0 || self.loss.feet > 0.0;
-        let terms = "the terms on joints and feet join the loss";
+        let terms = "the loss includes the terms on joints and feet";
         let terms = LossChange::behind(self.loss.joint_from, steps, terms, "loss.joint_from").filter(|_| weighted);
-        let clips = "training goes from short crops to whole clips, which are harder";
+        let clips = "training changes from short crops to whole clips, which have a higher loss";
         terms.into_iter().chain(LossChange::behind(self.windows.until, steps, clips, "windows.until")).collect()
     }
 
@@ -186,7 +186,7 @@ impl Windows {
             }
             if self.min > self.max {
                 let (min, max) = (self.min, self.max);
-                p.add("windows.max", format!("`windows.max` is {max}, below `windows.min`, {min}"), "");
+                p.add("windows.max", format!("`windows.max` is {max}, which is less than `windows.min` ({min})"), "");
             }
             if self.batch != 0 {
                 Batch { global: self.batch, slices }.check_division(p, "windows.batch");

@@ -34,13 +34,13 @@ pub(super) fn open(model: &Model, blobs: &dyn Blobs, device: &Device) -> Result<
     let text = text::open(&part(&Role::TEXT, ArtifactKind::TextEncoder)?, blobs, device)?;
     let meta = denoiser.meta();
     if meta.fits.get(&Role::TEXT) != model.parts.get(&Role::TEXT) {
-        return Err(StageError::Input("the denoiser was trained with another `text` than the model has".into()));
+        return Err(StageError::Input("the denoiser was not trained with the model's `text` part".into()));
     }
     let found = if meta.reads_tokens() { text.token_dim() } else { text.dim() };
     if meta.text_dim != found {
         let wanted = meta.text_dim;
         return Err(StageError::Input(format!(
-            "the denoiser reads {wanted} numbers a vector, the encoder gives {found}"
+            "the denoiser expects vectors of {wanted} numbers, but the text encoder returns {found}"
         )));
     }
     Ok(Box::new(FeatureDiffusion { denoiser, text }))

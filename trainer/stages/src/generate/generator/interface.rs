@@ -82,7 +82,7 @@ pub trait MotionGenerator: std::fmt::Debug {
     /// A denoising model's estimates of the clean motion in all steps of the sampler, with their timesteps, for a batch
     /// of one motion.
     fn predictions(&self, _: Batch<'_>, _: &Sampler) -> Result<Vec<(usize, Vec<f32>)>, StageError> {
-        Err(StageError::Input("the model draws without denoising, so that it has no steps to look at".into()))
+        Err(StageError::Input("the model generates motion without denoising; it has no steps to measure".into()))
     }
 
     /// Meta of the control part; without one a batch has no `control`.

@@ -47,22 +47,20 @@ pub(super) fn open(model: &Model, blobs: &dyn Blobs, device: &Device) -> Result<
     let meta = denoiser.meta();
     for role in [Role::VAE, Role::TEXT] {
         if meta.fits.get(&role) != model.parts.get(&role) {
-            return Err(StageError::Input(format!(
-                "the denoiser was trained with another `{role}` than the model has"
-            )));
+            return Err(StageError::Input(format!("the denoiser was not trained with the model's `{role}` part")));
         }
     }
     let (ours, theirs) = (meta.latent, vae.meta().latent);
     if ours != theirs {
         return Err(StageError::Input(format!(
-            "the denoiser's latent is {}x{}, the VAE's {}x{}",
+            "the denoiser's latent is {}x{}, but the VAE's is {}x{}",
             ours.tokens, ours.dim, theirs.tokens, theirs.dim
         )));
     }
     if meta.text_dim != text.dim() {
         let (wanted, found) = (meta.text_dim, text.dim());
         return Err(StageError::Input(format!(
-            "the denoiser reads {wanted} numbers a caption, the encoder gives {found}"
+            "the denoiser expects {wanted} numbers per caption, but the text encoder returns {found}"
         )));
     }
     let control = match model.parts.contains_key(&Role::CONTROL) {
@@ -75,9 +73,7 @@ pub(super) fn open(model: &Model, blobs: &dyn Blobs, device: &Device) -> Result<
     if let Some(control) = &control {
         let fits = |role: &Role| control.meta().fits.get(role) == model.parts.get(role);
         if control.meta().format != vae.meta().format || !fits(&Role::DENOISER) {
-            return Err(StageError::Input(
-                "the control part was trained for another denoiser than the model has".into(),
-            ));
+            return Err(StageError::Input("the control part was not trained for the model's denoiser".into()));
         }
     }
     let null = text.pooled(&[""])?;
@@ -126,7 +122,7 @@ impl MotionGenerator for LatentDiffusion {
         {
             if self.decoder.is_some() {
                 return Err(StageError::Input(
-                    "the model's motions are decoded by a flow, through which latents cannot be refined".into(),
+                    "the model decodes motions with a flow; latents cannot be refined through a flow".into(),
                 ));
             }
             refine(&self.vae, &mut z, batch.lengths, hints, options.refine);

@@ -44,16 +44,13 @@ pub fn open(manifest: &Manifest, blobs: &dyn Blobs, device: &Device) -> Result<B
     let Some((_, open)) = GENERATORS.iter().find(|(name, _)| *name == model.generator) else {
         let have: Vec<&str> = GENERATORS.iter().map(|(name, _)| *name).collect();
         let wanted = &model.generator;
-        return Err(StageError::Input(format!(
-            "generator `{wanted}` is not in this build, which has {}",
-            have.join(", ")
-        )));
+        return Err(StageError::Input(format!("this build has no generator `{wanted}`; it has {}", have.join(", "))));
     };
     let generator = open(&model, blobs, device)?;
     if generator.format() != model.format {
         let (found, said) = (generator.format().name(), model.format.name());
         return Err(StageError::Input(format!(
-            "the model's parts draw motions of `{found}`, its manifest says `{said}`"
+            "the model's parts generate motions in format `{found}`, but its manifest declares `{said}`"
         )));
     }
     Ok(generator)
@@ -77,16 +74,18 @@ pub fn motions(
     check_sampler(generator, sampler)?;
     let longest = generator.longest();
     if let Some(frames) = batch.lengths.iter().find(|frames| !(1..=longest).contains(*frames)) {
-        return Err(StageError::Input(format!("{frames} frames: the model draws motions of 1 to {longest}")));
+        return Err(StageError::Input(format!(
+            "a motion of {frames} frames was requested; the model generates 1 to {longest} frames"
+        )));
     }
     if let Some(control) = batch.control {
         let Some(meta) = generator.control() else {
-            return Err(StageError::Input("the model has no control part, and so cannot be told where to go".into()));
+            return Err(StageError::Input("the model has no control part, so it cannot follow a path".into()));
         };
         let joints = meta.mean.len() / 3;
         let fits = |(hint, frames): (&Hint, &usize)| (hint.frames(), hint.joints()) == (*frames, joints);
         if control.hints.len() != batch.lengths.len() || !control.hints.iter().zip(batch.lengths).all(fits) {
-            return Err(StageError::Fault("hints are not of the motions that are drawn".into()));
+            return Err(StageError::Fault("the hints do not match the requested motions".into()));
         }
     }
     let mut motions = generator.draw(batch, sampler, lap)?;
@@ -101,7 +100,9 @@ pub fn motions(
 fn finite<'v>(mut values: impl Iterator<Item = &'v f32>) -> Result<(), StageError> {
     match values.all(|v| v.is_finite()) {
         true => Ok(()),
-        false => Err(StageError::Input("the motion is not finite; the model has not been trained well".into())),
+        false => Err(StageError::Input(
+            "the motion has numbers that are not finite; the model is not trained well enough".into(),
+        )),
     }
 }
 
@@ -112,7 +113,7 @@ fn finite<'v>(mut values: impl Iterator<Item = &'v f32>) -> Result<(), StageErro
 pub fn infilling(generator: &dyn MotionGenerator) -> Result<&dyn Infilling, StageError> {
     generator.infilling().ok_or_else(|| {
         StageError::Input(
-            "the model draws whole motions; only masked token generators (MoMask, MMM) fill in a part of one".into(),
+            "the model cannot regenerate part of a motion; only masked token generators (MoMask, MMM) can".into(),
         )
     })
 }
@@ -133,7 +134,9 @@ pub fn edited(
     let model = infilling(generator)?;
     let (frames, longest) = (edit.kept.len() * model.unit(), generator.longest());
     if !(1..=longest).contains(&frames) {
-        return Err(StageError::Input(format!("{frames} frames: the model draws motions of 1 to {longest}")));
+        return Err(StageError::Input(format!(
+            "a motion of {frames} frames was requested; the model generates 1 to {longest} frames"
+        )));
     }
     let motion = model.fill_in(edit, text, seeds, sampler, lap);
     finite(motion.iter())?;

@@ -163,14 +163,14 @@ pub(super) fn open(model: &Model, blobs: &dyn Blobs, device: &Device) -> Result<
     for role in [Role::TOKENIZER, Role::TEXT] {
         if meta.fits.get(&role) != model.parts.get(&role) {
             return Err(StageError::Input(format!(
-                "the token generator was trained with another `{role}` than the model has"
+                "the token generator was not trained with the model's `{role}` part"
             )));
         }
     }
     let (ours, theirs) = ((meta.codes, meta.quantizers), (tokenizer.meta().codes, tokenizer.meta().quantizers));
     if ours != theirs {
         return Err(StageError::Input(format!(
-            "the generator draws ids of {} codebook(s) of {} codes, the tokenizer has {} of {}",
+            "the generator has {} codebook(s) of {} codes, but the tokenizer has {} of {}",
             ours.1, ours.0, theirs.1, theirs.0
         )));
     }
@@ -180,7 +180,7 @@ pub(super) fn open(model: &Model, blobs: &dyn Blobs, device: &Device) -> Result<
     if meta.text_dim != text.dim() {
         let (wanted, found) = (meta.text_dim, text.dim());
         return Err(StageError::Input(format!(
-            "the token generator reads {wanted} numbers a caption, the encoder gives {found}"
+            "the token generator expects {wanted} numbers per caption, but the text encoder returns {found}"
         )));
     }
     let decoder = match model.parts.contains_key(&Role::DECODER) {
@@ -228,7 +228,9 @@ fn network(
             let network = weights::load(fresh, blobs, manifest, what)?;
             Ok(Network::Mmm(Box::new(network), Box::new(codebook(tokenizer, device))))
         }
-        _ => Err(StageError::Input("the token generator's manifest says that it draws no tokens".into())),
+        _ => Err(StageError::Input(
+            "the manifest of the token generator names a model family that generates no tokens".into(),
+        )),
     }
 }
 

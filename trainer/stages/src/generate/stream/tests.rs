@@ -269,7 +269,7 @@ fn a_difference_fades() {
 fn an_overlap_must_leave_something_new() {
     let (_, generator, stream, _) = scripted(Joining::Control);
     let settings = Settings { overlap: Some(80), ..stream.settings.clone() };
-    assert!(MotionStream::new(&generator, settings).unwrap_err().to_string().contains("leaves nothing new"));
+    assert!(MotionStream::new(&generator, settings).unwrap_err().to_string().contains("have no new frames"));
     let settings = Settings { overlap: Some(50), ..stream.settings };
     let mut stream = MotionStream::new(&generator, settings).unwrap();
     stream.draw(&generator, &ask(Some(80))).unwrap();

@@ -69,7 +69,7 @@ impl Map for DataFeatures {
             let ShardMeta { first, files } = artifacts::meta(&manifest, "a shard of the recordings")?;
             if first != have {
                 return Err(StageError::Fault(format!(
-                    "a shard begins at file {first}, the one before it ended at {have}"
+                    "a shard begins at file {first}, but the previous shard ended at file {have}"
                 )));
             }
             have += files;
@@ -152,7 +152,7 @@ fn collect(
                 for mut clip in read.clips {
                     let (own, others) = rest
                         .split_at_checked(clip.frames * width)
-                        .ok_or_else(|| damaged(format!("`{}` has more frames than there are", clip.id)))?;
+                        .ok_or_else(|| damaged(format!("`{}` has more frames than the file of features", clip.id)))?;
                     clip.features = own.to_vec();
                     rest = others;
                     made.push(clip);
@@ -180,7 +180,7 @@ impl std::fmt::Display for Broken<'_> {
         if self.broken.len() > SHOWN {
             write!(f, "\n  ... and {} more", self.broken.len() - SHOWN)?;
         }
-        write!(f, "\nmend them, or set `skip_broken: true` to leave them out")
+        write!(f, "\nrepair them, or set `skip_broken: true` to leave them out")
     }
 }
 

@@ -27,6 +27,6 @@ fn log_report(cx: &mut dyn AttemptContext, report: &OpenReport) {
         cx.log(&format!("skipped {skip}, {}: {}", skip.split, skip.reason.heading()));
     }
     if !report.shared.is_empty() {
-        cx.log(&format!("warning: in more than one split: {}", report.shared.join(", ")));
+        cx.log(&format!("warning: clips in more than one split: {}", report.shared.join(", ")));
     }
 }

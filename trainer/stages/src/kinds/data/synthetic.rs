@@ -11,7 +11,7 @@ use crate::kinds::shape::Plain;
 impl Plain for DataSynthetic {
     fn run(&self, cx: &mut dyn AttemptContext) -> Result<Outcome, StageError> {
         if self.clips == 0 {
-            return Err(StageError::Input("`clips` is 0, expected at least 1".into()));
+            return Err(StageError::Input("`clips` is 0; expected at least 1".into()));
         }
         let (seed, clips) = (cx.task().seed, self.clips as u64);
         let world = RefCell::new(&mut *cx);

@@ -23,7 +23,7 @@ use crate::parts::warm_start::WarmStart;
 use crate::parts::weights;
 use crate::train::data::flow::{Encoder, FlowData, field_group, field_result};
 use crate::train::network::dropout_seed;
-use crate::train::{Average, GroupPlan, Losses, Objective, SliceResult, TrainState, Trained, train};
+use crate::train::{Average, GroupPlan, Losses, Objective, SliceResult, TrainState, train};
 
 struct Student {
     settings: DistillDiscord,
@@ -86,7 +86,7 @@ impl Gang for DistillDiscord {
         let blobs = cx.blobs();
         let teacher = FlowDecoder::read(&*blobs, &manifest, (&role, digest), &cx.device())?;
         let Some(solver) = teacher.meta().solver.followed() else {
-            return Err(StageError::Input("`teacher` is a student itself; name a `train.discord` stage".into()));
+            return Err(StageError::Input("`teacher` is a student; expected a `train.discord` stage".into()));
         };
         let data = FlowData::read(cx, encoder, (self.window, self.windows_of), &self.training)?;
         let meta = FlowMeta { solver: FlowPath::Jumps, steps: self.solver_steps, ..teacher.meta().clone() };
@@ -96,7 +96,7 @@ impl Gang for DistillDiscord {
         student.take(Values::Host(&field.params()));
         let mut start = WarmStart::find(cx, ArtifactKind::FlowDecoder)?;
         let student = student.begun_with(&mut start)?;
-        start.finish(cx, &to_meta(&meta))?;
+        start.finish(cx, &meta)?;
         let mut objective = Student {
             settings: self.clone(),
             data,
@@ -107,13 +107,7 @@ impl Gang for DistillDiscord {
             dropout: meta.network.dropout,
             dropout_seed: dropout_seed(cx),
         };
-        match train(&mut objective, &self.training, cx)? {
-            Trained::Yielded { at } => Ok(Outcome::Yielded { at }),
-            Trained::Finished { state, metrics } => {
-                let trained = (&state.groups[0].entries[..], state.params(0));
-                let output = weights::publish(cx, ArtifactKind::FlowDecoder, to_meta(&meta), trained)?;
-                Ok(Outcome::Finished { output, metrics })
-            }
-        }
+        train(&mut objective, &self.training, cx)?
+            .publish(|state| weights::publish(cx, ArtifactKind::FlowDecoder, to_meta(&meta), state.online(0)))
     }
 }

@@ -10,7 +10,7 @@ use crate::context::{GangContext, Outcome, StageError};
 use crate::kinds::shape::Gang;
 use crate::train::consistency::Distiller;
 use crate::train::network::slice_result;
-use crate::train::{GroupPlan, Losses, Objective, SliceResult, TrainState, Trained, train};
+use crate::train::{GroupPlan, Losses, Objective, SliceResult, TrainState, train};
 
 struct Lcm(Distiller);
 
@@ -43,15 +43,10 @@ impl Objective for Lcm {
 impl Gang for DistillLcm {
     fn run(&self, cx: &mut dyn GangContext) -> Result<Outcome, StageError> {
         let mut objective = Lcm(Distiller::read(cx, &self.distillation)?);
-        match train(&mut objective, &self.distillation.training, cx)? {
-            Trained::Yielded { at } => Ok(Outcome::Yielded { at }),
-            Trained::Finished { state, metrics } => {
-                // The result is the online network, as upstream; its average was only the target.
-                let trained = (&state.groups[0].entries[..], state.params(0));
-                let family = self.family().expect("a distillation gives a student");
-                let output = objective.0.publish(cx, family, trained)?;
-                Ok(Outcome::Finished { output, metrics })
-            }
-        }
+        train(&mut objective, &self.distillation.training, cx)?.publish(|state| {
+            // The result is the online network, as upstream; its average was only the target.
+            let family = self.family().expect("a distillation gives a student");
+            objective.0.publish(cx, family, state.online(0))
+        })
     }
 }

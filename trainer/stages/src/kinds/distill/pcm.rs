@@ -22,7 +22,7 @@ use crate::context::{GangContext, Outcome, StageError};
 use crate::kinds::shape::Gang;
 use crate::train::consistency::{Distiller, SolverStep};
 use crate::train::network::{group, slice_gradient, slice_result};
-use crate::train::{GroupPlan, Losses, Objective, SliceResult, TrainState, Trained, Turns, train};
+use crate::train::{GroupPlan, Losses, Objective, SliceResult, TrainState, Turns, train};
 use burn::module::Module;
 
 struct Pcm {
@@ -143,14 +143,9 @@ impl Gang for DistillPcm {
             Discriminator::new(network.layers, network.width, &mut init)
         });
         let mut objective = Pcm { distiller, settings: self.clone(), phases, heads };
-        match train(&mut objective, &self.distillation.training, cx)? {
-            Trained::Yielded { at } => Ok(Outcome::Yielded { at }),
-            Trained::Finished { state, metrics } => {
-                let trained = (&state.groups[0].entries[..], state.params(0));
-                let family = self.family().expect("a distillation gives a student");
-                let output = objective.distiller.publish(cx, family, trained)?;
-                Ok(Outcome::Finished { output, metrics })
-            }
-        }
+        train(&mut objective, &self.distillation.training, cx)?.publish(|state| {
+            let family = self.family().expect("a distillation gives a student");
+            objective.distiller.publish(cx, family, state.online(0))
+        })
     }
 }

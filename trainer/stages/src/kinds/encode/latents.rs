@@ -31,7 +31,7 @@ impl Map for EncodeLatents {
         let (vae_digest, vae) = artifacts::input(cx, "vae", ArtifactKind::Vae)?;
         let (_, dataset) = artifacts::input(cx, "dataset", ArtifactKind::Dataset)?;
         if self.crops == 0 {
-            return Err(StageError::Input("`crops` is 0, expected at least 1".into()));
+            return Err(StageError::Input("`crops` is 0; expected at least 1".into()));
         }
         let dataset = artifacts::dataset(&*blobs, &dataset)?;
         let vae = Autoencoder::read(&*blobs, &vae, &cx.device())?;
@@ -107,7 +107,7 @@ impl Map for EncodeLatents {
             let have = whole.as_ref().map_or(0, |w| w.splits.len());
             if first != have {
                 return Err(StageError::Fault(format!(
-                    "a shard begins at entry {first}, the one before it ended at {have}"
+                    "a shard begins at entry {first}, but the previous shard ended at entry {have}"
                 )));
             }
             let mut part = Tensors::from_bytes(artifacts::mapped(&*blobs, &manifest, LATENTS_FILE)?, LATENTS_FILE)?;
@@ -123,10 +123,10 @@ impl Map for EncodeLatents {
                 }
             }
         }
-        let meta = whole.ok_or_else(|| StageError::Fault("latents without shards".into()))?;
+        let meta = whole.ok_or_else(|| StageError::Fault("no shard of the latents was given".into()))?;
         if !mu.iter().chain(&sigma).all(|v| v.is_finite()) {
             return Err(StageError::Input(
-                "the VAE gives latents that are not finite; it has not been trained well".into(),
+                "the VAE's latents are not finite; the VAE is not trained well enough".into(),
             ));
         }
         let size = meta.latent.tokens * meta.latent.dim;

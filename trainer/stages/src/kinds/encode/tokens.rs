@@ -30,8 +30,7 @@ impl Map for EncodeTokens {
         let blobs = cx.blobs();
         let (digest, manifest) = artifacts::input(cx, "tokenizer", ArtifactKind::Tokenizer)?;
         let tokenizer = TrainedTokenizer::read(&*blobs, &manifest, &cx.device())?;
-        let (_, dataset) = artifacts::input(cx, "dataset", ArtifactKind::Dataset)?;
-        let dataset = artifacts::dataset(&*blobs, &dataset)?;
+        let dataset = artifacts::input_dataset(cx)?;
         tokenizer.check_format(dataset.format)?;
         let (unit, width) = (tokenizer.unit(), dataset.mean.len());
         let range = shard_range(dataset.entries.len(), index, of);
@@ -80,7 +79,7 @@ impl Map for EncodeTokens {
             let have = whole.as_ref().map_or(0, |whole| whole.splits.len());
             if first != have {
                 return Err(StageError::Fault(format!(
-                    "a shard begins at entry {first}, the one before it ended at {have}"
+                    "a shard begins at entry {first}, but the previous shard ended at entry {have}"
                 )));
             }
             let mut part = Tensors::from_bytes(artifacts::mapped(&*blobs, &manifest, TOKENS_FILE)?, TOKENS_FILE)?;
@@ -94,7 +93,7 @@ impl Map for EncodeTokens {
                 }
             }
         }
-        let meta = whole.ok_or_else(|| StageError::Fault("tokens without shards".into()))?;
+        let meta = whole.ok_or_else(|| StageError::Fault("no shard of the tokens was given".into()))?;
         let used: BTreeSet<i64> = ids.iter().step_by(meta.quantizers).copied().collect();
         let metrics = BTreeMap::from([
             ("entries".to_owned(), meta.splits.len() as f64),

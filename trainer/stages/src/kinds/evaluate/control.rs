@@ -184,7 +184,7 @@ impl Map for EvaluateControl {
         let plan = Plan::read(cx, self)?;
         let generator = plan.of.open(cx, &self.sampler)?;
         if generator.control().is_none() {
-            return Err(StageError::Input("`model` has no control part; name a `train.control` stage".into()));
+            return Err(StageError::Input("`model` has no control part; expected a `train.control` stage".into()));
         }
         let maker = Maker { generator: &*generator, texts: Texts::new(&*generator) };
         let units: Vec<Unit> = plan.units().enumerate().filter(|(i, _)| i % of == index).map(|(_, u)| u).collect();
@@ -313,7 +313,11 @@ fn gather(cx: &dyn AttemptContext, plan: &Plan<'_>, shards: &[Digest]) -> Result
     }
     let (found, expected): (BTreeSet<Unit>, BTreeSet<Unit>) = (parts.keys().copied().collect(), plan.units().collect());
     if found != expected {
-        return Err(StageError::Fault(format!("{} blocks of motions, expected {}", found.len(), expected.len())));
+        return Err(StageError::Fault(format!(
+            "the shards have {} blocks of motions; expected {}",
+            found.len(),
+            expected.len()
+        )));
     }
     let empty = Gathered {
         made: vec![Vec::new(); ways],

@@ -94,7 +94,10 @@ impl<'a> Plan<'a> {
             return Err(no_entries(settings.split));
         }
         if entries.len() * settings.samples < 2 || entries.len() * latents.meta.crops < 2 {
-            return refuse(format!("{} entries of the split are too few to compare with", entries.len()));
+            return refuse(format!(
+                "the split has {} entries; a comparison needs at least two latents and two samples",
+                entries.len()
+            ));
         }
         if settings.repeats == 0 || settings.components == 0 {
             return refuse("`repeats` and `components` must be at least 1".into());
@@ -102,7 +105,7 @@ impl<'a> Plan<'a> {
         if let Some(c) = latents.meta.captions.iter().flatten().find(|c| **c >= captions.len()) {
             let have = captions.len();
             return refuse(format!(
-                "`latents` speaks of caption {c}, `dataset` has {have}; they are of different clips"
+                "`latents` refers to caption {c}, but `dataset` has {have} captions; use latents of this dataset"
             ));
         }
         let matched = cx.task().inputs.contains_key("teacher");
@@ -110,7 +113,7 @@ impl<'a> Plan<'a> {
             let (digest, manifest) = artifacts::input(cx, "teacher", ArtifactKind::Model)?;
             let teacher = generator::open(&manifest, &*blobs, &cx.device())?;
             if teacher.family().is_student() {
-                return refuse("`teacher` is a student itself; expected the output of a train.mld stage".into());
+                return refuse("`teacher` is a student; expected a `train.mld` stage".into());
             }
             fits("teacher", &*teacher, &latents)?;
             // A teacher that is compared with itself is not sampled twice.
@@ -189,7 +192,7 @@ impl<'a> Plan<'a> {
 /// The latent generator of a model, or an error naming the input `field`.
 fn latents_of<'g>(field: &str, generator: &'g dyn MotionGenerator) -> Result<&'g dyn LatentGenerator, StageError> {
     generator.latents().ok_or_else(|| {
-        let text = format!("`{field}` draws motion from no latents, which is what this measures; use `evaluate.t2m`");
+        let text = format!("`{field}` generates no latents, but this stage measures latents; use `evaluate.t2m`");
         StageError::Input(text)
     })
 }
@@ -200,10 +203,13 @@ fn fits(field: &str, generator: &dyn MotionGenerator, latents: &Latents) -> Resu
     let model = latents_of(field, generator)?;
     let (a, b) = (model.shape(), latents.meta.latent);
     if a != b {
-        return refuse(format!("its latent is {}x{}, that of `latents` {}x{}", a.tokens, a.dim, b.tokens, b.dim));
+        return refuse(format!(
+            "its latent is {}x{}, but that of `latents` is {}x{}",
+            a.tokens, a.dim, b.tokens, b.dim
+        ));
     }
     if model.vae() != latents.meta.vae {
-        return refuse("it was trained on latents of another VAE than `latents`".into());
+        return refuse("its VAE is not the VAE of `latents`".into());
     }
     Ok(())
 }
@@ -266,10 +272,14 @@ impl Map for EvaluateLatentFid {
         }
         let expected: BTreeSet<Unit> = plan.units().into_iter().collect();
         if !blocks.keys().eq(&expected) {
-            return Err(StageError::Fault(format!("{} blocks of samples, expected {}", blocks.len(), expected.len())));
+            return Err(StageError::Fault(format!(
+                "the shards have {} blocks of samples; expected {}",
+                blocks.len(),
+                expected.len()
+            )));
         }
         if !blocks.values().flatten().all(|v| v.is_finite()) {
-            return Err(StageError::Input("samples are not finite; the denoiser has not been trained well".into()));
+            return Err(StageError::Input("samples are not finite; the denoiser is not trained well enough".into()));
         }
         let of = |maker: Maker, repeat: usize| -> Vec<f32> {
             let mine = blocks.iter().filter(|(u, _)| u.maker == maker && u.repeat == repeat);

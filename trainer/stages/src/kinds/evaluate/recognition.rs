@@ -116,14 +116,16 @@ impl Recognition<'_> {
                 labels.push(activity);
             }
         }
-        Classifier::fit(&motions, &labels, train.len())
-            .ok_or_else(|| StageError::Input("the clips are too few or too alike to learn activities from".into()))
+        Classifier::fit(&motions, &labels, train.len()).ok_or_else(|| {
+            StageError::Input("the training clips are too few or too similar to learn the activities from".into())
+        })
     }
 
     fn unknown(&self, activity: usize, split: Split) -> StageError {
         let Activity { name, words, .. } = &self.0.activities[activity];
         StageError::Input(format!(
-            "no clip of the split `{}` shows `{name}`: none whose captions all have one of \"{}\" and no word of an activity before it",
+            "no clip of the split `{}` shows `{name}`; in such a clip, each caption has one of \"{}\", and no word of \
+             an earlier activity",
             word(&split),
             words.join("\", \"")
         ))
@@ -148,7 +150,7 @@ impl Plain for EvaluateRecognition {
         let looked_at = by_activity(&dataset, &vocabulary, self.split);
         let present: Vec<usize> = (0..looked_at.len()).filter(|activity| !looked_at[*activity].is_empty()).collect();
         for (activity, _) in looked_at.iter().enumerate().filter(|(_, entries)| entries.is_empty()) {
-            cx.log(&format!("{}; it is not asked for", Recognition(self).unknown(activity, self.split)));
+            cx.log(&format!("{}; this activity is left out", Recognition(self).unknown(activity, self.split)));
         }
         if present.is_empty() {
             return Err(no_entries(self.split));

@@ -118,9 +118,7 @@ fn usage(codes: &[Vec<u64>]) -> Vec<(String, f64)> {
 
 impl Map for EvaluateReconstruction {
     fn shard(&self, cx: &mut dyn AttemptContext, index: usize, of: usize) -> Result<Outcome, StageError> {
-        let blobs = cx.blobs();
-        let (_, dataset) = artifacts::input(cx, "dataset", ArtifactKind::Dataset)?;
-        let dataset = artifacts::dataset(&*blobs, &dataset)?;
+        let dataset = artifacts::input_dataset(cx)?;
         let measured = Reconstructor::read(cx, self.decoder_steps)?;
         measured.check_format(dataset.format)?;
         let entries = dataset.entries_of(self.split);
@@ -132,7 +130,7 @@ impl Map for EvaluateReconstruction {
             evaluator.check(&dataset, &entries)?;
             if entries.len() < 2 {
                 return Err(StageError::Input(
-                    "FID needs at least 2 clips, the split has 1; leave `evaluator` out".into(),
+                    "FID needs at least 2 clips, but the split has 1; leave `evaluator` out".into(),
                 ));
             }
         }
@@ -201,7 +199,7 @@ impl Map for EvaluateReconstruction {
             }
         }
         let Rows { format, rows, codes } =
-            whole.ok_or_else(|| StageError::Fault("an evaluation without shards".into()))?;
+            whole.ok_or_else(|| StageError::Fault("no shard of the evaluation was given".into()))?;
         let skeleton = Skeleton::of(format);
         let column = |of: fn(&Row) -> ClipErrors| rows.iter().map(of).collect::<Vec<_>>();
         let mut metrics = summary(&column(|r| r.sample), skeleton, "");
@@ -222,14 +220,15 @@ impl Map for EvaluateReconstruction {
             meta["words"] = to_meta(&evaluator.meta().words);
             if rows.len() < FEW * width {
                 cx.log(&format!(
-                    "FID is taken of {} clips in {width} dimensions; it compares only with FIDs of as many in the same evaluator",
+                    "FID uses {} clips in {width} dimensions; compare it only with FIDs of as many clips in the same \
+                     evaluator",
                     rows.len()
                 ));
             }
         }
         if metrics.values().any(|v| !v.is_finite()) {
             return Err(StageError::Input(
-                "the reconstructions are not finite; what made them has not been trained well".into(),
+                "the reconstructions are not finite; their model is not trained well enough".into(),
             ));
         }
         meta["metrics"] = json!(metrics);

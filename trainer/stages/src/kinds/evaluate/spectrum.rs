@@ -70,7 +70,7 @@ impl Plain for EvaluateSpectrum {
             let motions: Vec<Vec<f64>> = predicted.iter().map(|(_, motion)| normalised(motion)).collect();
             timesteps = predicted.iter().map(|(t, _)| *t).collect();
             let Some(end) = motions.last() else {
-                return Err(StageError::Fault("a sampler without steps".into()));
+                return Err(StageError::Fault("the sampler has no steps".into()));
             };
             add(&mut last, &bands.energy(end, width));
             steps.resize(motions.len(), Step::default());
@@ -90,7 +90,7 @@ impl Plain for EvaluateSpectrum {
             }
         }
         if let Some((name, value)) = metrics.iter().find(|(_, value)| !value.is_finite()) {
-            return Err(StageError::Input(format!("`{name}` is {value}: the model has not been trained well")));
+            return Err(StageError::Input(format!("`{name}` is {value}: the model is not trained well enough")));
         }
         let count = entries.len() as f64;
         let details = json!({

@@ -139,14 +139,14 @@ impl Map for EvaluateT2m {
         few.iter().for_each(|few| cx.log(few));
         if plan.split != self.split {
             cx.log(&format!(
-                "the split `{}` is too small for pools of {}: measured on all {entries} entries",
+                "the split `{}` is too small for pools of {}; all {entries} entries are measured",
                 word(&self.split),
                 self.largest_pool()
             ));
         }
         if samples < entries {
             cx.log(&format!(
-                "{} of {entries} entries fill no pool of {pool}; each repeat leaves out others",
+                "{} of {entries} entries do not fill a pool of {pool}; each repeat leaves out different ones",
                 entries - samples
             ));
         }
@@ -191,8 +191,8 @@ impl Map for EvaluateT2m {
 /// A warning if FID is unreliable with so few motions.
 fn few(samples: usize, width: usize) -> Option<String> {
     let text = format!(
-        "FID is taken of {samples} motions in {width} dimensions; it is then larger than of many, and compares only with FIDs of as many motions in \
-         the same evaluator"
+        "FID is taken of {samples} motions in {width} dimensions; it is then larger than of many, and compares only \
+         with FIDs of as many motions in the same evaluator"
     );
     (samples < FEW * width).then_some(text)
 }

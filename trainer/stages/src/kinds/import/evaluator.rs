@@ -50,21 +50,22 @@ fn import(settings: &ImportEvaluator, cx: &mut dyn AttemptContext, given: &Given
     let expected = skeleton.layout().contacts.start;
     if config.features != expected {
         return Err(refuse(format!(
-            "its movements are made of {} features, those of {:?} of {expected}; set `format` to what it was trained on",
+            "its movements have {} features, but the format {:?} has {expected}; set `format` to the format that it \
+             was trained on",
             config.features, settings.format
         )));
     }
     if (config.word, config.classes) != (WORD_WIDTH, CLASSES) {
         let (word, classes) = (config.word, config.classes);
         return Err(refuse(format!(
-            "it reads words of width {word} in {classes} classes, expected {WORD_WIDTH} in {CLASSES}"
+            "it expects word vectors of width {word} and {classes} word classes; expected {WORD_WIDTH} and {CLASSES}"
         )));
     }
     check_parameters(&config, &bytes).map_err(refuse)?;
     let (mean, std) = (statistic(folder, "mean.npy", skeleton)?, statistic(folder, "std.npy", skeleton)?);
     if let Some(i) = std.iter().position(|s| !(*s > 0.0 && s.is_finite())) {
         return Err(StageError::Input(format!(
-            "{}: std.npy: value {i} is {}, expected above 0",
+            "{}: std.npy: value {i} is {}; expected a number above 0",
             folder.display(),
             std[i]
         )));
@@ -78,7 +79,10 @@ fn import(settings: &ImportEvaluator, cx: &mut dyn AttemptContext, given: &Given
     }
     let words = Words::open(given.get("words"))?;
     if words == Words::Hashed {
-        cx.log("no `words` folder: captions are read through the built-in word vectors; the published evaluators need the published ones");
+        cx.log(
+            "no `words` folder: captions use the built-in word vectors; published evaluators need the published \
+             vectors",
+        );
     }
     let meta =
         EvaluatorMeta { format: settings.format, config, mean, std, words: words.meta(), origin: "imported".into() };
@@ -104,8 +108,8 @@ fn weights(folder: &DataPath) -> Result<(DataPath, Vec<u8>), StageError> {
         }
     }
     Err(StageError::Input(format!(
-        "{}: no `finest.tar` or `finest.safetensors` here or in `text_mot_match/model`; `path` is the folder of one dataset in the \
-         published layout, such as `t2m/t2m`",
+        "{}: no `finest.tar` or `finest.safetensors` here or in `text_mot_match/model`; set `path` to the folder of \
+         one dataset in the published layout, such as `t2m/t2m`",
         folder.display()
     )))
 }
@@ -123,12 +127,12 @@ fn unpickle(file: &DataPath) -> Result<Vec<u8>, String> {
         tensors.extend(reader.into_tensors().into_iter().map(|(name, tensor)| (format!("{part}.{name}"), tensor)));
     }
     if tensors.len() > MAX_TENSORS {
-        return Err(format!("{} tensors; expected at most {MAX_TENSORS}", tensors.len()));
+        return Err(format!("the file has {} tensors; expected at most {MAX_TENSORS}", tensors.len()));
     }
     // A tensor may repeat one number, and several may share one storage.
     let declared = tensors.iter().fold(0_u64, |sum, (_, tensor)| sum.saturating_add(tensor.byte_len() as u64));
     if declared > length {
-        return Err(format!("its tensors take {declared} bytes, the file has {length}"));
+        return Err(format!("its tensors declare {declared} bytes, but the file has {length}"));
     }
     let mut all = Tensors::default();
     for (name, tensor) in tensors {
@@ -136,7 +140,7 @@ fn unpickle(file: &DataPath) -> Result<Vec<u8>, String> {
         let values: Vec<f32> = match tensor.dtype() {
             DType::F32 => bytes.as_chunks::<4>().0.iter().map(|b| f32::from_le_bytes(*b)).collect(),
             DType::F64 => bytes.as_chunks::<8>().0.iter().map(|b| f64::from_le_bytes(*b) as f32).collect(),
-            other => return Err(format!("`{}` is {other:?}, expected F32", excerpt(&name))),
+            other => return Err(format!("`{}` is {other:?}; expected F32", excerpt(&name))),
         };
         all = all.with(&name, tensor.shape().to_vec(), values);
     }
@@ -147,16 +151,16 @@ fn unpickle(file: &DataPath) -> Result<Vec<u8>, String> {
 fn sizes(bytes: &[u8]) -> Result<EvaluatorConfig, String> {
     let header = bytes.first_chunk::<8>().map_or(0, |length| u64::from_le_bytes(*length));
     if header > MAX_HEADER {
-        return Err(format!("a header of {header} bytes; expected at most {MAX_HEADER}"));
+        return Err(format!("the header has {header} bytes; expected at most {MAX_HEADER}"));
     }
     let file = SafeTensors::deserialize(bytes).map_err(|e| format!("no safetensors: {}", excerpt(&e.to_string())))?;
     if file.len() > MAX_TENSORS {
-        return Err(format!("{} tensors; expected at most {MAX_TENSORS}", file.len()));
+        return Err(format!("the file has {} tensors; expected at most {MAX_TENSORS}", file.len()));
     }
     let shapes: HashMap<String, Vec<usize>> =
         file.iter().map(|(name, view)| (name.to_owned(), view.shape().to_vec())).collect();
     if let Some((name, shape)) = shapes.iter().find(|(_, shape)| shape.contains(&0)) {
-        return Err(format!("`{}` has shape {shape:?}, which holds nothing", excerpt(name)));
+        return Err(format!("`{}` has shape {shape:?}, which has no elements", excerpt(name)));
     }
     let dim = |name: &str, axis: usize| {
         let found = shapes.get(name).and_then(|shape| shape.get(axis)).copied();
@@ -192,7 +196,7 @@ fn check_parameters(config: &EvaluatorConfig, bytes: &[u8]) -> Result<(), String
         + linear(wide(config.movement), wide(config.movement));
     let held = wide(bytes.len() / 4);
     if described > held {
-        return Err(format!("its shapes describe a network of {described} parameters, but it holds at most {held}"));
+        return Err(format!("its shapes need a network of {described} parameters, but the file holds at most {held}"));
     }
     Ok(())
 }
@@ -211,7 +215,8 @@ fn statistic(folder: &DataPath, name: &str, skeleton: &Skeleton) -> Result<Vec<f
         .collect();
     let [file] = &found[..] else {
         return Err(missing(format!(
-            "{} files `Comp_*/meta/{name}`, expected one: the statistics that the evaluator normalises motions with",
+            "found {} files `Comp_*/meta/{name}`; expected one, with the statistics that the evaluator normalises \
+             motions with",
             found.len()
         )));
     };
@@ -290,7 +295,7 @@ mod tests {
                 *shape = vec![2, 0, 1 << 40];
             }
         });
-        assert!(sizes(&empty).unwrap_err().contains("which holds nothing"));
+        assert!(sizes(&empty).unwrap_err().contains("which has no elements"));
         // The initial states are one row; the matrices after them are its square.
         let wide = reshaped(&|name, shape| {
             if name == "motion_encoder.hidden" {
@@ -300,10 +305,10 @@ mod tests {
         let config = sizes(&wide).unwrap();
         assert_eq!(config.motion_hidden, 1 << 20);
         let said = check_parameters(&config, &wide).unwrap_err();
-        assert!(said.contains("describe a network of"), "{said}");
+        assert!(said.contains("need a network of"), "{said}");
         let mut long = small();
         long[..8].copy_from_slice(&(90_u64 << 20).to_le_bytes());
-        assert!(sizes(&long).unwrap_err().contains("a header of 94371840 bytes"));
+        assert!(sizes(&long).unwrap_err().contains("the header has 94371840 bytes"));
     }
 
     #[test]

@@ -68,7 +68,7 @@ fn import(settings: &ImportModel, cx: &mut dyn AttemptContext, given: &Given) ->
         ImportedPart::Discord => import.discord(cx)?,
     };
     if let Some(left_out) = file.left_out(&import.read) {
-        cx.log(&format!("{}: not read, by the beginning of the names: {left_out}", settings.path));
+        cx.log(&format!("{}: tensors that were not read, by prefix: {left_out}", settings.path));
     }
     let metrics = BTreeMap::from([("parameters".to_owned(), import.parameters as f64)]);
     Ok(Outcome::Finished { output, metrics })
@@ -125,14 +125,14 @@ fn departing(found: bool, rule: bool) -> Option<bool> {
 fn statistic(folder: &DataPath, names: [&str; 2], len: usize) -> Result<Vec<f32>, StageError> {
     let refuse = |what: String| StageError::Input(format!("{}: {what}", folder.display()));
     let file = names.iter().map(|name| folder.join(name)).find(DataPath::has_entry);
-    let file = file.ok_or_else(|| refuse(format!("no `{}` in it", names.join("` or `"))))?;
+    let file = file.ok_or_else(|| refuse(format!("the folder has no `{}`", names.join("` or `"))))?;
     let array = npy::read_any_float(&file).map_err(|e| StageError::Input(e.to_string()))?;
     let refuse = |what: String| StageError::Input(format!("{}: {what}", file.display()));
     if array.data.len() != len {
-        return Err(refuse(format!("shape {:?}, expected {len} numbers", array.shape)));
+        return Err(refuse(format!("has shape {:?}; expected {len} numbers", array.shape)));
     }
     if let Some(i) = array.data.iter().position(|v| !v.is_finite()) {
-        return Err(refuse(format!("value {i} is {}, expected a number", array.data[i])));
+        return Err(refuse(format!("value {i} is {}; expected a finite number", array.data[i])));
     }
     Ok(array.data)
 }
@@ -142,7 +142,7 @@ fn statistics(folder: &DataPath, names: [[&str; 2]; 2], len: usize) -> Result<(V
     let (mean, std) = (statistic(folder, names[0], len)?, statistic(folder, names[1], len)?);
     if let Some(i) = std.iter().position(|s| *s <= 0.0) {
         return Err(StageError::Input(format!(
-            "{}: {}: value {i} is {}, expected above 0",
+            "{}: {}: value {i} is {}; expected a number above 0",
             folder.display(),
             names[1][0],
             std[i]
@@ -192,7 +192,8 @@ impl Import<'_> {
         let expected = Skeleton::of(format).features;
         if features != expected {
             return Err(found.refuse(format!(
-                "its motions have {features} features, those of `{}` {expected}; set `format` to what it was trained on",
+                "its motions have {features} features, but the format `{}` has {expected}; set `format` to the format \
+                 that it was trained on",
                 word(&format)
             )));
         }
@@ -209,7 +210,8 @@ impl Import<'_> {
         let meta: EmbeddingsMeta = artifacts::meta(&manifest, "the caption embeddings")?;
         if meta.dim != dim {
             return Err(found.refuse(format!(
-                "it reads {dim} numbers a caption, `text` gives {}; embed with the encoder that it was trained with",
+                "it expects {dim} numbers per caption, but `text` has {}; embed with the encoder that it was trained \
+                 with",
                 meta.dim
             )));
         }
@@ -234,7 +236,8 @@ impl Import<'_> {
         let other = |why: &str| {
             let place = found.prefix();
             found.refuse(format!(
-                "the {what} in it, `{place}`, is not that of `{field}`{why}; import that from this file too, or leave out what is not used"
+                "its {what}, `{place}`, differs from that of `{field}`{why}; import the {what} from this file too, or \
+                 leave it out if it is not used"
             ))
         };
         let taken = found.take(entries, &str::to_owned).map_err(|error| other(&format!(" ({error})")))?;
@@ -242,7 +245,7 @@ impl Import<'_> {
         let corrupt = |e| StageError::Context(ContextError::Corrupt(format!("the {what} of `{field}`: {e}")));
         let ours = from_bytes(entries, &bytes, "").map_err(corrupt)?;
         if ours.iter().zip(&taken.values).any(|(ours, theirs)| ours.to_bits() != theirs.to_bits()) {
-            return Err(other(", the numbers are others"));
+            return Err(other(": the values differ"));
         }
         self.read.extend(taken.read);
         Ok(())
@@ -272,20 +275,21 @@ impl Import<'_> {
         let vae: VaeMeta = artifacts::meta(&vae_part, "the VAE")?;
         let found = sizes::denoiser(self.file)?;
         let config = sizes::of_denoiser(&found, vae.latent.tokens, self.heads)?;
-        let family = self.settings.family().ok_or_else(|| StageError::Fault("a denoiser without a family".into()))?;
+        let family = self.settings.family().ok_or_else(|| StageError::Fault("the denoiser has no family".into()))?;
         match (config.guidance_dim, family.is_student()) {
             (Some(_), false) => {
-                return Err(found.refuse("it embeds a guidance scale, and so is a student; write `part: lcm`"));
+                return Err(found.refuse("it embeds a guidance scale, so it is a student; write `part: lcm`"));
             }
             (None, true) => {
-                return Err(found.refuse("it embeds no guidance scale, and so is a teacher; write `part: mld`"));
+                return Err(found.refuse("it embeds no guidance scale, so it is a teacher; write `part: mld`"));
             }
             _ => {}
         }
         if config.dim != vae.latent.dim {
             let (ours, theirs) = (config.dim, vae.latent);
             return Err(found.refuse(format!(
-                "it makes latents of tokens {ours} wide, those of `vae` are {}x{}; name the VAE that it was trained with",
+                "its latent tokens are {ours} wide, but the latents of `vae` are {}x{}; use the VAE that it was \
+                 trained with",
                 theirs.tokens, theirs.dim
             )));
         }
@@ -318,7 +322,8 @@ impl Import<'_> {
         let model = Model::read(&manifest).map_err(model_error)?;
         if model.parts.contains_key(&Role::CONTROL) || model.generator != LATENT_DIFFUSION {
             return Err(StageError::Input(
-                "`model` has a control part already, or is no latent diffusion; name the model that is controlled"
+                "`model` already has a control part, or is not a latent diffusion model; use the model that the part \
+                 controls"
                     .into(),
             ));
         }
@@ -338,11 +343,11 @@ impl Import<'_> {
         let joints = Skeleton::of(model.format).joints;
         if config.joints != joints {
             let (found, format) = (config.joints, word(&model.format));
-            return Err(trajectory.refuse(format!("it reads {found} joints, `{format}` has {joints}")));
+            return Err(trajectory.refuse(format!("it expects {found} joints, but `{format}` has {joints}")));
         }
         if (config.tokens, config.dim) != (base.latent.tokens, base.latent.dim) {
             return Err(trajectory.refuse(format!(
-                "its tokens are {}x{}, the latents of `model` {}x{}; name the model that it was trained with",
+                "its tokens are {}x{}, but the latents of `model` are {}x{}; use the model that it was trained with",
                 config.tokens, config.dim, base.latent.tokens, base.latent.dim
             )));
         }
@@ -376,7 +381,8 @@ impl Import<'_> {
         let reach = u32::try_from(depth).ok().and_then(|depth| growth.checked_pow(depth));
         if reach.is_none_or(|reach| reach > REACH) {
             return Err(found.refuse(format!(
-                "its dilations would grow to {growth}^{depth}; expected at most {REACH} frames; set `growth` to what it was trained with"
+                "its dilations grow to {growth}^{depth}; expected at most {REACH} frames; set `growth` to the value \
+                 that it was trained with"
             )));
         }
         let meta = TokenizerMeta {
@@ -431,7 +437,8 @@ impl Import<'_> {
     fn expect_codes(found: &Found<'_>, codes: usize, tokenizer: &TokenizerMeta, one: bool) -> Result<(), StageError> {
         if codes != tokenizer.codes || (one && tokenizer.quantizers != 1) {
             return Err(found.refuse(format!(
-                "it draws {codes} codes{}, `tokenizer` has {} codebook(s) of {}; name the tokenizer that it was trained with",
+                "it generates {codes} codes{}, but `tokenizer` has {} codebook(s) of {}; use the tokenizer that it was \
+                 trained with",
                 if one { " of one codebook" } else { "" },
                 tokenizer.quantizers,
                 tokenizer.codes
@@ -465,7 +472,8 @@ impl Import<'_> {
         Self::expect_codes(&found, config.codes, &tokenizer.2, true)?;
         if config.dim != tokenizer.2.code_dim {
             return Err(found.refuse(format!(
-                "it reads codes of width {}, those of `tokenizer` are {} wide; name the tokenizer that it was trained with",
+                "it expects codes of width {}, but those of `tokenizer` are {} wide; use the tokenizer that it was \
+                 trained with",
                 config.dim, tokenizer.2.code_dim
             )));
         }
@@ -496,7 +504,8 @@ impl Import<'_> {
             ("", 1) => {}
             ("", many) => {
                 return Err(found.refuse(format!(
-                    "`tokenizer` has {many} codebooks, and this network draws the first; set `residual` to the file of the other"
+                    "`tokenizer` has {many} codebooks, but this network generates only the first; set `residual` to \
+                     the file of the residual transformer"
                 )));
             }
             _ => networks.push(self.above(cx, &config)?.under(RESIDUAL_PREFIX)),
@@ -515,13 +524,14 @@ impl Import<'_> {
         let config = sizes::of_residual(&found, self.heads)?;
         if config != *first {
             return Err(found.refuse(format!(
-                "the two networks are of one tokenizer and one size, but this has {config:?}, and the masked one {first:?}"
+                "it has {config:?}, but the masked transformer has {first:?}; use two networks of the same size, \
+                 trained with the same tokenizer"
             )));
         }
         let entries = layout(&ResidualTransformer::new(&config, true, &mut Init::shapes(&self.device)));
         let taken = found.take(&entries, &str::to_owned)?;
         if let Some(left_out) = file.left_out(&taken.read) {
-            cx.log(&format!("{}: not read, by the beginning of the names: {left_out}", path.display()));
+            cx.log(&format!("{}: tensors that were not read, by prefix: {left_out}", path.display()));
         }
         self.parameters += taken.values.len();
         Ok(Network { entries, taken })
@@ -532,7 +542,8 @@ impl Import<'_> {
         let config = sizes::of_mdm(&found, self.heads)?;
         let (format, mean, std) = self.statistics(cx, config.features, &found)?;
         let text = self.text(cx, &found, config.text_dim)?;
-        let family = self.settings.family().ok_or_else(|| StageError::Fault("MDM without a family".into()))?;
+        let family =
+            self.settings.family().ok_or_else(|| StageError::Fault("the MDM denoiser has no family".into()))?;
         let size = MdmNetwork {
             width: config.width,
             layers: config.layers,
@@ -567,7 +578,8 @@ impl Import<'_> {
         let config = sizes::of_unet(&found, (self.heads, HEAD))?;
         if (config.features, config.token_dim) != (tokenizer.features, tokenizer.code_dim) {
             return Err(found.refuse(format!(
-                "it makes {} features of codes of width {}, `tokenizer` has {} and {}; name the tokenizer that it was trained with",
+                "it expects {} features and codes of width {}, but `tokenizer` has {} and {}; use the tokenizer that \
+                 it was trained with",
                 config.features, config.token_dim, tokenizer.features, tokenizer.code_dim
             )));
         }
@@ -575,7 +587,9 @@ impl Import<'_> {
             Projection::Stack => FlowProjection::Stack,
             Projection::Repeat => FlowProjection::Repeat,
             Projection::Transposed => FlowProjection::Transposed,
-            Projection::Upsample => return Err(found.refuse("its projection is not one that decoders have here")),
+            Projection::Upsample => {
+                return Err(found.refuse("its projection is not supported; expected stack, repeat or transposed"));
+            }
         };
         let meta = FlowMeta {
             format: tokenizer.format,
@@ -597,7 +611,7 @@ impl Import<'_> {
             fits: Parts::from([(Role::TOKENIZER, digest)]),
         };
         let Backbone::Unet(network) = meta.field(&mut Init::shapes(&self.device)).backbone else {
-            return Err(StageError::Fault("a U-Net was asked for".into()));
+            return Err(StageError::Fault("expected a U-Net".into()));
         };
         let entries = layout(&network);
         let taken = found.take(&entries, &str::to_owned)?;

@@ -24,7 +24,7 @@ impl Plain for ModelDecoder {
             LATENT_DIFFUSION => Role::VAE,
             other => {
                 return Err(StageError::Input(format!(
-                    "`model` is drawn by `{other}`, which makes neither tokens nor latents; there is nothing to decode"
+                    "the generator `{other}` of `model` makes neither tokens nor latents, so there is nothing to decode"
                 )));
             }
         };

@@ -87,7 +87,8 @@ impl Map for TextEmbed {
             let meta: ShardMeta = artifacts::meta(&manifest, "a shard of the embeddings")?;
             if meta.encoder != encoder {
                 return Err(StageError::Input(format!(
-                    "the encoder in {} is not the one that other workers read, or it has changed; run it again with one and the same",
+                    "the encoder in {} differs between workers, or changed during the stage; give all workers the same \
+                     encoder and run the stage again",
                     self.path
                 )));
             }
@@ -96,17 +97,24 @@ impl Map for TextEmbed {
             dim = part.row_len();
             if meta.first * dim != rows.len() {
                 let have = rows.len() / dim.max(1);
-                return Err(StageError::Fault(format!("a shard begins at text {}, {have} are there", meta.first)));
+                return Err(StageError::Fault(format!(
+                    "a shard begins at text {}, but the previous shard ended at text {have}",
+                    meta.first
+                )));
             }
             rows.extend_from_slice(&part.values);
         }
         if dim == 0 || rows.len() != texts.len() * dim {
-            return Err(StageError::Fault(format!("{} numbers for {} texts of {dim}", rows.len(), texts.len())));
+            return Err(StageError::Fault(format!(
+                "the shards have {} numbers for {} texts of {dim} numbers each",
+                rows.len(),
+                texts.len()
+            )));
         }
         if let Some(bad) = rows.iter().position(|v| !v.is_finite()) {
             let text = protocol::excerpt(&texts[bad / dim]);
             return Err(StageError::Input(format!(
-                "the encoder makes no finite numbers of `{text}`; its weights are damaged"
+                "the encoder's embedding of `{text}` is not finite; the encoder's weights are damaged"
             )));
         }
         if let Some(line) = named.skipped() {
@@ -115,7 +123,10 @@ impl Map for TextEmbed {
         let part = named.upload(cx)?;
         let said: TextEncoderMeta = artifacts::meta(&part, "the text encoder")?;
         if said.dim != dim {
-            return Err(StageError::Fault(format!("the encoder gave {dim} numbers a caption, not {}", said.dim)));
+            return Err(StageError::Fault(format!(
+                "the encoder returned {dim} numbers per caption; expected {}",
+                said.dim
+            )));
         }
         let row = |text: usize| rows[text * dim..(text + 1) * dim].iter().copied();
         let captions: Vec<f32> = of.iter().flat_map(|text| row(*text)).collect();

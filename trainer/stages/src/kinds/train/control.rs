@@ -46,7 +46,7 @@ use crate::parts::{self, model_error, weights};
 use crate::train::data::latents::{LatentData, LatentSlice};
 use crate::train::frequency::clean;
 use crate::train::network::{dropout_seed, group};
-use crate::train::{Clip, GroupPlan, Losses, Objective, Pick, SliceResult, TrainState, Trained, train};
+use crate::train::{Clip, GroupPlan, Losses, Objective, Pick, SliceResult, TrainState, train};
 
 /// Batches that are sorted by length together; a step's cost is mostly reading and decoding whole clips.
 const POOL: usize = 8;
@@ -365,25 +365,24 @@ fn taken<M: Module>(network: &M, gradients: &mut Gradients) -> Vec<f32> {
 fn base_meta(denoiser: &Manifest, model: &Model, data: &LatentData) -> Result<DenoiserMeta, StageError> {
     let refuse = |text: &str| Err(StageError::Input(text.to_owned()));
     if model.parts.contains_key(&Role::CONTROL) {
-        return refuse("`model` has a control part already; name the model that it controls");
+        return refuse("`model` already has a control part; use the model without it");
     }
     if model.generator != crate::generate::generator::LATENT_DIFFUSION {
-        return refuse("`model` is no latent diffusion, and only such a model has a ControlNet");
+        return refuse("`model` is not a latent diffusion model; a ControlNet needs one");
     }
     let meta: DenoiserMeta = artifacts::meta(denoiser, "the denoiser of `model`")?;
     if meta.fits.get(&Role::VAE) != Some(&data.vae()) {
-        return refuse("`latents` were made by another VAE than `model` was trained on; name its latents");
+        return refuse("`latents` were encoded with another VAE than that of `model`; use the model's latents");
     }
     if meta.fits.get(&Role::TEXT) != Some(&data.text_meta().text) {
-        return refuse("`text` was embedded with another encoder than `model` was trained with; name its `text`");
+        return refuse("`text` was embedded with another encoder than that of `model`; use the model's `text`");
     }
     Ok(meta)
 }
 
 /// The clips that the latents were encoded from.
 fn clips(cx: &dyn AttemptContext, data: &LatentData) -> Result<Dataset, StageError> {
-    let (_, manifest) = artifacts::input(cx, "dataset", ArtifactKind::Dataset)?;
-    let dataset = artifacts::dataset(&*cx.blobs(), &manifest)?;
+    let dataset = artifacts::input_dataset(cx)?;
     let meta = data.meta();
     let rows = meta.splits.len() * meta.crops;
     let fits = |row: usize| {
@@ -392,7 +391,7 @@ fn clips(cx: &dyn AttemptContext, data: &LatentData) -> Result<Dataset, StageErr
     };
     if dataset.entries.len() != meta.splits.len() || !(0..rows).all(fits) {
         return Err(StageError::Input(
-            "`latents` were encoded from other clips than `dataset` has; name the dataset that they were encoded from"
+            "`latents` were not encoded from the clips of `dataset`; use the dataset that they were encoded from"
                 .into(),
         ));
     }
@@ -434,7 +433,7 @@ impl Gang for TrainControl {
         let trajectory = start.take(trajectory, TRAJECTORY_PREFIX)?;
         let feedback = meta.feedback(&base_meta, &mut init);
         let feedback = feedback.map(|network| start.take(network, FEEDBACK_PREFIX)).transpose()?;
-        start.finish(cx, &to_meta(&meta))?;
+        start.finish(cx, &meta)?;
         let decoder = if self.loss.control > 0.0 || feedback.is_some() {
             let part = parts::part(&*blobs, &model, &Role::VAE, ArtifactKind::Vae)?;
             let vae: VaeMeta = artifacts::meta(&part, "the VAE")?;
@@ -462,12 +461,6 @@ impl Gang for TrainControl {
             seed: dropout_seed(cx),
             device,
         };
-        match train(&mut objective, &self.training, cx)? {
-            Trained::Yielded { at } => Ok(Outcome::Yielded { at }),
-            Trained::Finished { state, metrics } => {
-                let output = objective.publish(cx, &manifest, &state)?;
-                Ok(Outcome::Finished { output, metrics })
-            }
-        }
+        train(&mut objective, &self.training, cx)?.publish(|state| objective.publish(cx, &manifest, state))
     }
 }

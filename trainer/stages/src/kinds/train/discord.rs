@@ -23,7 +23,7 @@ use crate::parts::warm_start::WarmStart;
 use crate::parts::weights;
 use crate::train::data::flow::{Encoder, FlowData, FlowSlice, field_group, field_result};
 use crate::train::network::dropout_seed;
-use crate::train::{GroupPlan, Losses, Objective, SliceResult, TrainState, Trained, train};
+use crate::train::{GroupPlan, Losses, Objective, SliceResult, TrainState, train};
 
 struct Flow {
     settings: TrainDiscord,
@@ -77,15 +77,9 @@ impl Gang for TrainDiscord {
         let field = meta.field(&mut Init::new(seed, &format!("{purpose}/init"), Positions::Uniform, &tracked));
         let mut start = WarmStart::find(cx, ArtifactKind::FlowDecoder)?;
         let field = field.begun_with(&mut start)?;
-        start.finish(cx, &to_meta(&meta))?;
+        start.finish(cx, &meta)?;
         let mut objective = Flow { settings: self.clone(), data, field, dropout_seed: dropout_seed(cx) };
-        match train(&mut objective, &self.training, cx)? {
-            Trained::Yielded { at } => Ok(Outcome::Yielded { at }),
-            Trained::Finished { state, metrics } => {
-                let trained = (&state.groups[0].entries[..], state.result(0));
-                let output = weights::publish(cx, ArtifactKind::FlowDecoder, to_meta(&meta), trained)?;
-                Ok(Outcome::Finished { output, metrics })
-            }
-        }
+        train(&mut objective, &self.training, cx)?
+            .publish(|state| weights::publish(cx, ArtifactKind::FlowDecoder, to_meta(&meta), state.trained(0)))
     }
 }

@@ -19,7 +19,7 @@ use motion::dataset::{Dataset, crop, window};
 use protocol::stage::{Positions, Split, TrainEvaluator};
 use protocol::{ArtifactKind, Seed};
 
-use crate::artifacts::{self, to_meta};
+use crate::artifacts;
 use crate::context::{GangContext, Outcome, StageError};
 use crate::external;
 use crate::kinds::shape::Gang;
@@ -27,7 +27,7 @@ use crate::parts::evaluator::{self, EvaluatorMeta, UNIT, normalise};
 use crate::parts::warm_start::WarmStart;
 use crate::parts::words::{CLASSES, CaptionBatch, WORD_WIDTH, WORDS, Words};
 use crate::train::network::{dropout_seed, group, no_clips};
-use crate::train::{GroupPlan, Objective, Order, Pick, SliceResult, TrainState, Trained, Turns, train};
+use crate::train::{GroupPlan, Objective, Order, Pick, SliceResult, TrainState, Turns, train};
 
 /// Keeps the gradient of a distance finite at 0, as in the original.
 const NEAR: f64 = 1e-6;
@@ -266,8 +266,7 @@ fn emphasised(dataset: &Dataset, emphasis: f64) -> Vec<f32> {
 
 impl Gang for TrainEvaluator {
     fn run(&self, cx: &mut dyn GangContext) -> Result<Outcome, StageError> {
-        let (_, manifest) = artifacts::input(cx, "dataset", ArtifactKind::Dataset)?;
-        let dataset = artifacts::dataset(&*cx.blobs(), &manifest)?;
+        let dataset = artifacts::input_dataset(cx)?;
         let train_entries = dataset.entries_of(Split::Train);
         let stage = cx.task().name.clone();
         let steps = self.training.steps.0;
@@ -277,7 +276,8 @@ impl Gang for TrainEvaluator {
         }
         if turn == 0 || turn >= steps {
             return Err(StageError::Input(format!(
-                "`movement.until` gives {turn} of {steps} steps to the movements; both phases need some"
+                "`movement.until` assigns {turn} of {steps} steps to the movement phase; each of the two phases needs \
+                 at least one"
             )));
         }
         let words = external::read(cx, |_, given| Words::open(given.get("words")))?;
@@ -299,7 +299,7 @@ impl Gang for TrainEvaluator {
         let motion = MotionEncoder::new(&meta.config, &mut fresh(&draws("motion")));
         let encoder = start.take(encoder, "movement_encoder.")?;
         let (text, motion) = (start.take(text, "text_encoder.")?, start.take(motion, "motion_encoder.")?);
-        start.finish(cx, &to_meta(&meta))?;
+        start.finish(cx, &meta)?;
         let movements = Movements {
             encoder,
             decoder: MovementDecoder::new(&meta.config, meta.mean.len(), &mut fresh(&draws("decoder"))),
@@ -323,22 +323,18 @@ impl Gang for TrainEvaluator {
             device: plain.clone(),
             meta,
         };
-        match train(&mut objective, &self.training, cx)? {
-            Trained::Yielded { at } => Ok(Outcome::Yielded { at }),
-            Trained::Finished { state, metrics } => {
-                let blank = Evaluator::new(
-                    &objective.meta.config,
-                    &mut Init::new(Seed(0), "blank", Positions::Uniform, &plain.clone().inner()),
-                );
-                let encoder = objective.frozen.num_params();
-                let mut weights = state.result(0).to_vec();
-                weights.extend_from_slice(state.result(1));
-                weights.extend_from_slice(&state.result(2)[..encoder]);
-                let trained = (&flat::layout(&blank)[..], &weights[..]);
-                let output = evaluator::publish(cx, &objective.meta, trained, &objective.words)?;
-                Ok(Outcome::Finished { output, metrics })
-            }
-        }
+        train(&mut objective, &self.training, cx)?.publish(|state| {
+            let blank = Evaluator::new(
+                &objective.meta.config,
+                &mut Init::new(Seed(0), "blank", Positions::Uniform, &plain.clone().inner()),
+            );
+            let encoder = objective.frozen.num_params();
+            let mut weights = state.result(0).to_vec();
+            weights.extend_from_slice(state.result(1));
+            weights.extend_from_slice(&state.result(2)[..encoder]);
+            let trained = (&flat::layout(&blank)[..], &weights[..]);
+            evaluator::publish(cx, &objective.meta, trained, &objective.words)
+        })
     }
 }
 

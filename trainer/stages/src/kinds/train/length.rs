@@ -25,7 +25,7 @@ use crate::parts::length::LengthMeta;
 use crate::parts::warm_start::WarmStart;
 use crate::parts::weights;
 use crate::train::network::{dropout_seed, group, no_clips, slice_result};
-use crate::train::{GroupPlan, Losses, Objective, Order, SliceResult, TrainState, Trained, train};
+use crate::train::{GroupPlan, Losses, Objective, Order, SliceResult, TrainState, train};
 
 /// Name of the distance in frames between the mean of the predicted lengths and the true one.
 const OFF: &str = "frames_off";
@@ -91,13 +91,12 @@ impl Objective for Lengths {
 impl Gang for TrainLength {
     fn run(&self, cx: &mut dyn GangContext) -> Result<Outcome, StageError> {
         let blobs = cx.blobs();
-        let (_, manifest) = artifacts::input(cx, "dataset", ArtifactKind::Dataset)?;
-        let dataset = artifacts::dataset(&*blobs, &manifest)?;
+        let dataset = artifacts::input_dataset(cx)?;
         let (_, manifest) = artifacts::input(cx, "text", ArtifactKind::Embeddings)?;
         let embeddings = Embeddings::read(&*blobs, &manifest)?;
         if dataset.captions.len() != embeddings.meta.captions {
             return Err(StageError::Input(format!(
-                "`dataset` has {} captions, `text` embeds {}; both must come from one dataset",
+                "`dataset` has {} captions, but `text` embeds {}; use embeddings of the same dataset",
                 dataset.captions.len(),
                 embeddings.meta.captions
             )));
@@ -116,9 +115,12 @@ impl Gang for TrainLength {
         let (seed, purpose) = (cx.task().seed, cx.task().name.to_string());
         let tracked = cx.device().autodiff();
         let mut init = Init::new(seed, &format!("{purpose}/init"), Positions::Uniform, &tracked);
-        let mut start = WarmStart::find(cx, ArtifactKind::Length)?;
-        let network = start.take(LengthEstimator::new(meta.text_dim, meta.classes, &mut init), "")?;
-        start.finish(cx, &to_meta(&meta))?;
+        let network = WarmStart::begin(
+            cx,
+            ArtifactKind::Length,
+            LengthEstimator::new(meta.text_dim, meta.classes, &mut init),
+            &meta,
+        )?;
         let mut objective = Lengths {
             settings: self.clone(),
             network,
@@ -131,13 +133,7 @@ impl Gang for TrainLength {
             dropout_seed: dropout_seed(cx),
             device: cx.device(),
         };
-        match train(&mut objective, &self.training, cx)? {
-            Trained::Yielded { at } => Ok(Outcome::Yielded { at }),
-            Trained::Finished { state, metrics } => {
-                let trained = (&state.groups[0].entries[..], state.result(0));
-                let output = weights::publish(cx, ArtifactKind::Length, to_meta(&meta), trained)?;
-                Ok(Outcome::Finished { output, metrics })
-            }
-        }
+        train(&mut objective, &self.training, cx)?
+            .publish(|state| weights::publish(cx, ArtifactKind::Length, to_meta(&meta), state.trained(0)))
     }
 }

@@ -20,7 +20,7 @@ use protocol::ArtifactKind;
 use protocol::artifact::Role;
 use protocol::stage::{Family, TrainMld};
 
-use crate::artifacts::{self, DenoiserMeta, VaeMeta, to_meta};
+use crate::artifacts::{self, DenoiserMeta, VaeMeta};
 use crate::context::{GangContext, Outcome, StageError};
 use crate::kinds::shape::Gang;
 use crate::parts::networks::Autoencoder;
@@ -28,7 +28,7 @@ use crate::parts::warm_start::WarmStart;
 use crate::train::data::latents::{self, LatentData};
 use crate::train::frequency::{FrequencyTerms, LOW_FREQUENCY, Predicted, SEMANTIC, clean};
 use crate::train::network::{dropout_seed, group, slice_result};
-use crate::train::{GroupPlan, Losses, Objective, Pick, SliceResult, TrainState, Trained, train};
+use crate::train::{GroupPlan, Losses, Objective, Pick, SliceResult, TrainState, train};
 
 /// Name of the loss term that every latent diffusion has.
 const DENOISING: &str = "denoising";
@@ -145,7 +145,8 @@ impl Gang for TrainMld {
         let text_part = data.text_encoder(cx)?;
         if data.vae() != vae_digest || data.meta().latent != vae.latent {
             return Err(StageError::Input(format!(
-                "`latents` were made by another VAE ({} x {} latents) than `vae` ({} x {}); name the VAE that encoded them",
+                "`latents` were encoded with another VAE ({} x {} latents) than `vae` ({} x {}); use the VAE that \
+                 encoded them",
                 data.meta().latent.tokens,
                 data.meta().latent.dim,
                 vae.latent.tokens,
@@ -168,9 +169,7 @@ impl Gang for TrainMld {
         let purpose = format!("{}/init", cx.task().name);
         let mut init = Init::new(cx.task().seed, &purpose, self.network.positions, &device);
         let network = Denoiser::new(&meta.config(), &mut init);
-        let mut start = WarmStart::find(cx, ArtifactKind::Denoiser)?;
-        let network = start.take(network, "")?;
-        start.finish(cx, &to_meta(&meta))?;
+        let network = WarmStart::begin(cx, ArtifactKind::Denoiser, network, &meta)?;
         let seed = dropout_seed(cx);
         let noise = Schedule::new(&self.diffusion, TIMESTEPS);
         let statistics = (&vae.mean[..], &vae.std[..]);
@@ -180,14 +179,9 @@ impl Gang for TrainMld {
             None => None,
         };
         let mut objective = Mld { settings: self.clone(), decoded, data, network, noise, seed };
-        match train(&mut objective, &self.training, cx)? {
-            Trained::Yielded { at } => Ok(Outcome::Yielded { at }),
-            Trained::Finished { state, metrics } => {
-                let trained = (&state.groups[0].entries[..], state.result(0));
-                let parts = BTreeMap::from([(Role::VAE, vae_part), (Role::TEXT, text_part)]);
-                let output = latents::publish(cx, vae.format, &meta, trained, parts)?;
-                Ok(Outcome::Finished { output, metrics })
-            }
-        }
+        train(&mut objective, &self.training, cx)?.publish(|state| {
+            let parts = BTreeMap::from([(Role::VAE, vae_part), (Role::TEXT, text_part)]);
+            latents::publish(cx, vae.format, &meta, state.trained(0), parts)
+        })
     }
 }

@@ -25,7 +25,6 @@ use motion::random::permutation;
 use protocol::ArtifactKind;
 use protocol::stage::{Positions, Resets, TrainTokenizer};
 
-use crate::artifacts::to_meta;
 use crate::context::{GangContext, Outcome, StageError};
 use crate::kinds::shape::Gang;
 use crate::parts::tokenizer::TokenizerMeta;
@@ -33,7 +32,7 @@ use crate::parts::warm_start::WarmStart;
 use crate::train::data::windows::TokenWindows;
 use crate::train::network::{dropout_seed, group, slice_result};
 use crate::train::{
-    AfterStep, BufferPlan, GroupPlan, Losses, Objective, Order, Pick, SliceResult, SumPlan, TrainState, Trained, train,
+    AfterStep, BufferPlan, GroupPlan, Losses, Objective, Order, Pick, SliceResult, SumPlan, TrainState, train,
 };
 
 /// Frames per token.
@@ -317,7 +316,7 @@ impl Gang for TrainTokenizer {
         let mut start = WarmStart::find(cx, ArtifactKind::Tokenizer)?;
         let network = start.take(Tokenizer::new(&meta.config(), &mut init), "")?;
         let given = start.values(&meta.books(), "")?.unwrap_or_else(|| vec![None; self.quantizers]);
-        start.finish(cx, &to_meta(&meta))?;
+        start.finish(cx, &meta)?;
         let mut objective = VqObjective {
             settings: self.clone(),
             network,
@@ -329,14 +328,10 @@ impl Gang for TrainTokenizer {
             dropout_seed: dropout_seed(cx),
             device: cx.device(),
         };
-        match train(&mut objective, &self.training, cx)? {
-            Trained::Yielded { at } => Ok(Outcome::Yielded { at }),
-            Trained::Finished { state, metrics } => {
-                let names: Vec<String> = (0..self.quantizers).map(|q| of("codebook", q)).collect();
-                let books: Vec<&[f32]> = names.iter().map(|name| state.buffers.get(name)).collect();
-                let output = meta.publish(cx, (&state.groups[0].entries, state.result(0)), &books)?;
-                Ok(Outcome::Finished { output, metrics })
-            }
-        }
+        train(&mut objective, &self.training, cx)?.publish(|state| {
+            let names: Vec<String> = (0..self.quantizers).map(|q| of("codebook", q)).collect();
+            let books: Vec<&[f32]> = names.iter().map(|name| state.buffers.get(name)).collect();
+            meta.publish(cx, state.trained(0), &books)
+        })
     }
 }

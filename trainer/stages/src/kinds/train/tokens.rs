@@ -35,7 +35,7 @@ use crate::parts::warm_start::WarmStart;
 use crate::parts::{self, weights};
 use crate::train::data::tokens::{TokenData, uniforms};
 use crate::train::network::{dropout_seed, group, no_clips, slice_gradient, slice_result};
-use crate::train::{GroupPlan, Losses, Objective, Order, Pick, SliceResult, TrainState, Trained, train};
+use crate::train::{GroupPlan, Losses, Objective, Order, Pick, SliceResult, TrainState, train};
 
 struct Autoregressive {
     settings: TrainTokens,
@@ -217,8 +217,7 @@ impl Inputs {
         let (digest, tokenizer) = artifacts::input(cx, "tokenizer", ArtifactKind::Tokenizer)?;
         if tokens.meta.tokenizer != digest {
             return Err(StageError::Input(
-                "`tokens` were encoded by another tokenizer than `tokenizer`; name the tokenizer that encoded them"
-                    .into(),
+                "`tokens` were not encoded with `tokenizer`; use the tokenizer that encoded them".into(),
             ));
         }
         let (_, manifest) = artifacts::input(cx, "text", ArtifactKind::Embeddings)?;
@@ -226,20 +225,20 @@ impl Inputs {
         let captions = tokens.meta.captions.iter().flatten().max().map_or(0, |most| most + 1);
         if captions > embeddings.meta.captions {
             return Err(StageError::Input(format!(
-                "`tokens` refers to {captions} captions, `text` embeds {}; both must come from one dataset",
+                "`tokens` refers to {captions} captions, but `text` embeds {}; use both of the same dataset",
                 embeddings.meta.captions
             )));
         }
         let quantizers = tokens.meta.quantizers;
         if settings.generator == TokenGenerator::Masked && quantizers == 2 {
             return Err(StageError::Input(
-                "a masked generator needs a tokenizer of one codebook, or of at least 3; this one has 2".into(),
+                "a masked generator needs a tokenizer with 1 codebook, or at least 3; `tokenizer` has 2".into(),
             ));
         }
         if settings.generator != TokenGenerator::Masked && quantizers > 1 {
             return Err(StageError::Input(format!(
-                "this generator draws the tokens of one codebook, and the tokenizer has {quantizers}; train one with `quantizers: 1`, or \
-                 write `generator: masked`"
+                "this generator needs a tokenizer with one codebook, but `tokenizer` has {quantizers}; train one with \
+                 `quantizers: 1`, or write `generator: masked`"
             )));
         }
         let usable = |e: &usize| tokens.meta.splits[*e] == Split::Train && tokens.meta.lengths[*e] > 0;
@@ -249,7 +248,7 @@ impl Inputs {
         }
         let text = parts::manifest(&*blobs, embeddings.meta.text, "the text encoder")?;
         let meta = GeneratorMeta {
-            family: settings.family().ok_or_else(|| StageError::Fault("a token generator without a family".into()))?,
+            family: settings.family().ok_or_else(|| StageError::Fault("the token generator has no family".into()))?,
             network: settings.network.clone(),
             codes: tokens.meta.codes,
             quantizers,
@@ -301,16 +300,12 @@ impl Gang for TrainTokens {
             }
             TokenGenerator::Mmm => Box::new(WithWords::new(self, data, &meta, cx, &mut init, &mut start)?),
         };
-        start.finish(cx, &to_meta(&meta))?;
-        match train(&mut *objective, &self.training, cx)? {
-            Trained::Yielded { at } => Ok(Outcome::Yielded { at }),
-            Trained::Finished { state, metrics } => {
-                let mut generator = Draft::new(cx, ArtifactKind::TokenGenerator, to_meta(&meta));
-                add_weights(&mut generator, &state)?;
-                parts.insert(Role::GENERATOR, generator.into_manifest());
-                let output = parts::publish_model(cx, TOKENS, format, &parts)?;
-                Ok(Outcome::Finished { output, metrics })
-            }
-        }
+        start.finish(cx, &meta)?;
+        train(&mut *objective, &self.training, cx)?.publish(|state| {
+            let mut generator = Draft::new(cx, ArtifactKind::TokenGenerator, to_meta(&meta));
+            add_weights(&mut generator, state)?;
+            parts.insert(Role::GENERATOR, generator.into_manifest());
+            parts::publish_model(cx, TOKENS, format, &parts)
+        })
     }
 }

@@ -20,7 +20,7 @@ use crate::kinds::shape::Gang;
 use crate::parts::warm_start::WarmStart;
 use crate::parts::weights;
 use crate::train::network::{dropout_seed, group, no_clips, slice_result};
-use crate::train::{GroupPlan, Losses, Objective, Order, Pick, SliceResult, TrainState, Trained, train};
+use crate::train::{GroupPlan, Losses, Objective, Order, Pick, SliceResult, TrainState, train};
 
 /// Number of batches that are sorted by length together.
 const POOL: usize = 4;
@@ -145,8 +145,7 @@ impl Objective for VaeObjective {
 
 impl Gang for TrainVae {
     fn run(&self, cx: &mut dyn GangContext) -> Result<Outcome, StageError> {
-        let (_, manifest) = artifacts::input(cx, "dataset", ArtifactKind::Dataset)?;
-        let dataset = artifacts::dataset(&*cx.blobs(), &manifest)?;
+        let dataset = artifacts::input_dataset(cx)?;
         let train_entries = dataset.entries_of(Split::Train);
         let stage = cx.task().name.clone();
         if train_entries.is_empty() {
@@ -164,9 +163,7 @@ impl Gang for TrainVae {
         let (seed, device) = (cx.task().seed, cx.device().autodiff());
         let purpose = stage.to_string();
         let mut init = Init::new(seed, &format!("{purpose}/init"), self.network.positions, &device);
-        let mut start = WarmStart::find(cx, ArtifactKind::Vae)?;
-        let network = start.take(Vae::new(&meta.config(), &mut init), "")?;
-        start.finish(cx, &to_meta(&meta))?;
+        let network = WarmStart::begin(cx, ArtifactKind::Vae, Vae::new(&meta.config(), &mut init), &meta)?;
         let batch = self.training.batch.global;
         let window_batch = if self.windows.batch > 0 { self.windows.batch } else { batch };
         let mut objective = VaeObjective {
@@ -182,13 +179,7 @@ impl Gang for TrainVae {
             dropout_seed: dropout_seed(cx),
             device: cx.device(),
         };
-        match train(&mut objective, &self.training, cx)? {
-            Trained::Yielded { at } => Ok(Outcome::Yielded { at }),
-            Trained::Finished { state, metrics } => {
-                let trained = (&state.groups[0].entries[..], state.result(0));
-                let output = weights::publish(cx, ArtifactKind::Vae, to_meta(&meta), trained)?;
-                Ok(Outcome::Finished { output, metrics })
-            }
-        }
+        train(&mut objective, &self.training, cx)?
+            .publish(|state| weights::publish(cx, ArtifactKind::Vae, to_meta(&meta), state.trained(0)))
     }
 }

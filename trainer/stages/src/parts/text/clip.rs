@@ -35,7 +35,9 @@ impl std::fmt::Debug for Clip {
 /// Creates the network and loads its weights.
 pub(super) fn open(published: Published, device: &Device) -> Result<Box<dyn TextEncoder>, StageError> {
     let Network::Clip(sizes) = &published.captions.meta.description.network else {
-        return Err(StageError::Input("the text encoder `clip` has the network of another".into()));
+        return Err(StageError::Input(
+            "the manifest of the text encoder `clip` describes another kind of network".into(),
+        ));
     };
     let (width, positions) = (sizes.hidden_size, sizes.max_position_embeddings);
     let config: ClipTextConfig = published.sizes(sizes)?;

@@ -46,14 +46,17 @@ pub fn open(manifest: &Manifest, blobs: &dyn Blobs, device: &Device) -> Result<B
         let have: Vec<&str> = ENCODERS.iter().map(|(name, _)| *name).collect();
         let wanted = meta.encoder;
         return Err(StageError::Input(format!(
-            "text encoder `{wanted}` is not in this build, which has {}",
+            "this build has no text encoder `{wanted}`; it has {}",
             have.join(", ")
         )));
     };
     let encoder = open(manifest, blobs, device)?;
     if encoder.dim() != meta.dim {
         let (found, said) = (encoder.dim(), meta.dim);
-        return Err(StageError::Input(format!("text encoder `{}` gives {found} numbers, not {said}", meta.encoder)));
+        return Err(StageError::Input(format!(
+            "text encoder `{}` returns {found} numbers; its manifest declares {said}",
+            meta.encoder
+        )));
     }
     Ok(encoder)
 }
@@ -69,8 +72,8 @@ pub fn expect_one_width(encoder: &dyn TextEncoder) -> Result<(), StageError> {
         return Ok(());
     }
     Err(StageError::Input(format!(
-        "the text encoder gives {pooled} numbers a caption and {tokens} a token, and this network reads both with one width; take an \
-         encoder that has one, such as `clip-vit-base-patch32`, or set `output: pooled`"
+        "the text encoder returns {pooled} numbers per caption and {tokens} per token, but this network needs the same \
+         width for both; use an encoder such as `clip-vit-base-patch32`, or set `output: pooled`"
     )))
 }
 

@@ -66,7 +66,7 @@ impl ReadAt for Pieces {
             }
             begin = end;
         }
-        if filled == out.len() { Ok(()) } else { Err("it ends before that".into()) }
+        if filled == out.len() { Ok(()) } else { Err("the file is too short".into()) }
     }
 }
 

@@ -37,7 +37,9 @@ pub(super) fn open(published: Published, device: &Device) -> Result<Box<dyn Text
         (&published.captions.meta.description.network, published.captions.meta.description.head.clone())
     else {
         let name = &published.captions.meta.encoder;
-        return Err(StageError::Input(format!("the text encoder `{name}` has the network of another")));
+        return Err(StageError::Input(format!(
+            "the manifest of the text encoder `{name}` describes another kind of network"
+        )));
     };
     let width = sizes.d_model;
     let config: T5Config = published.sizes(sizes)?;

@@ -87,13 +87,12 @@ impl FeatureData {
     /// Reads the inputs `dataset` and `text`.
     pub(crate) fn read(cx: &dyn AttemptContext, training: &Training, rules: Rules) -> Result<Self, StageError> {
         let blobs = cx.blobs();
-        let (_, manifest) = artifacts::input(cx, "dataset", ArtifactKind::Dataset)?;
-        let dataset = artifacts::dataset(&*blobs, &manifest)?;
+        let dataset = artifacts::input_dataset(cx)?;
         let (_, manifest) = artifacts::input(cx, "text", ArtifactKind::Embeddings)?;
         let text_meta: EmbeddingsMeta = artifacts::meta(&manifest, "the caption embeddings")?;
         if text_meta.captions != dataset.captions.len() {
             return Err(StageError::Input(format!(
-                "`text` embeds {} captions, `dataset` has {}; both must come from one dataset",
+                "`text` embeds {} captions, but `dataset` has {}; use embeddings of the same dataset",
                 text_meta.captions,
                 dataset.captions.len()
             )));
@@ -225,7 +224,10 @@ impl FeatureData {
             Words::Vectors(embeddings) => Ok(embeddings.captions.row(number).to_vec()),
             Words::Tokens(encoder) => {
                 let tokens = encoder.tokens(&[&self.dataset.captions[number].text])?;
-                tokens.into_iter().next().ok_or_else(|| StageError::Fault("the encoder gave no caption".into()))
+                tokens
+                    .into_iter()
+                    .next()
+                    .ok_or_else(|| StageError::Fault("the text encoder returned no embedding".into()))
             }
         }
     }

@@ -62,7 +62,7 @@ impl LatentData {
         let stage = cx.task().name.clone();
         if captions > embeddings.meta.captions {
             return Err(StageError::Input(format!(
-                "`latents` refers to {captions} captions, `text` embeds {}; both must come from one dataset",
+                "`latents` refers to {captions} captions, but `text` embeds {}; use both of the same dataset",
                 embeddings.meta.captions
             )));
         }
@@ -170,7 +170,7 @@ pub(crate) fn publish(
     mut parts: BTreeMap<Role, Manifest>,
 ) -> Result<Digest, StageError> {
     let mut denoiser = Draft::new(cx, ArtifactKind::Denoiser, to_meta(meta));
-    weights::add(&mut denoiser, entries, values)?;
+    weights::add(&mut denoiser, (entries, values))?;
     parts.insert(Role::DENOISER, denoiser.into_manifest());
     parts::publish_model(cx, LATENT_DIFFUSION, format, &parts)
 }

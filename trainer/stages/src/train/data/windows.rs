@@ -2,8 +2,8 @@
 
 use motion::Stream;
 use motion::dataset::Dataset;
+use protocol::Seed;
 use protocol::stage::{Split, WindowsOf};
-use protocol::{ArtifactKind, Seed};
 
 use crate::artifacts;
 use crate::context::{AttemptContext, StageError};
@@ -27,8 +27,7 @@ pub(crate) struct TokenWindows {
 impl TokenWindows {
     /// Reads the input `dataset`.
     pub(crate) fn read(cx: &dyn AttemptContext, frames: usize, of: WindowsOf) -> Result<Self, StageError> {
-        let (_, manifest) = artifacts::input(cx, "dataset", ArtifactKind::Dataset)?;
-        let dataset = artifacts::dataset(&*cx.blobs(), &manifest)?;
+        let dataset = artifacts::input_dataset(cx)?;
         let all = dataset.entries_of(Split::Train);
         if all.is_empty() {
             return Err(no_clips());
@@ -37,7 +36,8 @@ impl TokenWindows {
         if train.is_empty() {
             let longest = all.iter().map(|e| dataset.entries[*e].len).max().unwrap_or(0);
             return Err(StageError::Input(format!(
-                "`window` is {frames} frames, the longest clip of the training split has {longest}; set a shorter window"
+                "`window` is {frames} frames, but the longest clip of the training split has {longest}; set a shorter \
+                 window"
             )));
         }
         let mut firsts = vec![0];

@@ -48,7 +48,8 @@ impl Source {
         let (ours, theirs) = (model.format(), plan.dataset.format);
         if ours != theirs {
             return Err(StageError::Input(format!(
-                "`model` draws motions of `{}`, the dataset has `{}`; measure it on the format that it was trained on",
+                "`model` generates motions in format `{}`, but the dataset has format `{}`; use a dataset in the \
+                 model's format",
                 ours.name(),
                 theirs.name()
             )));
@@ -75,14 +76,14 @@ fn lengths(
     let meta = lengths.meta();
     if meta.format != model.format {
         return Err(StageError::Input(format!(
-            "`length` knows motions of `{}`, `model` draws `{}`",
+            "`length` was trained on motions in format `{}`, but `model` generates `{}`",
             meta.format.name(),
             model.format.name()
         )));
     }
     if meta.fits.get(&Role::TEXT) != model.parts.get(&Role::TEXT) {
         let text =
-            "`length` reads captions of another text encoder than `model`; train it on the same `text.embed` stage";
+            "`length` and `model` have different text encoders; train `length` with the model's `text.embed` stage";
         return Err(StageError::Input(text.into()));
     }
     Ok(Some(lengths))
@@ -138,7 +139,7 @@ pub(super) fn reconstruct(
     let mut made = reconstructor.sample(&rows, draw.len, &mut plan.stream("posterior", draw.repeat, draw.number));
     reconstructor.denormalise(&mut made);
     if !made.iter().all(|v| v.is_finite()) {
-        let text = "a reconstruction is not finite; what made it has not been trained well";
+        let text = "a reconstruction is not finite; its model is not trained well enough";
         return Err(StageError::Input(text.into()));
     }
     Ok(made)

@@ -61,7 +61,11 @@ pub(super) fn gather(cx: &dyn AttemptContext, plan: &Plan<'_>, shards: &[Digest]
     let found: BTreeSet<Unit> = all.made.keys().chain(all.many.keys()).copied().collect();
     let expected: BTreeSet<Unit> = plan.units().into_iter().collect();
     if found != expected {
-        return Err(StageError::Fault(format!("{} blocks of motions, expected {}", found.len(), expected.len())));
+        return Err(StageError::Fault(format!(
+            "the shards have {} blocks of motions; expected {}",
+            found.len(),
+            expected.len()
+        )));
     }
     Ok(all)
 }

@@ -67,10 +67,9 @@ impl<'a> Plan<'a> {
         let blobs = cx.blobs();
         let refuse = |text: String| Err(StageError::Input(text));
         if settings.repeats == 0 || settings.pools.is_empty() {
-            return refuse("`repeats` and `pools` must say at least 1".into());
+            return refuse("`repeats` and `pools` must be at least 1".into());
         }
-        let (_, manifest) = artifacts::input(cx, "dataset", ArtifactKind::Dataset)?;
-        let dataset = artifacts::dataset(&*blobs, &manifest)?;
+        let dataset = artifacts::input_dataset(cx)?;
         let (evaluator, manifest) = artifacts::input(cx, "evaluator", ArtifactKind::Evaluator)?;
         let trained = TrainedEvaluator::read(&*blobs, &manifest, &cx.device())?;
         let pool = settings.largest_pool();
@@ -83,14 +82,14 @@ impl<'a> Plan<'a> {
         }
         if entries.len() < pool {
             let instead = match taken {
-                Split::All => "there are no more in the dataset; take smaller `pools`",
+                Split::All => "the dataset has no more; use smaller `pools`",
                 Split::Test => "set `split: all`, or `all_if_small: true`, or smaller `pools`",
                 Split::Train | Split::Val => {
-                    "set `split: all`, `split: test` for a last look, `all_if_small: true`, or smaller `pools`"
+                    "set `split: all`, `split: test` (for final results only), `all_if_small: true`, or smaller `pools`"
                 }
             };
             return refuse(format!(
-                "the split `{}` has {} entries, R-precision ranks a motion among {pool}; {instead}",
+                "the split `{}` has {} entries, but R-precision needs pools of {pool}; {instead}",
                 word(&taken),
                 entries.len()
             ));

@@ -53,7 +53,7 @@ impl WithWords {
         let captions = artifacts::captions(&*blobs, &manifest)?;
         if captions.len() != data.embeddings.meta.captions {
             return Err(StageError::Input(format!(
-                "`text` embeds {} captions, `dataset` has {}; both must be of one dataset",
+                "`text` embeds {} captions, but `dataset` has {}; use embeddings of the same dataset",
                 data.embeddings.meta.captions,
                 captions.len()
             )));
