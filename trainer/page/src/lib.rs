@@ -40,8 +40,18 @@ pub const VIEWER: &str = include_str!("../static/viewer.js");
 pub const VIEWER_STYLE: &str = include_str!("../static/viewer.css");
 
 /// The addresses at which the page itself is shown: each is a view. What stands behind the last slash is the page's to read.
-pub const VIEWS: [&str; 8] =
-    ["/", "/runs", "/runs/{*rest}", "/compare", "/models", "/models/{*rest}", "/workers", "/store"];
+pub const VIEWS: [&str; 10] = [
+    "/",
+    "/runs",
+    "/runs/{*rest}",
+    "/compare",
+    "/data",
+    "/data/{*rest}",
+    "/models",
+    "/models/{*rest}",
+    "/workers",
+    "/store",
+];
 
 macro_rules! files {
     ($($name:literal),* $(,)?) => {
@@ -50,7 +60,7 @@ macro_rules! files {
 }
 
 /// Everything that lies in `static` but licences.
-static FILES: [(&str, &[u8]); 33] = files![
+static FILES: [(&str, &[u8]); 36] = files![
     "index.html",
     "icon.svg",
     "style.css",
@@ -66,6 +76,8 @@ static FILES: [(&str, &[u8]); 33] = files![
     "log.js",
     "rates.js",
     "viewer.js",
+    "motions.js",
+    "features.js",
     "viewer.css",
     "settings.js",
     "history.js",
@@ -77,6 +89,7 @@ static FILES: [(&str, &[u8]); 33] = files![
     "views/run.js",
     "views/stage.js",
     "views/compare.js",
+    "views/data.js",
     "views/models.js",
     "views/workers.js",
     "views/store.js",

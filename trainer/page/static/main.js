@@ -6,6 +6,7 @@ import { start as startRouter, go, words } from "./router.js";
 import { currentWho, setWho } from "./session.js";
 import { html, nothing, render } from "./vendor/lit-html.js";
 import { compare } from "./views/compare.js";
+import { dataset, datasets } from "./views/data.js";
 import { login } from "./views/login.js";
 import { model, models } from "./views/models.js";
 import { now } from "./views/now.js";
@@ -41,6 +42,8 @@ function viewAt(at, context) {
   if (first === "runs" && second === undefined) return runs(context);
   if (first === "runs" && second !== undefined && third !== undefined) return stage(context, second, third);
   if (first === "runs" && second !== undefined) return run(context, second);
+  if (first === "data" && second !== undefined) return dataset(context, second);
+  if (first === "data") return datasets(context);
   if (first === "compare") return compare(context);
   if (first === "models" && second === undefined) return models(context);
   if (first === "models" && second !== undefined) return model(context, second);
@@ -54,6 +57,7 @@ const PLACES = [
   ["/", "Now", "now"],
   ["/runs", "Runs", "runs"],
   ["/models", "Models", "models"],
+  ["/data", "Data", "data"],
   ["/workers", "Workers", "workers"],
   ["/store", "Store", "store"],
 ];

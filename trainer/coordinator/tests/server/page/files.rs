@@ -7,7 +7,19 @@ async fn the_page_is_shown_without_a_token_and_may_load_nothing_from_elsewhere()
     let dir = tempfile::tempdir().unwrap();
     let handle = with_tokens(dir.path()).await;
     let address = handle.address();
-    for view in ["/", "/runs", "/runs/a-1", "/runs/a-1/vae", "/models", "/models/m", "/compare", "/workers", "/store"] {
+    for view in [
+        "/",
+        "/runs",
+        "/runs/a-1",
+        "/runs/a-1/vae",
+        "/models",
+        "/models/m",
+        "/compare",
+        "/data",
+        "/data/d",
+        "/workers",
+        "/store",
+    ] {
         let answer = call(address, "GET", view, &[]);
         assert_eq!(answer.status, 200, "{view}");
         assert_eq!(answer.body, page::index().bytes, "{view}");

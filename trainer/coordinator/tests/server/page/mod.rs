@@ -1,6 +1,7 @@
 //! The page: its files, sessions of browsers, and what a browser shows of runs whose every text is hostile.
 
 mod beside;
+mod clips;
 mod files;
 mod http;
 mod in_browser;
