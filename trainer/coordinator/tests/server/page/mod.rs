@@ -1,6 +1,6 @@
 //! The page: its files, sessions of browsers, and what a browser shows of runs whose every text is hostile.
 
 mod files;
-mod http;
+pub(crate) mod http;
 mod in_browser;
 mod sessions;
