@@ -13,13 +13,14 @@ use std::io::{self, Read as _, Write as _};
 use std::os::unix::fs::{FileExt as _, OpenOptionsExt as _};
 use std::path::{Path, PathBuf};
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// The size at which a file is rotated: some 100,000 lines.
 pub const FILE_BYTES: u64 = 16 << 20;
 
 /// One call, or several equal calls.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct AuditEntry {
     /// Time of the first call, in milliseconds since 1970.
     pub at_ms: i64,

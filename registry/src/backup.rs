@@ -21,6 +21,7 @@ use std::path::{Path, PathBuf};
 
 use checkpoint::{BLOBS, BlobError, blob_path};
 use protocol::Digest;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest as _, Sha256};
 
@@ -38,7 +39,7 @@ const MANIFEST: &str = "backup.json";
 const FORMAT: u32 = 1;
 
 /// Summary of a backup or a restored store.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct Summary {
     /// Identity of the store.
     pub store: StoreId,

@@ -5,13 +5,15 @@
 //!
 //! Every value counts in its bucket; none is left out by chance. A value that is not finite is counted and hides no other.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// A value after a step. A missing number is NaN, and `null` in JSON.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Point {
     pub step: u64,
     #[serde(deserialize_with = "null_is_nan")]
+    #[schemars(with = "Option<f64>")]
     pub value: f64,
 }
 
@@ -20,7 +22,7 @@ fn null_is_nan<'de, D: serde::Deserializer<'de>>(deserializer: D) -> Result<f64,
 }
 
 /// The values of one key of one stage.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Curve {
     /// Ordered by step.
     pub points: Vec<Point>,
@@ -40,7 +42,7 @@ impl Page {
 }
 
 /// Axis that a curve is drawn over.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Axis {
     #[default]
@@ -64,20 +66,25 @@ pub struct Window {
 
 /// A curve in buckets of neighbouring values, column by column. A bucket holds all values after the bucket before, up to its place. A number
 /// that there is not is NaN, and `null` in JSON.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Buckets {
     /// The place of each bucket's last value on the axis.
     #[serde(deserialize_with = "nulls_are_nan")]
+    #[schemars(with = "Vec<Option<f64>>")]
     pub x: Vec<f64>,
     /// The smallest, the largest and the mean of the finite values.
     #[serde(deserialize_with = "nulls_are_nan")]
+    #[schemars(with = "Vec<Option<f64>>")]
     pub min: Vec<f64>,
     #[serde(deserialize_with = "nulls_are_nan")]
+    #[schemars(with = "Vec<Option<f64>>")]
     pub max: Vec<f64>,
     #[serde(deserialize_with = "nulls_are_nan")]
+    #[schemars(with = "Vec<Option<f64>>")]
     pub mean: Vec<f64>,
     /// The last value, if it is finite.
     #[serde(deserialize_with = "nulls_are_nan")]
+    #[schemars(with = "Vec<Option<f64>>")]
     pub last: Vec<f64>,
     /// Number of values, and number of values that are not finite.
     pub count: Vec<u64>,

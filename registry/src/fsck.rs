@@ -1,5 +1,6 @@
 //! Check of a whole store: the database's own check, every blob hashed again, every reference resolved.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::blob::BlobStore;
@@ -7,7 +8,7 @@ use crate::catalog::Root;
 use crate::{QueryError, ReadStore};
 
 /// Result of a check.
-#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct Report {
     /// Number of hashed blobs.
     pub blobs: u64,

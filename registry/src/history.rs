@@ -1,10 +1,11 @@
 //! Entries of the history of runs, stages and workers.
 
 use protocol::{ModelName, RunId, StageName, TaskId, WorkerId};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// Kind of an event.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum HistoryKind {
     /// A run was submitted.
@@ -93,7 +94,7 @@ impl HistoryKind {
 }
 
 /// One event, with everything that it is about.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct HistoryEntry {
     pub kind: HistoryKind,
     #[serde(default, skip_serializing_if = "Option::is_none")]

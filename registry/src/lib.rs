@@ -43,7 +43,8 @@ mod write;
 pub use blob::BlobStore;
 pub use blob::place::Place;
 pub use catalog::{
-    CheckpointRow, EndedRow, HistoryQuery, HistoryRow, LineageNode, LogRow, Recovery, RunRow, StageResultRow, Usage,
+    CheckpointRow, EndedRow, HistoryQuery, HistoryRow, LineageNode, LogRow, Recovery, RunListQuery, RunOrder, RunPage,
+    RunRow, StageResultRow, Usage,
 };
 pub use curve::{Axis, Buckets, Curve, Page, Point, Window};
 pub use error::{QueryError, WriteError};

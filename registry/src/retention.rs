@@ -22,6 +22,7 @@ use checkpoint::BlobError;
 use futures::{StreamExt as _, TryStreamExt as _, stream};
 use protocol::artifact::mentioned;
 use protocol::{Digest, TaskId};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::blob::{BlobStore, Entry, ManifestError};
@@ -35,7 +36,7 @@ use crate::{QueryError, ReadStore, Store, WriteError, clock};
 pub const GRACE_MS: i64 = 60 * 60 * 1000;
 
 /// Blobs that a collection removes, or would remove.
-#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct Plan {
     /// Unneeded blobs by digest.
     pub remove: Vec<Digest>,

@@ -13,8 +13,8 @@ use protocol::{Alias, Digest, Group, ModelName, RunId, StageName, TaskId};
 
 use crate::QueryError;
 use crate::catalog::{
-    CheckpointRow, EndedRow, HistoryQuery, HistoryRow, LineageNode, LogRow, Needs, Records, Recovery, RunRow,
-    StageResultRow, Usage,
+    CheckpointRow, EndedRow, HistoryQuery, HistoryRow, LineageNode, LogRow, Needs, Records, Recovery, RunListQuery,
+    RunPage, RunRow, StageResultRow, Usage,
 };
 use crate::curve::{Buckets, Curve, Page, Window};
 use crate::store_id::Stored;
@@ -73,12 +73,12 @@ impl Records for ScopedRecords {
         if self.sees_run(run).await? { self.all.ended(run).await } else { Ok(None) }
     }
 
-    async fn ended_views(&self, before: Option<&RunId>, limit: u32) -> Result<Vec<(RunId, String)>> {
-        self.all.ended_views_of(&self.group, before, limit).await
+    async fn run_list(&self, asked: &RunListQuery) -> Result<RunPage> {
+        self.all.run_list_of(&self.group, asked).await
     }
 
-    async fn ended_views_of(&self, group: &Group, before: Option<&RunId>, limit: u32) -> Result<Vec<(RunId, String)>> {
-        if *group == self.group { self.all.ended_views_of(group, before, limit).await } else { Ok(Vec::new()) }
+    async fn run_list_of(&self, group: &Group, asked: &RunListQuery) -> Result<RunPage> {
+        if *group == self.group { self.all.run_list_of(group, asked).await } else { Ok(RunPage::default()) }
     }
 
     async fn ended_before(&self, before_ms: i64) -> Result<Vec<RunId>> {
@@ -164,6 +164,10 @@ impl Records for ScopedRecords {
 
     async fn timeline_of(&self, group: &Group, asked: &HistoryQuery) -> Result<Vec<HistoryRow>> {
         if *group == self.group { self.all.timeline_of(group, asked).await } else { Ok(Vec::new()) }
+    }
+
+    async fn history_span(&self) -> Result<(Option<i64>, i64)> {
+        self.all.history_span().await
     }
 
     async fn run_times(&self, runs: &[RunId]) -> Result<BTreeMap<RunId, Times>> {

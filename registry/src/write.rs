@@ -55,6 +55,8 @@ pub enum Write {
         /// Unique if given.
         idempotency_key: Option<String>,
     },
+    /// The digest of a run's submission as it was sent; see [`RunRow::submission`](crate::RunRow::submission).
+    Submission { run: RunId, digest: Digest },
     /// The group that owns a run.
     RunOwner {
         run: RunId,
@@ -188,6 +190,7 @@ impl Write {
             | Self::Snapshot { .. }
             | Self::Fence { .. }
             | Self::Run { .. }
+            | Self::Submission { .. }
             | Self::RunOwner { .. }
             | Self::ModelOwner { .. }
             | Self::RunState { .. }
@@ -213,6 +216,7 @@ impl Write {
             | Self::Snapshot { .. }
             | Self::Fence { .. }
             | Self::Run { .. }
+            | Self::Submission { .. }
             | Self::RunOwner { .. }
             | Self::ModelOwner { .. }
             | Self::RunState { .. }

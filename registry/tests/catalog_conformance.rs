@@ -14,7 +14,7 @@ use protocol::{Alias, ArtifactKind, Digest, FileEntry, Manifest, ModelName, RunI
 use registry::catalog::{Catalog, Done, Order, PromoteOrder, Records, RollbackOrder, Which};
 use registry::testing::slow::SlowBucket;
 use registry::versions::Action;
-use registry::{BlobStore, Expect, Page, Pick, QueryError, Store, Write, WriteError};
+use registry::{BlobStore, Expect, Page, Pick, QueryError, RunListQuery, RunOrder, Store, Write, WriteError};
 use serde_json::json;
 use tempfile::TempDir;
 
@@ -497,9 +497,15 @@ async fn a_run_that_ended_answers_from_its_view_until_it_is_forgotten(place: &im
     let refused = opened.catalog().commit(Order::Forget("a".into())).await;
     assert!(matches!(refused, Err(WriteError::Conflict(_))), "it is running");
     opened.write(vec![ended("a", "finished"), ended("b", "failed")]).await.unwrap();
-    let views = records.ended_views(None, 10).await.unwrap();
-    assert_eq!(views.iter().map(|(run, _)| run.as_str()).collect::<Vec<_>>(), ["a", "b"]);
-    assert_eq!(records.ended_views(None, 1).await.unwrap()[0].0.as_str(), "b", "of more than asked for the newest");
+    let asked = RunListQuery { limit: 10, order: RunOrder::Oldest, ..RunListQuery::default() };
+    let listed = records.run_list(&asked).await.unwrap();
+    let states: Vec<_> = listed.rows.iter().map(|row| (row.run.as_str(), row.state.name())).collect();
+    assert_eq!(states, [("a", "finished"), ("b", "failed"), ("c", "running")]);
+    let asked = RunListQuery { limit: 1, ..RunListQuery::default() };
+    let newest = records.run_list(&asked).await.unwrap();
+    assert_eq!(newest.rows[0].run.as_str(), "c");
+    let before = records.run_list(&RunListQuery { after: newest.next, ..asked }).await.unwrap();
+    assert_eq!((before.rows[0].run.as_str(), before.next.is_some()), ("b", true));
     assert!(records.ended(&"a".into()).await.unwrap().unwrap().archive.contains("archived"));
     assert_eq!(records.ended_before(i64::MAX).await.unwrap().len(), 2);
     assert!(records.ended_before(0).await.unwrap().is_empty());

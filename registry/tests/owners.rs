@@ -4,8 +4,8 @@
 mod common;
 
 use common::{artifact, open, result, version};
-use protocol::{ArtifactKind, Digest, Group, ModelName, Owner, RunId};
-use registry::{QueryError, Store, Write, WriteError};
+use protocol::{ArtifactKind, Digest, Group, ModelName, Owner};
+use registry::{QueryError, RunListQuery, RunOrder, RunPage, Store, Write, WriteError};
 use serde_json::json;
 
 fn owner(name: &str, project: Option<&str>, admin: bool) -> Owner {
@@ -98,9 +98,18 @@ async fn an_ended_run_is_seen_by_its_group_and_forgotten_with_its_owner() {
     store.write(vec![Write::RunOwner { run: "mine-1".into(), owner: group.clone() }]).await.unwrap();
     store.write(vec![Write::RunOwner { run: "others-2".into(), owner: Group::of("bob", None) }]).await.unwrap();
     let seen = store.seen_by(&group);
-    let views = |views: Vec<(RunId, String)>| views.into_iter().map(|(run, _)| run.to_string()).collect::<Vec<_>>();
-    assert_eq!(views(seen.ended_views(None, 10).await.unwrap()), ["mine-1"]);
-    assert_eq!(views(store.ended_views(None, 10).await.unwrap()), ["mine-1", "others-2", "nobodys-3"]);
+    let names = |page: RunPage| page.rows.into_iter().map(|row| row.run.to_string()).collect::<Vec<_>>();
+    let all = RunListQuery { limit: 10, order: RunOrder::Oldest, ..RunListQuery::default() };
+    let of = |owner: &Group| RunListQuery { owner: Some(owner.clone()), ..all.clone() };
+    assert_eq!(names(seen.run_list(&all).await.unwrap()), ["mine-1"]);
+    assert_eq!(names(store.run_list(&all).await.unwrap()), ["mine-1", "others-2", "nobodys-3"]);
+    assert_eq!(names(store.run_list(&of(&Group::of("bob", None))).await.unwrap()), ["others-2"]);
+    assert!(names(seen.run_list(&of(&Group::of("bob", None))).await.unwrap()).is_empty(), "asked for by another");
+    let found = RunListQuery { words: "OTHERS".into(), ..all.clone() };
+    assert_eq!(
+        (names(seen.run_list(&found).await.unwrap()).len(), names(store.run_list(&found).await.unwrap()).len()),
+        (0, 1)
+    );
     assert!(
         seen.ended(&"mine-1".into()).await.unwrap().is_some()
             && seen.ended(&"others-2".into()).await.unwrap().is_none()
@@ -110,4 +119,5 @@ async fn an_ended_run_is_seen_by_its_group_and_forgotten_with_its_owner() {
     assert_eq!(seen.runs().await.unwrap().len(), 1);
     store.forget(&"mine-1".into()).await.unwrap();
     assert!(store.run_owners(&["mine-1".into()]).await.unwrap().is_empty());
+    assert_eq!(names(store.run_list(&all).await.unwrap()), ["others-2", "nobodys-3"]);
 }

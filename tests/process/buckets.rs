@@ -30,8 +30,7 @@ fn a_run_on_a_bucket_that_is_killed_and_goes_on_gives_the_digests_of_a_folder() 
     bench.run(&["registry", "fsck"]).expect_code(0);
 
     let interrupted = bench.run(&["status", "--all", "-o", "json"]).expect_code(0).json()["runs"][0].clone();
-    let done = interrupted["stages"].as_array().expect("stages").iter().filter(|stage| stage["state"] == "ran");
-    assert!(done.count() > 0, "{interrupted:#}");
+    assert!(interrupted["done"].as_u64() > Some(0), "{interrupted:#}");
 
     // The store remembers where its blobs are, and the same run continues.
     let report = bench.pipeline("smoke.yaml", &until);

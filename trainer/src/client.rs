@@ -6,10 +6,10 @@ use std::path::Path;
 use access::{Server, ServerOptions, explain, local};
 use coordinator::shell::{CurveSeries, Curves, StageMetrics};
 use coordinator::{Config, Coordinator, Handle, WorkerView};
-use protocol::message::{ApiError, RunView, Submit};
+use protocol::message::{ApiError, Listing, RunSummary, RunView, Submit};
 use protocol::{Digest, RunId};
 use registry::cli::{Answer, Command};
-use registry::{Axis, Holder, LogRow, Page, ReadStore, Store, Window};
+use registry::{Axis, Holder, LogRow, Page, ReadStore, RunListQuery, RunOrder, Store, Window};
 use reqwest::{Method, RequestBuilder, Response, StatusCode};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
@@ -137,10 +137,14 @@ impl Client {
         Ok(self.post::<coordinator::shell::Submitted>("/v1/runs", submit).await?.run)
     }
 
-    /// The newest runs by submission, or those before a run: at most `limit`, and at most the server's page size.
-    pub(crate) async fn runs_before(&self, before: Option<&RunId>, limit: u32) -> Result<Vec<RunView>> {
-        let before = before.map(|run| format!("&before={run}")).unwrap_or_default();
-        self.get(&format!("/v1/runs?limit={limit}{before}")).await
+    /// A part of the list of runs, in the order of submissions.
+    pub(crate) async fn run_list(&self, asked: &RunListQuery) -> Result<Listing<RunSummary>> {
+        let sort = if asked.order == RunOrder::Oldest { "oldest" } else { "newest" };
+        let mut query = vec![("limit", asked.limit.to_string()), ("sort", sort.to_owned())];
+        query.extend(asked.pipeline.as_ref().map(|pipeline| ("pipeline", pipeline.clone())));
+        query.extend((!asked.words.is_empty()).then(|| ("q", asked.words.clone())));
+        query.extend(asked.after.as_ref().map(|after| ("after", after.clone())));
+        self.get(&with_query("/v1/runs", &query)).await
     }
 
     pub(crate) async fn run(&self, run: &RunId) -> Result<RunView> {

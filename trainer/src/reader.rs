@@ -3,16 +3,18 @@
 
 use coordinator::shell::CurveSeries;
 use coordinator::{Records, WorkerView};
-use protocol::message::RunView;
+use protocol::message::{Listing, RunSummary, RunView};
 use protocol::{Digest, RunId, StageName, limits};
 use registry::cli::{Answer, Command};
-use registry::{LogRow, Page, Point, Window};
+use registry::{LogRow, Page, Point, RunListQuery, RunOrder, Window};
 
 use crate::client::{Client, Target};
 use crate::report::problem::{Problem, Result, exit};
 
 /// Lines of a log per request.
 const LINES: u32 = 1000;
+/// Largest number of runs that an error names.
+const NAMED: usize = 10;
 
 /// A source of runs and models.
 #[derive(Debug)]
@@ -44,34 +46,35 @@ impl Reader {
         matches!(self, Self::Server(_))
     }
 
-    /// All runs by submission.
-    pub(crate) async fn runs(&self) -> Result<Vec<RunView>> {
+    /// All runs by submission, the oldest first.
+    pub(crate) async fn runs(&self) -> Result<Vec<RunSummary>> {
+        let mut asked = RunListQuery { limit: limits::RUNS_LISTED, order: RunOrder::Oldest, ..RunListQuery::default() };
         let mut all = Vec::new();
         loop {
-            let before = all.last().map(|run: &RunView| run.run.clone());
-            let mut part = self.runs_before(before.as_ref(), limits::RUNS_LISTED).await?;
-            if part.is_empty() {
-                all.reverse();
+            let mut part = self.run_list(&asked).await?;
+            all.append(&mut part.items);
+            asked.after = part.next;
+            if asked.after.is_none() {
                 return Ok(all);
             }
-            part.reverse();
-            all.append(&mut part);
         }
     }
 
-    /// The newest runs by submission, or those before a run.
-    async fn runs_before(&self, before: Option<&RunId>, limit: u32) -> Result<Vec<RunView>> {
-        let records = match self {
-            Self::Server(client) => return client.runs_before(before, limit).await,
-            Self::Store(records) => records,
-        };
-        let read = |view: String| {
-            serde_json::from_str(&view).map_err(|error| {
-                Problem::failed(format!("cannot parse the stored data of a run: {error}"))
-                    .hint("use the build that wrote it")
-            })
-        };
-        records.run_views(before, limit).await?.into_iter().map(read).collect()
+    /// The newest run, or the newest of a pipeline.
+    pub(crate) async fn newest(&self, pipeline: Option<&str>) -> Result<Option<RunView>> {
+        let asked = RunListQuery { pipeline: pipeline.map(str::to_owned), limit: 1, ..RunListQuery::default() };
+        match self.run_list(&asked).await?.items.first() {
+            Some(newest) => Ok(Some(self.run(&newest.run).await?)),
+            None => Ok(None),
+        }
+    }
+
+    /// A part of the list of runs.
+    pub(crate) async fn run_list(&self, asked: &RunListQuery) -> Result<Listing<RunSummary>> {
+        match self {
+            Self::Server(client) => client.run_list(asked).await,
+            Self::Store(records) => Ok(records.run_list(asked).await?),
+        }
     }
 
     pub(crate) async fn run(&self, run: &RunId) -> Result<RunView> {
@@ -144,23 +147,36 @@ impl Reader {
 
     /// Finds a run by its name, a unique beginning of it, or `@last`.
     pub(crate) async fn find(&self, text: &str) -> Result<RunView> {
-        let runs = if text == "@last" { self.runs_before(None, 1).await? } else { self.runs().await? };
         let not_found = |message: String| Problem::new(exit::NOT_FOUND, anyhow::anyhow!("{message}"));
         if text == "@last" {
-            return runs.into_iter().next_back().ok_or_else(|| {
-                not_found("there are no runs yet".into()).hint("`trainer run configs/quickstart.yaml` starts one")
-            });
+            let hint = "`trainer run configs/quickstart.yaml` starts one";
+            return self.newest(None).await?.ok_or_else(|| not_found("there are no runs yet".into()).hint(hint));
         }
-        if let Some(exact) = runs.iter().find(|run| run.run.as_str() == text) {
-            return Ok(exact.clone());
+        // A path of a call has no further part.
+        if !text.is_empty() && text.bytes().all(|byte| byte.is_ascii_alphanumeric() || b"._-".contains(&byte)) {
+            match self.run(&RunId::from(text)).await {
+                Err(problem) if problem.exit == exit::NOT_FOUND => {}
+                found => return found,
+            }
         }
-        let begins: Vec<&RunView> = runs.iter().filter(|run| run.run.as_str().starts_with(text)).collect();
+        let mut begins: Vec<RunId> = Vec::new();
+        let mut asked = RunListQuery { words: text.to_owned(), limit: limits::RUNS_LISTED, ..RunListQuery::default() };
+        loop {
+            let part = self.run_list(&asked).await?;
+            begins.extend(part.items.into_iter().map(|row| row.run).filter(|run| run.as_str().starts_with(text)));
+            asked.after = part.next;
+            if asked.after.is_none() || begins.len() >= NAMED {
+                break;
+            }
+        }
         match begins.as_slice() {
-            [run] => Ok((*run).clone()),
+            [run] => self.run(run).await,
             [] => Err(not_found(format!("there is no run `{text}`")).hint("`trainer status --all` lists runs")),
             several => {
-                let names: Vec<&str> = several.iter().map(|run| run.run.as_str()).collect();
-                Err(Problem::usage(format!("`{text}` could be {}", names.join(", "))).hint("write more of the name"))
+                let more = if several.len() > NAMED { " or another one" } else { "" };
+                let names: Vec<&str> = several.iter().take(NAMED).map(RunId::as_str).collect();
+                let message = format!("`{text}` could be {}{more}", names.join(", "));
+                Err(Problem::usage(message).hint("write more of the name"))
             }
         }
     }

@@ -31,8 +31,8 @@ use protocol::stage::Keep;
 use protocol::{Alias, Digest, Group, ModelName, RunId, StageName, TaskId};
 
 pub use rows::{
-    CheckpointRow, EndedRow, HistoryQuery, HistoryRow, LineageNode, LogRow, Needs, Recovery, Root, RunRow,
-    StageResultRow, Usage,
+    CheckpointRow, EndedRow, HistoryQuery, HistoryRow, LineageNode, LogRow, Needs, Recovery, Root, RunListQuery,
+    RunOrder, RunPage, RunRow, StageResultRow, Usage,
 };
 
 use crate::curve::{Buckets, Curve, Page, Window};
@@ -55,11 +55,11 @@ pub trait Records: Debug + Send + Sync {
     /// Returns the stored data of an ended run; `None` if it has never ended.
     async fn ended(&self, run: &RunId) -> Result<Option<EndedRow>>;
 
-    /// Returns the views of ended runs as JSON, oldest first: the newest `limit`, or the newest `limit` submitted before a run.
-    async fn ended_views(&self, before: Option<&RunId>, limit: u32) -> Result<Vec<(RunId, String)>>;
+    /// Returns a part of the list of runs, without reading the rest of it.
+    async fn run_list(&self, asked: &RunListQuery) -> Result<RunPage>;
 
-    /// Returns the views of ended runs as [`Self::ended_views`] does, for one group.
-    async fn ended_views_of(&self, group: &Group, before: Option<&RunId>, limit: u32) -> Result<Vec<(RunId, String)>>;
+    /// The same for the runs of one group.
+    async fn run_list_of(&self, group: &Group, asked: &RunListQuery) -> Result<RunPage>;
 
     /// Returns the groups that own the runs. Runs of the store's own user, or without an owner, are missing.
     async fn run_owners(&self, runs: &[RunId]) -> Result<BTreeMap<RunId, Group>>;
@@ -137,6 +137,9 @@ pub trait Records: Debug + Send + Sync {
 
     /// The same; what happened to runs of other groups is left out.
     async fn timeline_of(&self, group: &Group, asked: &HistoryQuery) -> Result<Vec<HistoryRow>>;
+
+    /// Returns the ids of the oldest row of the history and of the newest one ever added.
+    async fn history_span(&self) -> Result<(Option<i64>, i64)>;
 
     /// Returns the times of runs. Their views do not have them.
     async fn run_times(&self, runs: &[RunId]) -> Result<BTreeMap<RunId, Times>>;

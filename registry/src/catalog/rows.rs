@@ -2,7 +2,9 @@
 
 use std::collections::{BTreeMap, HashMap};
 
-use protocol::{Attempt, Digest, RunId, StageName, TaskId, WorkerId};
+use protocol::message::{RunState, RunSummary};
+use protocol::{Attempt, Digest, Group, RunId, StageName, TaskId, WorkerId};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
@@ -20,10 +22,49 @@ pub struct RunRow {
     pub state: String,
     /// Unique if given.
     pub idempotency_key: Option<String>,
+    /// Digest of the submission as it was sent, if it had an idempotency key.
+    pub submission: Option<String>,
     /// Time of submission, in milliseconds since 1970.
     pub created_ms: i64,
     /// Time of the last change, in milliseconds since 1970.
     pub updated_ms: i64,
+}
+
+/// A part of the list of runs.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct RunListQuery {
+    /// Only runs in one of these states; all, if there are none.
+    pub states: Vec<RunState>,
+    /// Only runs of this pipeline, and of this group of tokens.
+    pub pipeline: Option<String>,
+    pub owner: Option<Group>,
+    /// Only runs whose name, pipeline, owner or note contains each of these words, in any case.
+    pub words: String,
+    pub order: RunOrder,
+    /// [`RunPage::next`] of an earlier answer to the same question.
+    pub after: Option<String>,
+    pub limit: u32,
+}
+
+/// Order of a list of runs.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum RunOrder {
+    /// The newest submission first.
+    #[default]
+    Newest,
+    /// The oldest submission first.
+    Oldest,
+    /// The newest change of a run's state first.
+    Changed,
+}
+
+/// Some runs of a list.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct RunPage {
+    pub rows: Vec<RunSummary>,
+    /// Place at which the list continues, unless this is its end. A search may return few rows and still continue.
+    pub next: Option<String>,
 }
 
 /// Data from which a coordinator recovers, with decision numbers.
@@ -51,7 +92,7 @@ pub struct HistoryQuery {
 }
 
 /// An event as stored.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct HistoryRow {
     /// Grows from row to row.
     pub id: i64,
@@ -117,7 +158,7 @@ pub struct Usage {
 }
 
 /// A stored log line.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct LogRow {
     /// Increasing number; a reader continues after the last one it has seen.
     pub id: i64,
@@ -133,7 +174,7 @@ pub struct LogRow {
 }
 
 /// An artifact with the artifacts it was made from.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct LineageNode {
     pub digest: Digest,
     /// Kind of the artifact, if a stage made it.

@@ -2,13 +2,14 @@
 
 use access::Scope;
 use clap::{ArgAction, Subcommand};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::leaderboard::Style;
 use crate::versions::Expect;
 
 /// A request to a registry. Clients send it as JSON.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Subcommand)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema, Subcommand)]
 #[serde(tag = "command", rename_all = "kebab-case")]
 pub enum Command {
     /// Lists models with their versions and aliases

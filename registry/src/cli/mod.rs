@@ -18,6 +18,7 @@ use checkpoint::model::{self, Model as ModelMeta, Parts};
 use protocol::artifact::Role;
 use protocol::message::ApiError;
 use protocol::{Alias, Digest, Manifest, ModelName, RunId};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 pub use args::{Output, OutputArg, Verb};
@@ -48,7 +49,7 @@ Exit codes:
    10  a gate does not hold; nothing was changed";
 
 /// Result of a command.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(tag = "kind", rename_all = "kebab-case")]
 #[expect(missing_docs, reason = "each field is the type it holds")]
 pub enum Data {
@@ -105,7 +106,7 @@ pub enum Data {
 }
 
 /// Answer to a command.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Answer {
     /// The process's exit code.
     pub exit: u8,

@@ -16,6 +16,7 @@ pub(crate) use print::in_words;
 
 use std::collections::BTreeMap;
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::versions::Version;
@@ -24,7 +25,7 @@ pub use print::Style;
 pub use row::{Measure, Row};
 
 /// Direction in which a metric is better.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Better {
     /// A smaller value is better, such as a distance.
@@ -93,7 +94,7 @@ fn better(key: &str) -> Better {
 }
 
 /// A table of rows.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Leaderboard {
     /// Title of the table.
     pub title: String,
@@ -102,7 +103,7 @@ pub struct Leaderboard {
 }
 
 /// Result of comparing two values.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Verdict {
     /// The left value is better, beyond noise.
@@ -118,7 +119,7 @@ pub enum Verdict {
 }
 
 /// One metric of two models.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Difference {
     pub metric: String,
     /// Value of the left model.
@@ -132,7 +133,7 @@ pub struct Difference {
 }
 
 /// A comparison of two models, metric by metric.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Comparison {
     /// Left version, as `MODEL:VERSION`.
     pub left: String,

@@ -2,12 +2,13 @@
 
 use clap::ValueEnum;
 use comfy_table::{ContentArrangement, Table, presets};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::{Better, COLUMNS, Column, Comparison, Leaderboard, Measure, PAPER_COLUMNS, Row, Verdict};
 
 /// Format of a table.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, ValueEnum)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, ValueEnum, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Style {
     /// Plain text for a terminal

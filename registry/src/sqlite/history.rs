@@ -49,6 +49,15 @@ pub(super) async fn prune(conn: &mut SqliteConnection, before_ms: i64) -> Result
     run(conn, sqlx::query("DELETE FROM history WHERE at_ms < ?").bind(before_ms)).await
 }
 
+/// The ids of the oldest row and of the newest one ever added.
+pub(super) async fn span(conn: &mut SqliteConnection) -> Result<(Option<i64>, i64), QueryError> {
+    // The newest row may have been removed; its number is not given again.
+    let find =
+        "SELECT (SELECT min(id) FROM history), coalesce((SELECT seq FROM sqlite_sequence WHERE name = 'history'), 0)";
+    let row = sqlx::query(find).fetch_one(conn).await?;
+    Ok((row.try_get(0)?, row.try_get(1)?))
+}
+
 /// Rows in the order in which they happened. Those of runs of others than `group` are left out, if there is one.
 pub(super) async fn read(
     conn: &mut SqliteConnection,
@@ -123,7 +132,7 @@ pub(super) async fn run_times(
     runs: &[RunId],
 ) -> Result<BTreeMap<RunId, Times>, QueryError> {
     let find = "SELECT run, created_ms, (SELECT min(started_ms) FROM stage_times WHERE stage_times.run = runs.run) AS started_ms, \
-                CASE WHEN state IN ('finished', 'failed', 'cancelled') THEN updated_ms END AS ended_ms \
+                CASE WHEN state IN ('finished', 'failed', 'cancelled') THEN max(updated_ms, coalesce((SELECT max(ended_ms) FROM stage_times WHERE stage_times.run = runs.run), 0)) END AS ended_ms \
                 FROM runs WHERE run IN (SELECT value FROM json_each(?))";
     let times = |row: &SqliteRow| -> Result<(RunId, Times), QueryError> {
         let (created_ms, started_ms) = (row.try_get("created_ms")?, row.try_get("started_ms")?);

@@ -17,6 +17,7 @@ mod query;
 mod recording;
 mod retention;
 mod rows;
+mod run_list;
 mod statement;
 mod times;
 mod usage;

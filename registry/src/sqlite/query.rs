@@ -14,11 +14,11 @@ use sqlx::{Connection, Row, Sqlite, SqliteConnection, SqlitePool};
 use super::open::{open_copy, stored};
 use super::rows::{checkpoints, digest, run_row, stage_result};
 use super::statement::json;
-use super::{curves, history, logs, models, owners, retention, usage};
+use super::{curves, history, logs, models, owners, retention, run_list, usage};
 use crate::QueryError;
 use crate::catalog::{
-    CheckpointRow, EndedRow, HistoryQuery, HistoryRow, LineageNode, LogRow, Needs, Records, Recovery, RunRow,
-    StageResultRow, Usage,
+    CheckpointRow, EndedRow, HistoryQuery, HistoryRow, LineageNode, LogRow, Needs, Records, Recovery, RunListQuery,
+    RunPage, RunRow, StageResultRow, Usage,
 };
 use crate::curve::{Buckets, Curve, Page, Window};
 use crate::store_id::Stored;
@@ -81,23 +81,20 @@ impl Records for SqliteRecords {
         row.map(ended).transpose()
     }
 
-    async fn ended_views(&self, before: Option<&RunId>, limit: u32) -> Result<Vec<(RunId, String)>> {
+    async fn run_list(&self, asked: &RunListQuery) -> Result<RunPage> {
         let mut conn = self.connection().await?;
-        let find = "SELECT run, view FROM (SELECT rowid AS number, run, view FROM runs WHERE view IS NOT NULL \
-                    AND (?1 IS NULL OR rowid < (SELECT rowid FROM runs WHERE run = ?1)) \
-                    ORDER BY rowid DESC LIMIT ?2) ORDER BY number";
-        let rows = sqlx::query(find).bind(before.map(RunId::as_str)).bind(limit).fetch_all(&mut *conn).await?;
-        rows.iter().map(|row| Ok((RunId::new(row.try_get::<String, _>(0)?), row.try_get(1)?))).collect()
+        let mut moment = conn.begin().await?;
+        let page = run_list::page(&mut moment, asked, None).await?;
+        moment.rollback().await?;
+        Ok(page)
     }
 
-    async fn ended_views_of(&self, group: &Group, before: Option<&RunId>, limit: u32) -> Result<Vec<(RunId, String)>> {
+    async fn run_list_of(&self, group: &Group, asked: &RunListQuery) -> Result<RunPage> {
         let mut conn = self.connection().await?;
-        let find = "SELECT run, view FROM (SELECT runs.rowid AS number, run, view FROM run_owners JOIN runs USING (run) \
-                    WHERE owner = ?1 AND view IS NOT NULL AND (?2 IS NULL OR runs.rowid < (SELECT rowid FROM runs WHERE run = ?2)) \
-                    ORDER BY runs.rowid DESC LIMIT ?3) ORDER BY number";
-        let before = before.map(RunId::as_str);
-        let rows = sqlx::query(find).bind(group.as_str()).bind(before).bind(limit).fetch_all(&mut *conn).await?;
-        rows.iter().map(|row| Ok((RunId::new(row.try_get::<String, _>(0)?), row.try_get(1)?))).collect()
+        let mut moment = conn.begin().await?;
+        let page = run_list::page(&mut moment, asked, Some(group)).await?;
+        moment.rollback().await?;
+        Ok(page)
     }
 
     async fn run_owners(&self, runs: &[RunId]) -> Result<BTreeMap<RunId, Group>> {
@@ -184,6 +181,10 @@ impl Records for SqliteRecords {
 
     async fn timeline_of(&self, group: &Group, asked: &HistoryQuery) -> Result<Vec<HistoryRow>> {
         history::read(&mut *self.connection().await?, asked, Some(group)).await
+    }
+
+    async fn history_span(&self) -> Result<(Option<i64>, i64)> {
+        history::span(&mut *self.connection().await?).await
     }
 
     async fn run_times(&self, runs: &[RunId]) -> Result<BTreeMap<RunId, Times>> {

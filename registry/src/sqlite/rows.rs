@@ -44,6 +44,7 @@ pub(super) fn run_row(row: &SqliteRow) -> Result<RunRow> {
         source: row.try_get("source")?,
         state: row.try_get("state")?,
         idempotency_key: row.try_get("idempotency_key")?,
+        submission: row.try_get("submission")?,
         created_ms: row.try_get("created_ms")?,
         updated_ms: row.try_get("updated_ms")?,
     })

@@ -13,6 +13,7 @@ use std::str::FromStr;
 
 use protocol::Alias;
 use protocol::spelling::question;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// A comparison operator.
@@ -61,7 +62,7 @@ pub struct ParseGateError {
 }
 
 /// Result of a gate.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct GateResult {
     /// The gate as written.
     pub gate: String,

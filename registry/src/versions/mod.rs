@@ -13,6 +13,7 @@ use std::str::FromStr;
 
 use protocol::stage::Mode;
 use protocol::{Alias, Digest, ModelName};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
@@ -21,7 +22,7 @@ pub use protocol::model_ref::{BEST, LATEST, ModelRef, Pick};
 pub(crate) use rules::{compare, evaluate, gates, pick, previous, refuse_reserved, summary, unknown};
 
 /// A model in a listing.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Model {
     pub model: ModelName,
     /// The metric that ranks `@best`.
@@ -37,7 +38,7 @@ pub struct Model {
 }
 
 /// A registered artifact. Only its metrics can be extended.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Version {
     pub model: ModelName,
     /// Number of the version, from 1.
@@ -45,6 +46,7 @@ pub struct Version {
     /// Digest of a manifest of kind `model`.
     pub artifact: Digest,
     /// Metrics by name.
+    #[schemars(with = "BTreeMap<String, Option<f64>>")]
     pub metrics: BTreeMap<String, f64>,
     /// Origin: run, stage, stage key.
     pub source: Value,
@@ -55,7 +57,7 @@ pub struct Version {
 }
 
 /// Kind of an alias's move.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Action {
     /// A move by `promote`.
@@ -65,7 +67,7 @@ pub enum Action {
 }
 
 /// One move of an alias.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Promotion {
     /// Number of the log entry.
     pub id: i64,
@@ -88,8 +90,9 @@ pub struct Promotion {
 }
 
 /// Expected target of an alias.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(into = "String", try_from = "String")]
+#[schemars(with = "String")]
 pub enum Expect {
     /// The alias does not exist yet.
     None,

@@ -298,12 +298,12 @@ fn heartbeats(handle: &Handle) -> Result {
     beside(handle, "10,000 queued runs and submissions, 8 clients", 8, |caller| submit(caller, &small))?;
     // A client that reads all runs, page by page.
     let list = |caller: &mut Caller| {
-        let mut before = String::new();
+        let mut after = String::new();
         loop {
-            let (status, answer) = caller.call("GET", &format!("/v1/runs?limit=500{before}"), b"")?;
-            let views: Vec<serde_json::Value> = serde_json::from_slice(&answer)?;
-            match views.first().and_then(|view| view["run"].as_str()) {
-                Some(first) if status == 200 => before = format!("&before={first}"),
+            let (status, answer) = caller.call("GET", &format!("/v1/runs?limit=500{after}"), b"")?;
+            let list: serde_json::Value = serde_json::from_slice(&answer)?;
+            match list["next"].as_str() {
+                Some(next) if status == 200 => after = format!("&after={next}"),
                 _ => return Result::Ok(()),
             }
         }

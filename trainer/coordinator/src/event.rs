@@ -32,6 +32,8 @@ pub enum Event {
         source: String,
         /// Submissions with the same key create only one run.
         idempotency_key: Option<String>,
+        /// Digest of the submission as it was sent, for an idempotency key.
+        submission: Option<Digest>,
         /// The last stage to run.
         until: Option<StageName>,
         /// The owner of the submitting token.

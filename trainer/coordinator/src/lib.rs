@@ -15,6 +15,7 @@ pub mod failpoints;
 mod history;
 pub mod invariants;
 pub mod journal;
+mod note;
 pub mod observe;
 pub mod policy;
 pub mod register;

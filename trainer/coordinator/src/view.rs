@@ -4,13 +4,16 @@ use std::collections::BTreeSet;
 
 use pipeline::PipelineStage;
 use protocol::message::{
-    Assignment, DesiredAssignments, Prepare, Progress, Role, RunState, RunView, StageState, StageTask, StageView,
+    Assignment, DesiredAssignments, Prepare, Progress, Role, RunState, RunSummary, RunView, StageState, StageTask,
+    StageView,
 };
 use protocol::stage::{Backend, Shape};
 use protocol::units::grouped;
 use protocol::{Digest, Generation, Incarnation, StageName, TaskId, WorkerId, canonical};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use crate::note::note;
 use crate::rejected::Rejected;
 use crate::state::State;
 use crate::state::execution::{ExecutionState, StageExecution};
@@ -20,7 +23,7 @@ use crate::state::worker::{Presence, Worker};
 use crate::time::Millis;
 
 /// A worker as clients see it: `GET /v1/workers`.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct WorkerView {
     pub worker: WorkerId,
     /// The number of its newest process.
@@ -119,7 +122,7 @@ impl State {
 
     /// A run as clients see it at `now`.
     pub fn view(&self, run: &Run, now: Millis) -> RunView {
-        let stages = (0..run.stages.len()).map(|i| self.stage_view(run, i, now)).collect();
+        let stages: Vec<StageView> = (0..run.stages.len()).map(|i| self.stage_view(run, i, now)).collect();
         let sweeps = run.sweeps.iter().map(|sweep| self.sweep_view(run, sweep)).collect();
         RunView {
             run: run.id.clone(),
@@ -127,11 +130,32 @@ impl State {
             owner: run.owner.clone(),
             state: run.state,
             interrupted: run.is_interrupted(),
+            note: note(run.state, &stages),
             stages,
             sweeps,
             storage: None,
             times: Default::default(),
         }
+    }
+
+    /// A run as lists show it at `now`, without times.
+    pub fn summary(&self, run: &Run, now: Millis) -> RunSummary {
+        // Sweeps may have made thousands of stages, which a summary leaves out.
+        let main = run.pipeline.stages.iter().enumerate().filter(|(_, stage)| stage.derived.is_none());
+        let stages: Vec<StageView> = main.map(|(i, _)| self.stage_view(run, i, now)).collect();
+        let view = RunView {
+            run: run.id.clone(),
+            pipeline: run.pipeline.name.clone(),
+            owner: run.owner.clone(),
+            state: run.state,
+            interrupted: run.is_interrupted(),
+            note: note(run.state, &stages),
+            stages,
+            sweeps: Vec::new(),
+            storage: None,
+            times: Default::default(),
+        };
+        RunSummary::of(&view)
     }
 
     fn stage_view(&self, run: &Run, i: usize, now: Millis) -> StageView {

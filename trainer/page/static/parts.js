@@ -52,10 +52,10 @@ export const sign = (state) => STATES[state]?.[1] ?? "○";
 export const badge = (state, word = state) =>
   html`<span class="badge ${tone(state)}"><span aria-hidden="true">${sign(state)}</span> ${word}</span>`;
 
-/** A run's state in one word. @param {Run} run */
+/** A run's state in one word. @param {{state: string, interrupted?: boolean}} run */
 export const runState = (run) => (run.state === "paused" && run.interrupted ? "interrupted" : run.state);
 
-/** @param {Run} run */
+/** @param {{state: string}} run */
 export const isOver = (run) => run.state === "finished" || run.state === "failed" || run.state === "cancelled";
 
 /** The stages that were asked for, without trials. @param {Run} run */

@@ -20,8 +20,14 @@ interface Trial { trial: number; values: Record<string, unknown>; state: string;
 interface Sweep { stage: string; search: string; metric: string; mode: string; rungs: number[]; over: boolean; spent: number; planned: number; full: number; best: number | null; trials: Trial[] }
 interface Run {
   run: string; pipeline: string; owner: Owner; state: string; interrupted: boolean; stages: Stage[];
-  sweeps?: Sweep[]; storage?: { since_ms: number; what: string }; times?: Times;
+  note?: string; sweeps?: Sweep[]; storage?: { since_ms: number; what: string }; times?: Times;
 }
+/** A run in a list. */
+interface RunRow {
+  run: string; pipeline: string; owner?: string; project?: string; state: string; interrupted?: boolean;
+  created_ms: number; changed_ms: number; done: number; stages: number; wall_s: number; wants_workers?: number; note?: string;
+}
+interface RunList { items: RunRow[]; next?: string }
 interface WorkerRow { worker: string; incarnation: number; pid: number; backend: string; instruction_set: string; state: string; task: string | null }
 interface LogLine { id: number; task: string; attempt: number; worker: string; line: number; at_ms: number; text: string }
 interface Curve { total: number; x: number[]; mean: (number | null)[]; min?: (number | null)[]; max?: (number | null)[]; count?: number[]; nan?: number[]; key?: string }

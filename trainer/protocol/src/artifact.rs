@@ -7,12 +7,13 @@ use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::fmt;
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::{Digest, canonical};
 
 /// Kind of an artifact. A stage refuses an input of another kind before anything runs.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum ArtifactKind {
     /// Clips, captions, splits and normalisation.
@@ -103,8 +104,9 @@ impl ArtifactKind {
 ///
 /// A role is a text and not an enum, because storing, registering, exporting and showing models treat all roles alike.
 /// A role is also the name of a folder of a model's files, so it consists of small letters, digits and `-`.
-#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, JsonSchema)]
 #[serde(try_from = "String", into = "String")]
+#[schemars(with = "String")]
 pub struct Role(Cow<'static, str>);
 
 impl Role {
@@ -158,7 +160,7 @@ impl fmt::Display for Role {
 }
 
 /// One file of an artifact.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct FileEntry {
     /// Digest of the blob.
     pub digest: Digest,
@@ -167,7 +169,7 @@ pub struct FileEntry {
 }
 
 /// Kind, meta and files of an artifact.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Manifest {
     /// Version of this document, [`Manifest::FORMAT`].
     pub format: u32,

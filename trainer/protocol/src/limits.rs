@@ -29,12 +29,23 @@ pub const BATCHES_WAITING: usize = 64;
 pub const READS_AT_ONCE: usize = 2;
 /// Largest number of such calls that wait; a further one must retry.
 pub const READS_WAITING: usize = 64;
-/// Largest number of runs in one answer; `before` asks for earlier ones.
+/// Largest number of runs in one answer; `after` asks for further ones.
 pub const RUNS_LISTED: u32 = 500;
+/// Largest size in bytes of the words that runs are searched for.
+pub const SEARCH_BYTES: usize = 256;
 /// Largest number of log lines in one answer; `after` asks for later ones.
 pub const LINES_READ: u32 = 10_000;
 /// Largest number of rows of history in one answer; `after` asks for later ones.
 pub const HISTORY_READ: u32 = 10_000;
+/// Largest number of seconds that a call for history waits for rows.
+pub const HISTORY_WAIT_S: u32 = 30;
+/// Largest number of open streams of events, and of those of one token.
+pub const STREAMS: usize = 512;
+pub const STREAMS_OF_TOKEN: usize = 64;
+/// Largest number of rows that a stream of events catches up with; a client further behind begins anew.
+pub const EVENTS_BEHIND: u32 = 10_000;
+/// Largest number of points of one curve in a packed answer.
+pub const PACKED_POINTS: usize = 1_000_000;
 /// Largest number of points of one curve in an answer; `after` asks for later ones.
 pub const CURVE_POINTS: usize = 10_000;
 /// Largest number of buckets of one curve.

@@ -5,12 +5,13 @@
 //! lost answer does no harm, because the next one has the same content.
 //!
 //! Every write carries a [`Grant`]. The coordinator checks its fence in the transaction that stores the write. It
-//! answers 409 with [`ApiError`] code `stale-fence` to an old one.
+//! answers 409 with the code `stale-fence` to an old one.
 //!
 //! Names and grants are not secret. [`proof`](crate::proof) says how a call proves whose it is.
 
 use std::collections::BTreeMap;
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::stage::{Backend, CheckpointPolicy, Mode, StageSettings};
@@ -18,10 +19,10 @@ use crate::sweep::{SearchKind, Values};
 use crate::{Attempt, Digest, Fence, Generation, Incarnation, Owner, RunId, Seed, StageName, TaskId, WorkerId};
 
 /// Version of these messages; a worker with another version is refused.
-pub const PROTOCOL_VERSION: u32 = 5;
+pub const PROTOCOL_VERSION: u32 = 6;
 
 /// `POST /v1/workers`: a process registers as a worker.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Join {
     /// Version of the worker's messages, [`PROTOCOL_VERSION`].
     pub protocol: u32,
@@ -40,7 +41,7 @@ pub struct Join {
 }
 
 /// The answer to [`Join`].
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Joined {
     /// Incarnation of this process among all with the worker's name.
     pub incarnation: Incarnation,
@@ -51,7 +52,7 @@ pub struct Joined {
 }
 
 /// `POST /v1/workers/{worker}/poll`: a worker reports its work and asks for assignments.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Poll {
     /// Incarnation from [`Joined`].
     pub incarnation: Incarnation,
@@ -65,7 +66,7 @@ pub struct Poll {
 }
 
 /// State of a worker's work on one assignment.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Doing {
     /// Grant of the assignment.
     pub grant: Grant,
@@ -86,14 +87,14 @@ impl Doing {
 }
 
 /// A gang member that another cannot go on with.
-#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize, JsonSchema)]
 pub struct LostPeer {
     pub worker: WorkerId,
     pub cause: LossCause,
 }
 
 /// The reason for which a member cannot go on with a peer.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum LossCause {
     /// No connection, or no byte of it for too long.
@@ -105,7 +106,7 @@ pub enum LossCause {
 }
 
 /// Progress of a task.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Progress {
     /// Number of steps, clips or shards done.
     pub done: u64,
@@ -114,18 +115,19 @@ pub struct Progress {
     /// Unit of the numbers: `steps`, `clips`, `captions`.
     pub unit: String,
     /// Newest values, for a progress line.
+    #[schemars(with = "BTreeMap<String, Option<f64>>")]
     pub metrics: BTreeMap<String, f64>,
 }
 
 /// `POST /v1/workers/{worker}/gone`: the process ends.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct Gone {
     /// Incarnation from [`Joined`].
     pub incarnation: Incarnation,
 }
 
 /// The answer to [`Poll`].
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct DesiredAssignments {
     /// Version that changes with the assignments.
     pub version: u64,
@@ -139,7 +141,7 @@ pub struct DesiredAssignments {
 }
 
 /// Inputs to be fetched before a task can be assigned.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct Prepare {
     pub task: TaskId,
     /// Artifacts by the field that names them, as in [`StageTask::inputs`].
@@ -151,7 +153,7 @@ pub struct Prepare {
 }
 
 /// The right to write for a task.
-#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize, JsonSchema)]
 pub struct Grant {
     pub task: TaskId,
     /// Number of the attempt.
@@ -164,7 +166,7 @@ pub struct Grant {
 }
 
 /// Work for one worker on one task.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Assignment {
     /// Grant, carried by every write.
     pub grant: Grant,
@@ -182,7 +184,7 @@ pub struct Assignment {
 }
 
 /// A stage's work from the point of view of a worker.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct StageTask {
     pub run: RunId,
     pub name: StageName,
@@ -196,7 +198,7 @@ pub struct StageTask {
 }
 
 /// Part of a worker in a task.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(tag = "role", rename_all = "kebab-case")]
 pub enum Role {
     /// The only worker on a plain stage.
@@ -227,7 +229,7 @@ pub enum Role {
 }
 
 /// A member of a gang.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct Member {
     pub worker: WorkerId,
     pub incarnation: Incarnation,
@@ -236,7 +238,7 @@ pub struct Member {
 }
 
 /// `POST /v1/metrics`: values by step, exactly once per (task, attempt, key, step).
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct MetricBatch {
     /// Grant of the write.
     pub grant: Grant,
@@ -245,7 +247,7 @@ pub struct MetricBatch {
 }
 
 /// One recorded value.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct MetricRow {
     /// Step after which it was recorded.
     pub step: u64,
@@ -253,6 +255,7 @@ pub struct MetricRow {
     pub key: String,
     /// NaN for everything that is not finite, and `null` in JSON.
     #[serde(deserialize_with = "null_is_nan")]
+    #[schemars(with = "Option<f64>")]
     pub value: f64,
 }
 
@@ -261,7 +264,7 @@ fn null_is_nan<'de, D: serde::Deserializer<'de>>(deserializer: D) -> Result<f64,
 }
 
 /// `POST /v1/logs`: lines of a task's log.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct LogBatch {
     /// Grant of the write.
     pub grant: Grant,
@@ -272,7 +275,7 @@ pub struct LogBatch {
 }
 
 /// `POST /v1/checkpoints`: makes an uploaded manifest the task's newest checkpoint.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct CommitCheckpoint {
     /// Grant of the write.
     pub grant: Grant,
@@ -281,11 +284,12 @@ pub struct CommitCheckpoint {
     /// Manifest, uploaded earlier with all blobs that it lists.
     pub manifest: Digest,
     /// Values by which retention may rank.
+    #[schemars(with = "BTreeMap<String, Option<f64>>")]
     pub metrics: BTreeMap<String, f64>,
 }
 
 /// `POST /v1/outcomes`: the end of an assignment.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct ReportOutcome {
     /// Grant of the write.
     pub grant: Grant,
@@ -293,13 +297,14 @@ pub struct ReportOutcome {
 }
 
 /// End of an assignment.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(tag = "outcome", rename_all = "kebab-case")]
 pub enum TaskOutcome {
     /// The output's manifest is uploaded with all blobs that it lists.
     Finished {
         output: Digest,
         /// Final metrics by name.
+        #[schemars(with = "BTreeMap<String, Option<f64>>")]
         metrics: BTreeMap<String, f64>,
     },
     /// The digests that [`Role::Resolve`] asks for.
@@ -322,7 +327,7 @@ pub enum TaskOutcome {
 }
 
 /// Consequence of a failure for retries.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum FailureClass {
     /// The user's data or settings are wrong: final.
@@ -354,7 +359,7 @@ impl FailureClass {
 }
 
 /// `POST /v1/runs`: submits a pipeline.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Submit {
     /// The validated pipeline as JSON (`pipeline::Pipeline`).
     pub pipeline: serde_json::Value,
@@ -367,7 +372,7 @@ pub struct Submit {
 }
 
 /// A run as clients see it: `GET /v1/runs/{run}`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct RunView {
     pub run: RunId,
     /// The pipeline's name.
@@ -389,10 +394,113 @@ pub struct RunView {
     pub storage: Option<StorageProblem>,
     #[serde(default, skip_serializing_if = "Times::are_unknown")]
     pub times: Times,
+    /// Its standing in a sentence: the reason of a failure or of waiting, or the result.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub note: String,
+}
+
+/// A part of a list.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct Listing<T> {
+    pub items: Vec<T>,
+    /// The `after` that continues the list; missing at its end. A search may return few items and still continue.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub next: Option<String>,
+}
+
+/// A run in a list: `GET /v1/runs`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct RunSummary {
+    pub run: RunId,
+    /// The pipeline's name.
+    pub pipeline: String,
+    /// Name of the token that submitted it, if it is known.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub owner: String,
+    /// The token's project.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub project: Option<String>,
+    pub state: RunState,
+    /// It is paused because the process that worked on it ended, not because a user paused it.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub interrupted: bool,
+    /// Time of the submission, in milliseconds since 1970.
+    pub created_ms: i64,
+    /// Time of the newest change of its state, in milliseconds since 1970.
+    pub changed_ms: i64,
+    /// Number of finished stages.
+    pub done: u32,
+    /// Number of stages that were asked for, without those of sweeps.
+    pub stages: u32,
+    /// Seconds of work on these stages.
+    pub wall_s: f64,
+    /// Idle workers that it lacks, if that is what it waits for.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub wants_workers: Option<usize>,
+    /// The beginning of [`RunView::note`].
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub note: String,
+}
+
+impl RunSummary {
+    /// Largest size of a summary as JSON in bytes, unless its names alone are longer.
+    pub const BYTES: usize = 300;
+
+    /// Summarises a view. Its times are those of the view, or 0.
+    pub fn of(view: &RunView) -> Self {
+        let main = || view.stages.iter().filter(|stage| stage.of.is_none() && stage.is_asked_for());
+        let count = |stages: usize| u32::try_from(stages).unwrap_or(u32::MAX);
+        let created_ms = view.times.created_ms.unwrap_or_default();
+        Self {
+            run: view.run.clone(),
+            pipeline: view.pipeline.clone(),
+            owner: view.owner.name.clone(),
+            project: view.owner.project.clone(),
+            state: view.state,
+            interrupted: view.interrupted,
+            created_ms,
+            changed_ms: view.times.ended_ms.unwrap_or(created_ms),
+            done: count(main().filter(|stage| stage.state.is_done()).count()),
+            stages: count(main().count()),
+            wall_s: main().map(|stage| stage.wall_s).sum(),
+            wants_workers: main().find_map(|stage| stage.wants_workers),
+            note: view.note.clone(),
+        }
+    }
+
+    /// Shortens the note so that the summary as JSON has at most [`Self::BYTES`] bytes.
+    #[must_use]
+    pub fn shortened(mut self) -> Self {
+        self.wall_s = (self.wall_s * 10.0).round() / 10.0;
+        let note = std::mem::take(&mut self.note);
+        // Ten bytes: the note's name, quotes and comma.
+        let mut left = Self::BYTES.saturating_sub(json_length(&self) + 10);
+        if json_length(&note) - 2 <= left {
+            self.note = note;
+            return self;
+        }
+        left = left.saturating_sub('…'.len_utf8());
+        for letter in note.chars() {
+            let bytes = json_length(&letter) - 2;
+            if bytes > left {
+                break;
+            }
+            left -= bytes;
+            self.note.push(letter);
+        }
+        if !self.note.is_empty() {
+            self.note.push('…');
+        }
+        self
+    }
+}
+
+fn json_length(value: &impl Serialize) -> usize {
+    serde_json::to_vec(value).map_or(0, |text| text.len())
 }
 
 /// Why a store does not take or give what it should.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct StorageProblem {
     /// Since when, in milliseconds since 1970.
     pub since_ms: i64,
@@ -401,7 +509,7 @@ pub struct StorageProblem {
 }
 
 /// State of a run.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum RunState {
     /// Work is in progress or waits for workers.
@@ -417,6 +525,24 @@ pub enum RunState {
 }
 
 impl RunState {
+    const ALL: [(Self, &str); 5] = [
+        (Self::Running, "running"),
+        (Self::Paused, "paused"),
+        (Self::Finished, "finished"),
+        (Self::Failed, "failed"),
+        (Self::Cancelled, "cancelled"),
+    ];
+
+    /// Its name in JSON and in tables.
+    pub fn name(self) -> &'static str {
+        Self::ALL.iter().find(|(state, _)| *state == self).map_or("", |(_, name)| name)
+    }
+
+    /// The state of a name.
+    pub fn named(text: &str) -> Option<Self> {
+        Self::ALL.iter().find(|(_, name)| *name == text).map(|(state, _)| *state)
+    }
+
     /// Returns true if the state cannot change any more.
     pub fn is_final(self) -> bool {
         matches!(self, Self::Finished | Self::Failed | Self::Cancelled)
@@ -424,7 +550,7 @@ impl RunState {
 }
 
 /// Times of a run or a stage by the server's clock, in milliseconds since 1970.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct Times {
     /// Time of the submission; a stage has none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -445,7 +571,7 @@ impl Times {
 }
 
 /// A stage as clients see it.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct StageView {
     pub name: StageName,
     /// Stage kind, such as `train.vae`.
@@ -456,6 +582,7 @@ pub struct StageView {
     /// Outputs by name.
     pub outputs: BTreeMap<String, Digest>,
     /// Final values, or the newest ones while it runs.
+    #[schemars(with = "BTreeMap<String, Option<f64>>")]
     pub metrics: BTreeMap<String, f64>,
     pub progress: Progress,
     /// Seconds of work so far, over all attempts of this run; not part of any key.
@@ -493,7 +620,7 @@ impl StageView {
 }
 
 /// A sweep as clients see it.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct SweepView {
     /// The swept stage.
     pub stage: StageName,
@@ -520,7 +647,7 @@ pub struct SweepView {
 }
 
 /// A trial as clients see it.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct TrialView {
     /// Number of the trial, from 0.
     pub trial: usize,
@@ -537,7 +664,7 @@ pub struct TrialView {
 }
 
 /// State of a trial.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum TrialState {
     /// Not started yet.
@@ -555,7 +682,7 @@ pub enum TrialState {
 }
 
 /// State of a stage.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum StageState {
     /// Waits for other stages.
@@ -576,14 +703,124 @@ pub enum StageState {
     Skipped,
 }
 
-/// Answer to every refused call.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+impl StageState {
+    /// Returns true if the stage has its value.
+    pub fn is_done(self) -> bool {
+        matches!(self, Self::Ran | Self::Cached | Self::Resumed)
+    }
+}
+
+/// The reason for a refusal, as clients read it. The server sends it as [`Problem`].
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct ApiError {
-    /// Code for programs: `stale-fence`, `unproven`, `unvouched`, `name-held`, `forbidden`, `not-found`, `conflict`, `invalid`,
-    /// `storage`, `gate`, `internal`.
+    /// Code for programs, one of [`CODES`].
     pub code: String,
     /// Description for users.
+    #[serde(alias = "detail")]
     pub message: String,
     /// Remedy, if there is one.
     pub hint: Option<String>,
+}
+
+/// Answer to every refused call: problem details (RFC 9457) with our code and hint, sent as [`Problem::CONTENT_TYPE`].
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+pub struct Problem {
+    /// Kind of the problem as a URI: `urn:stride:problem:` and the code.
+    #[serde(rename = "type")]
+    pub kind: String,
+    /// The kind in words, the same for each problem of the kind.
+    pub title: String,
+    /// The answer's HTTP status.
+    pub status: u16,
+    /// Description for users.
+    pub detail: String,
+    /// Code for programs, one of [`CODES`].
+    pub code: String,
+    /// Remedy, if there is one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub hint: Option<String>,
+}
+
+impl Problem {
+    /// The media type of problems.
+    pub const CONTENT_TYPE: &str = "application/problem+json";
+
+    /// The problem of a call that is answered with `status`.
+    pub fn new(status: u16, error: ApiError) -> Self {
+        let ApiError { code, message: detail, hint } = error;
+        let title = CODES.iter().find(|(known, _)| *known == code).map_or("Refused", |(_, title)| *title);
+        Self { kind: format!("urn:stride:problem:{code}"), title: title.to_owned(), status, detail, code, hint }
+    }
+}
+
+/// Codes of refusals with their titles.
+pub const CODES: [(&str, &str); 25] = [
+    ("arrived-damaged", "The blob was damaged on its way"),
+    ("busy", "The server has too much to do"),
+    ("conflict", "The request conflicts with the current state"),
+    ("cut", "The request ended early"),
+    ("damaged", "The stored data is damaged"),
+    ("failed", "The server has failed"),
+    ("forbidden", "The token does not allow this"),
+    ("gate", "A gate does not hold"),
+    ("host", "The server has another name"),
+    ("internal", "The server made a mistake"),
+    ("invalid", "The request is invalid"),
+    ("method", "The path has no such method"),
+    ("name-held", "Another process holds the name"),
+    ("not-found", "There is no such object"),
+    ("offset", "The part does not follow the stored ones"),
+    ("origin", "Pages of other sites may not call this server"),
+    ("slow", "The request came too slowly"),
+    ("stale-fence", "The grant has been superseded"),
+    ("storage", "The store does not take data"),
+    ("too-large", "The data is too large"),
+    ("unauthorized", "The call shows no valid token"),
+    ("unproven", "The data is not proven complete"),
+    ("unreachable", "The blob storage does not answer"),
+    ("unvouched", "The call does not prove its upload"),
+    ("used-up", "The run has used up its limit"),
+];
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_summary_fits_whatever_its_note_says() {
+        let note =
+            ["short", &"loss is NaN ".repeat(100), &"\"\\\u{1}".repeat(200), &"ö…😀".repeat(200)].map(str::to_owned);
+        for note in note {
+            let summary = RunSummary {
+                run: "quickstart-0a1b2c3d-100000".into(),
+                pipeline: "quickstart".into(),
+                owner: "alice".into(),
+                project: Some("motion".into()),
+                state: RunState::Cancelled,
+                interrupted: true,
+                created_ms: 1_764_054_273_000,
+                changed_ms: 1_764_054_273_000,
+                done: 12,
+                stages: 12,
+                wall_s: 1.0 / 3.0,
+                wants_workers: Some(2),
+                note: note.clone(),
+            };
+            let shortened = summary.shortened();
+            assert!(json_length(&shortened) <= RunSummary::BYTES, "{shortened:?}");
+            assert!(note.starts_with(shortened.note.trim_end_matches('…')) && !shortened.note.is_empty());
+        }
+    }
+
+    #[test]
+    fn a_problem_reads_as_the_error_that_it_tells() {
+        let error = ApiError { code: "busy".into(), message: "too much".into(), hint: Some("wait".into()) };
+        let problem = serde_json::to_value(Problem::new(429, error.clone())).unwrap_or_default();
+        assert_eq!(problem["title"], "The server has too much to do");
+        assert_eq!(problem["type"], "urn:stride:problem:busy");
+        assert_eq!(serde_json::from_value::<ApiError>(problem).ok(), Some(error.clone()));
+        let plain = serde_json::to_value(&error).unwrap_or_default();
+        assert_eq!(serde_json::from_value::<ApiError>(plain).ok(), Some(error));
+        assert!(CODES.is_sorted(), "{CODES:?}");
+    }
 }

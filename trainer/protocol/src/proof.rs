@@ -14,6 +14,7 @@
 
 use std::collections::BTreeMap;
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::{Digest, Incarnation, WorkerId};
@@ -38,7 +39,7 @@ pub struct Process {
 }
 
 /// Body of `POST /v1/checkpoints` and `POST /v1/outcomes`: a message that may name a manifest, and receipts of its blobs.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Vouched<T> {
     #[serde(flatten)]
     pub what: T,
@@ -48,7 +49,7 @@ pub struct Vouched<T> {
 }
 
 /// Answer to `PUT /v1/blobs/{digest}` and `GET /v1/blobs/{digest}/staged`.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct BlobStored {
     /// Name of the blob.
     pub digest: Digest,

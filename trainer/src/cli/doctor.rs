@@ -6,7 +6,7 @@ use std::os::unix::fs::PermissionsExt as _;
 use std::path::{Path, PathBuf};
 
 use clap::Args;
-use registry::{OpenError, ReadStore};
+use registry::{OpenError, ReadStore, RunListQuery};
 use serde::Serialize;
 
 use crate::client::{Client, Target, shown};
@@ -190,7 +190,7 @@ fn token_file(path: Option<&Path>) -> Option<Finding> {
 async fn server(target: &Target) -> Option<Finding> {
     let asked = match Client::running(target).await {
         Ok(None) => return None,
-        Ok(Some(client)) => client.runs_before(None, 1).await,
+        Ok(Some(client)) => client.run_list(&RunListQuery { limit: 1, ..RunListQuery::default() }).await,
         Err(problem) => Err(problem),
     };
     Some(match asked {

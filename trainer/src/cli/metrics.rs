@@ -13,6 +13,7 @@ use crate::reader::Reader;
 use crate::report::figure::{self, Panel};
 use crate::report::print::{self, Output};
 use crate::report::problem::{Problem, Result, exit};
+use crate::report::tensorboard::EventFile;
 
 /// Buckets of a drawn curve: about one a pixel.
 const DRAWN: usize = 400;
@@ -37,6 +38,9 @@ pub(crate) struct MetricsArgs {
     /// Prints every value as CSV
     #[arg(long, conflicts_with_all = ["plot", "output"])]
     csv: bool,
+    /// Writes every value to event files that TensorBoard shows, in a folder for each stage
+    #[arg(long, value_name = "DIR", conflicts_with_all = ["plot", "csv", "output"])]
+    tensorboard: Option<PathBuf>,
     #[command(flatten)]
     target: Target,
     /// Format of the result
@@ -73,7 +77,9 @@ pub(crate) async fn metrics(args: MetricsArgs) -> Result<u8> {
     if curves.is_empty() {
         return Err(nothing(&run, &args));
     }
-    if args.csv {
+    if let Some(dir) = &args.tensorboard {
+        write_events(&reader, &run, &curves, dir).await?;
+    } else if args.csv {
         write_csv(&reader, &run, &curves).await?;
     } else if let Some(path) = &args.plot {
         draw(path, &run, axis, &curves)?;
@@ -126,6 +132,66 @@ async fn write_csv(reader: &Reader, run: &RunId, curves: &[CurveSeries]) -> Resu
         }
     }
     Ok(())
+}
+
+/// Writes every value to an event file of its stage.
+async fn write_events(reader: &Reader, run: &RunId, curves: &[CurveSeries], dir: &Path) -> Result<()> {
+    let stages: BTreeSet<&str> = curves.iter().map(|curve| curve.stage.as_str()).collect();
+    for stage in stages {
+        let folder = dir.join(run.as_str()).join(stage);
+        let path = folder.join("events.out.tfevents.0.stride");
+        let failed = |error: std::io::Error| Problem::usage(format!("cannot write `{}`: {error}", path.display()));
+        std::fs::create_dir_all(&folder).map_err(failed)?;
+        let out = std::io::BufWriter::new(std::fs::File::create(&path).map_err(failed)?);
+        let mut file = None;
+        let mut out = Some(out);
+        for curve in curves.iter().filter(|curve| curve.stage.as_str() == stage) {
+            let times = times(reader, run, curve).await?;
+            let mut page = Page { after: None, limit: protocol::limits::CURVE_POINTS };
+            loop {
+                let points = reader.points(run, stage, &curve.key, page).await?;
+                let Some(last) = points.last() else { break };
+                page.after = Some(last.step);
+                for point in &points {
+                    let wall_s = time_of(&times, point.step as f64) / 1000.0;
+                    if let Some(out) = out.take() {
+                        file = Some(EventFile::new(out, wall_s).map_err(failed)?);
+                    }
+                    if let Some(file) = &mut file {
+                        file.scalar(&curve.key, point.step, wall_s, point.value).map_err(failed)?;
+                    }
+                }
+            }
+        }
+        if let Some(file) = file {
+            file.finish().map_err(failed)?;
+        }
+        print::note(&format!("wrote {}", path.display()));
+    }
+    Ok(())
+}
+
+/// Steps of a curve with their times in milliseconds since 1970, in order.
+async fn times(reader: &Reader, run: &RunId, curve: &CurveSeries) -> Result<Vec<(f64, f64)>> {
+    let keys = [curve.key.clone()];
+    let mut columns = Vec::new();
+    for axis in [Axis::Step, Axis::Time] {
+        let window = Window { axis, from: None, to: None, buckets: protocol::limits::CURVE_BUCKETS };
+        let drawn = reader.curves(run, Some(curve.stage.as_str()), &keys, &window).await?;
+        columns.push(drawn.into_iter().next().map(|curve| curve.columns.x).unwrap_or_default());
+    }
+    let [steps, times]: [Vec<f64>; 2] = columns.try_into().unwrap_or_default();
+    Ok(if steps.len() == times.len() { steps.into_iter().zip(times).collect() } else { Vec::new() })
+}
+
+/// The time of a step, on the line between its neighbours.
+fn time_of(times: &[(f64, f64)], step: f64) -> f64 {
+    let after = times.partition_point(|(known, _)| *known < step);
+    match (after.checked_sub(1).and_then(|before| times.get(before)), times.get(after)) {
+        (Some((x0, y0)), Some((x1, y1))) if x1 > x0 => y0 + (y1 - y0) * (step - x0) / (x1 - x0),
+        (_, Some((_, time))) | (Some((_, time)), None) => *time,
+        (None, None) => 0.0,
+    }
 }
 
 /// Escapes a text for CSV.
@@ -188,6 +254,14 @@ mod tests {
         assert_eq!(panels[1].odd, [2.0, 2.0]);
         let picture = figure::svg("r", &panels);
         assert_eq!((picture.matches("<polygon").count(), picture.contains("NaN")), (3, false));
+    }
+
+    #[test]
+    fn a_step_has_the_time_between_its_neighbours() {
+        let times = [(10.0, 1000.0), (20.0, 3000.0)];
+        let of = |step| time_of(&times, step);
+        assert_eq!([of(0.0), of(10.0), of(15.0), of(20.0), of(99.0)], [1000.0, 1000.0, 2000.0, 3000.0, 3000.0]);
+        assert_eq!(time_of(&[], 1.0), 0.0);
     }
 
     #[test]

@@ -4,8 +4,8 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use clap::Args;
-use protocol::StageName;
-use protocol::message::{RunState, RunView, Submit};
+use protocol::message::{RunState, RunSummary, RunView, Submit};
+use protocol::{Owner, StageName};
 
 use super::args::PipelineArgs;
 use super::spectrum;
@@ -160,17 +160,13 @@ pub(crate) async fn status(args: StatusArgs) -> Result<u8> {
     if args.all {
         let runs = reader.runs().await?;
         match args.output {
-            Output::Json => {
-                let runs: Vec<Summary> = runs.iter().map(|run| Summary::of(run, false)).collect();
-                print::json(&serde_json::json!({"schema_version": 1, "runs": runs}));
-            }
+            Output::Json => print::json(&serde_json::json!({"schema_version": 2, "runs": runs})),
             Output::Table => {
-                let row = |run: &RunView| {
-                    let asked = || run.stages.iter().filter(|stage| stage.of.is_none());
-                    let done = asked().filter(|stage| !stage.outputs.is_empty()).count();
-                    let state = summary::run_state(run).to_owned();
-                    let stages = format!("{done}/{}", asked().count());
-                    vec![run.run.to_string(), run.pipeline.clone(), run.owner.to_string(), state, stages]
+                let row = |run: &RunSummary| {
+                    let owner = Owner { name: run.owner.clone(), project: run.project.clone(), ..Owner::default() };
+                    let state = if run.interrupted { "interrupted" } else { run.state.name() };
+                    let stages = format!("{}/{}", run.done, run.stages);
+                    vec![run.run.to_string(), run.pipeline.clone(), owner.to_string(), state.to_owned(), stages]
                 };
                 print::out(&print::table(
                     &["RUN", "PIPELINE", "OWNER", "STATE", "STAGES"],

@@ -165,10 +165,13 @@ async fn find(which: &Which) -> Result<(RunView, Vec<SweepView>)> {
         None => reader.find(&which.run).await,
         Some(file) => {
             let name = &file.pipeline.name;
-            let newest = reader.runs().await?.into_iter().rfind(|run| &run.pipeline == name);
-            newest.ok_or_else(|| {
-                let problem = Problem::new(exit::NOT_FOUND, anyhow::anyhow!("pipeline `{name}` was never run here"));
-                problem.hint(format!("`trainer run {}` runs it", which.run))
+            let newest = reader.newest(Some(name)).await;
+            newest.and_then(|newest| {
+                newest.ok_or_else(|| {
+                    let problem =
+                        Problem::new(exit::NOT_FOUND, anyhow::anyhow!("pipeline `{name}` was never run here"));
+                    problem.hint(format!("`trainer run {}` runs it", which.run))
+                })
             })
         }
     };

@@ -406,6 +406,7 @@ mod tests {
 
     fn row(pipeline: &Pipeline) -> RunRow {
         RunRow {
+            submission: None,
             run: "p-1".into(),
             pipeline: serde_json::to_value(pipeline).unwrap(),
             source: String::new(),

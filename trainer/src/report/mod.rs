@@ -6,3 +6,4 @@ pub(crate) mod problem;
 pub(crate) mod progress;
 pub(crate) mod summary;
 pub(crate) mod sweep_plot;
+pub(crate) mod tensorboard;

@@ -231,6 +231,7 @@ mod tests {
             sweeps: vec![],
             storage: None,
             times: Default::default(),
+            note: String::new(),
         }
     }
 

@@ -78,8 +78,8 @@ impl Deciding<'_> {
     fn happen(&mut self, event: Event) -> Result<bool, Rejected> {
         match event {
             Event::Started { alone, park } => self.started(alone, park),
-            Event::Submit { pipeline, source, idempotency_key, until, owner } => {
-                return self.submit(*pipeline, source, idempotency_key, until, owner);
+            Event::Submit { pipeline, source, idempotency_key, submission, until, owner } => {
+                return self.submit(*pipeline, source, idempotency_key, submission, until, owner);
             }
             Event::Join { join, by } => self.join(join, by)?,
             Event::WorkerBack { worker } => return self.sign(&worker, Sign::Back),

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use pipeline::Pipeline;
 use protocol::message::RunState;
-use protocol::{Owner, RunId, StageName, limits};
+use protocol::{Digest, Owner, RunId, StageName, limits};
 use registry::Write;
 
 use super::deciding::Deciding;
@@ -21,6 +21,7 @@ impl Deciding<'_> {
         pipeline: Pipeline,
         source: String,
         key: Option<String>,
+        submission: Option<Digest>,
         until: Option<StageName>,
         owner: Owner,
     ) -> Result<bool, Rejected> {
@@ -54,6 +55,9 @@ impl Deciding<'_> {
             idempotency_key: run.idempotency_key.clone(),
         });
         self.writes.push(Write::RunOwner { run: run.id.clone(), owner: run.owner.group() });
+        if let Some(digest) = submission {
+            self.writes.push(Write::Submission { run: run.id.clone(), digest });
+        }
         self.effects.push(Effect::Submitted(run.id.clone()));
         self.record(Fact::Run { run: Box::new(run) });
         Ok(true)
@@ -131,8 +135,7 @@ impl Deciding<'_> {
 
 /// The name of a run's state in its row.
 pub(crate) fn word(state: RunState) -> String {
-    let state = serde_json::to_value(state).expect("a state is a word");
-    state.as_str().unwrap_or_default().to_owned()
+    state.name().to_owned()
 }
 
 /// Checks a pipeline for mistakes that even an honest client of another build can make.

@@ -8,8 +8,8 @@ use futures::FutureExt as _;
 use pipeline::Pipeline;
 use protocol::message::{Poll, RunView, StorageProblem, Submit};
 use protocol::stage::Register;
-use protocol::{Alias, Digest, Group, ModelName, Owner, RunId, WorkerId, limits};
-use registry::{Proof, QueryError, ReadStore, Store, WriteError};
+use protocol::{Alias, Digest, Group, ModelName, Owner, RunId, WorkerId, canonical, limits};
+use registry::{Proof, QueryError, ReadStore, RunRow, Store, WriteError};
 use tokio::sync::{Semaphore, mpsc, oneshot, watch};
 use tokio::task::JoinHandle;
 
@@ -20,6 +20,7 @@ use super::meters::Meters;
 use super::records::{Records, read};
 use super::secrets::Secrets;
 use super::storage::{self, unless_away};
+use super::streams::Streams;
 use super::token_table::TokenTable;
 use super::versions::resolve_versions;
 use super::vouching::Reach;
@@ -63,6 +64,7 @@ pub(crate) struct ActorHandle {
     pub(crate) secrets: Secrets,
     pub(crate) reach: Arc<Reach>,
     pub(crate) meters: Meters,
+    pub(crate) streams: Streams,
 }
 
 impl ActorHandle {
@@ -96,6 +98,7 @@ impl ActorHandle {
             secrets,
             reach: Arc::default(),
             meters: Meters::default(),
+            streams: Streams::default(),
         };
         (handle, queue)
     }
@@ -174,7 +177,16 @@ impl ActorHandle {
 
     /// Submits a pipeline of `owner`, who sees the models of group `sees`, or all models if it is `None`.
     pub(crate) async fn submit(&self, mut submit: Submit, owner: Owner, sees: Option<Group>) -> Result<RunId, Refused> {
-        submit.idempotency_key = submit.idempotency_key.map(|key| owner.group().key(&key));
+        let shown = submit.idempotency_key.take();
+        let key = shown.as_ref().map(|key| owner.group().key(key));
+        let sent = key.is_some().then(|| canonical::digest(&submit));
+        let check = |row: &RunRow| match (&row.submission, &sent, &shown) {
+            (Some(stored), Some(sent), Some(key)) if *stored != sent.to_string() => {
+                let message = format!("idempotency key `{key}` belongs to another submission, run `{}`", row.run);
+                Err(Refused::from(Rejected::Conflict(message)))
+            }
+            _ => Ok(()),
+        };
         // A large pipeline takes a while, so it is parsed outside the threads that answer heartbeats.
         let read = blocking(move || {
             let pipeline: Pipeline = serde_json::from_value(submit.pipeline)
@@ -184,9 +196,10 @@ impl ActorHandle {
         });
         let mut pipeline = read.await.map_err(Rejected::Invalid)?;
         // A run submitted earlier already has its versions.
-        if let Some(key) = &submit.idempotency_key
+        if let Some(key) = &key
             && let Some(row) = self.store.run_by_key(key).await.map_err(WriteError::from)?
         {
+            check(&row)?;
             return Ok(row.run);
         }
         self.check_registrations(&pipeline, &owner).await?;
@@ -198,28 +211,37 @@ impl ActorHandle {
         let event = Event::Submit {
             pipeline: Box::new(pipeline),
             source: submit.source,
-            idempotency_key: submit.idempotency_key.clone(),
+            idempotency_key: key.clone(),
+            submission: sent,
             until: submit.until,
             owner,
         };
         let mut tries = 0;
         loop {
             // An ended run is only in the tables.
-            if let Some(key) = &submit.idempotency_key
+            if let Some(key) = &key
                 && let Some(row) = self.store.run_by_key(key).await.map_err(WriteError::from)?
             {
+                check(&row)?;
                 return Ok(row.run);
             }
             tries += 1;
             match self.decide(event.clone()).await {
                 // Another run with this key was submitted after the lookup and has already ended.
-                Err(Refused::Write(WriteError::Conflict(_))) if submit.idempotency_key.is_some() && tries < 3 => {}
+                Err(Refused::Write(WriteError::Conflict(_))) if key.is_some() && tries < 3 => {}
                 decided => {
                     let run = decided?.into_iter().find_map(|effect| match effect {
                         Effect::Submitted(run) => Some(run),
                         _ => None,
                     });
-                    return Ok(run.expect("a submission gives a run"));
+                    let run = run.expect("a submission gives a run");
+                    // Another submission with this key may have been decided just before.
+                    if key.is_some()
+                        && let Some(row) = self.store.run(&run).await.map_err(WriteError::from)?
+                    {
+                        check(&row)?;
+                    }
+                    return Ok(run);
                 }
             }
         }

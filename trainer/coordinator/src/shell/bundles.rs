@@ -13,14 +13,16 @@ use access::Caller;
 use axum::Extension;
 use axum::Json;
 use axum::body::Body;
-use axum::extract::{Query, State};
+use axum::extract::State;
 use axum::http::StatusCode;
 use futures::StreamExt as _;
 use protocol::limits;
+use schemars::JsonSchema;
 use serde::Deserialize;
 
 use super::actor_handle::ActorHandle;
 use super::blocking::blocking;
+use super::extract::Query;
 use super::failure::Failure;
 
 /// Longest pause of a body before the upload counts as cut off.
@@ -29,7 +31,8 @@ const BODY_IDLE: Duration = Duration::from_secs(30);
 static NUMBER: AtomicU64 = AtomicU64::new(0);
 
 /// Query parameters: `?model=`.
-#[derive(Debug, Deserialize)]
+#[derive(Debug, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
 pub(crate) struct BundleQuery {
     /// Name of the imported model.
     model: Option<String>,

@@ -8,25 +8,25 @@
 use std::sync::Arc;
 
 use access::Caller;
-use axum::extract::rejection::QueryRejection;
-use axum::extract::{Query, State};
+use axum::extract::State;
 use axum::http::{HeaderMap, header};
 use axum::response::{IntoResponse, Response};
 use axum::{Extension, Json};
 use protocol::{RunId, StageName, limits};
 use registry::{Axis, Buckets, Window};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::actor_handle::ActorHandle;
 use super::blocking::blocking;
+use super::extract::Query;
 use super::failure::Failure;
-use super::queries::turn;
+use super::queries::{PACKED, accepts_packed};
 use super::records::StageCurves;
-
-const PACKED: &str = "application/octet-stream";
+use super::turn::turn;
 
 /// The answer to `GET /v1/metrics`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Curves {
     pub x: Axis,
     /// By run as asked for, by stage, by key.
@@ -34,7 +34,7 @@ pub struct Curves {
 }
 
 /// One curve in buckets.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct CurveSeries {
     pub run: RunId,
     pub stage: StageName,
@@ -55,6 +55,24 @@ impl CurveSeries {
         let stages = stages.into_iter();
         stages.flat_map(|(stage, keys)| keys.into_iter().map(move |(key, it)| series(stage.clone(), key, it))).collect()
     }
+}
+
+/// The call's query as it is documented; `run` and `key` may be given several times.
+#[derive(Debug, JsonSchema)]
+#[expect(dead_code, reason = "only its schema is used")]
+pub(crate) struct CurvesAsked {
+    run: Vec<RunId>,
+    /// All stages, if it is missing.
+    stage: Option<StageName>,
+    /// All names, if it is missing.
+    #[schemars(default)]
+    key: Vec<String>,
+    /// `step`, `time` in milliseconds since 1970, or `hours` since the stage's first value.
+    x: Option<Axis>,
+    from: Option<f64>,
+    to: Option<f64>,
+    #[schemars(range(min = 1, max = 4000))]
+    buckets: Option<usize>,
 }
 
 /// The call's query.
@@ -124,9 +142,8 @@ pub(crate) async fn curves(
     State(actor_handle): State<Arc<ActorHandle>>,
     Extension(caller): Extension<Arc<Caller>>,
     headers: HeaderMap,
-    query: Result<Query<Vec<(String, String)>>, QueryRejection>,
+    Query(pairs): Query<Vec<(String, String)>>,
 ) -> Result<Response, Failure> {
-    let Query(pairs) = query.map_err(|error| Failure::invalid(error.body_text()))?;
     let CurveQuery { runs, stage, keys, window } = CurveQuery::read(pairs)?;
     let _turn = turn(&actor_handle).await?;
     let records = actor_handle.records_for(caller.sees());
@@ -142,10 +159,9 @@ pub(crate) async fn curves(
             return Err(Failure::invalid(message).hint("set `stage` or `key`, or use fewer `buckets`"));
         }
     }
-    let accepts = headers.get(header::ACCEPT).and_then(|value| value.to_str().ok()).unwrap_or_default();
     let vary = (header::VARY, "accept");
     // Beside the threads that answer heartbeats: there may be many numbers.
-    if accepts.contains(PACKED) {
+    if accepts_packed(&headers) {
         let packed = blocking(move || pack(&curves)).await;
         return Ok(([(header::CONTENT_TYPE, PACKED), vary], packed).into_response());
     }

@@ -1,11 +1,10 @@
 //! Refused calls as HTTP answers.
 
-use axum::Json;
 use axum::http::{HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use checkpoint::BlobError;
 use protocol::limits;
-use protocol::message::ApiError;
+use protocol::message::{ApiError, CODES, Problem};
 use registry::{QueryError, WriteError};
 
 use crate::batch::Refused;
@@ -21,7 +20,9 @@ pub(crate) struct Failure {
 }
 
 impl Failure {
+    /// A refusal with one of [`CODES`].
     pub(crate) fn new(status: StatusCode, code: &str, message: String) -> Self {
+        debug_assert!(CODES.iter().any(|(known, _)| *known == code), "`{code}` is not in the list of codes");
         Self { status, error: ApiError { code: code.to_owned(), message, hint: None }, retry_after: None }
     }
 
@@ -44,20 +45,24 @@ impl Failure {
         Self::new(StatusCode::PAYLOAD_TOO_LARGE, "invalid", format!("the body is larger than {limit} bytes"))
     }
 
+    fn body(&self) -> String {
+        serde_json::json!(Problem::new(self.status.as_u16(), self.error.clone())).to_string()
+    }
+
     /// Formats the refusal as a whole HTTP answer, for a request that is not read.
     pub(crate) fn to_http(&self) -> Vec<u8> {
-        let body = serde_json::json!(self.error).to_string();
-        let (status, length) = (self.status, body.len());
-        let head = format!(
-            "HTTP/1.1 {status}\r\ncontent-type: application/json\r\nconnection: close\r\ncontent-length: {length}"
-        );
+        let body = self.body();
+        let (status, length, kind) = (self.status, body.len(), Problem::CONTENT_TYPE);
+        let head =
+            format!("HTTP/1.1 {status}\r\ncontent-type: {kind}\r\nconnection: close\r\ncontent-length: {length}");
         format!("{head}\r\n\r\n{body}").into_bytes()
     }
 }
 
 impl IntoResponse for Failure {
     fn into_response(self) -> Response {
-        let mut response = (self.status, Json(self.error)).into_response();
+        let kind = [(header::CONTENT_TYPE, Problem::CONTENT_TYPE)];
+        let mut response = (self.status, kind, self.body()).into_response();
         if let Some(seconds) = self.retry_after {
             response.headers_mut().insert(header::RETRY_AFTER, HeaderValue::from(seconds));
         }

@@ -3,12 +3,12 @@
 use std::sync::Arc;
 
 use axum::Router;
-use axum::extract::Path;
 use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
 
 use super::actor_handle::ActorHandle;
+use super::extract::Path;
 use super::failure::Failure;
 
 /// A file under the name of its build never changes.

@@ -4,13 +4,14 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use axum::Json;
-use axum::extract::{Path, State};
+use axum::extract::State;
 use protocol::WorkerId;
 use protocol::message::{DesiredAssignments, Gone, Join, Joined, PROTOCOL_VERSION, Poll};
 use protocol::proof::Process;
 
 use super::actor_handle::ActorHandle;
 use super::body::Message;
+use super::extract::Path;
 use super::failure::Failure;
 use super::secrets::Proof;
 use crate::event::{Effect, Event};

@@ -1,18 +1,20 @@
 //! Calls of clients: submission, queries and control of runs.
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use access::{Caller, Scope};
-use axum::extract::rejection::QueryRejection;
-use axum::extract::{Path, Query, State};
-use axum::http::{StatusCode, header};
-use axum::response::IntoResponse;
+use axum::extract::State;
+use axum::http::{HeaderMap, StatusCode, header};
+use axum::response::{IntoResponse, Response};
 use axum::{Extension, Json};
-use protocol::message::{RunView, Submit};
-use protocol::{Alias, ModelRef, RunId, StageName, WorkerId, limits};
+use protocol::message::{Listing, RunState, RunSummary, RunView, Submit};
+use protocol::{Alias, Group, ModelRef, RunId, StageName, WorkerId, limits};
 use registry::cli::{Answer, Command};
-use registry::{HistoryQuery, HistoryRow, LogRow, Page};
+use registry::{HistoryQuery, HistoryRow, LogRow, Page, RunListQuery, RunOrder};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use serde_json::json;
 use tokio::sync::SemaphorePermit;
 
 use super::actor_handle::ActorHandle;
@@ -21,21 +23,31 @@ use super::auth;
 use super::blocking::blocking;
 use super::body::Message;
 use super::clock::wall_clock;
+use super::events;
+use super::extract::{Path, Query};
 use super::failure::Failure;
 use super::records::StageMetrics;
+use super::turn::turn;
 use crate::rejected::Rejected;
 use crate::state::run::Control;
 use crate::view::WorkerView;
 
+/// The header that makes a submission the same as an earlier one of the same token or project.
+pub(super) const IDEMPOTENCY_KEY: &str = "idempotency-key";
+
 /// The answer to `POST /v1/runs`.
-#[derive(Debug, Clone, Serialize, Deserialize)]
+#[derive(Debug, Clone, Serialize, Deserialize, JsonSchema)]
 pub struct Submitted {
     /// The run, identical for all submissions with the same idempotency key.
     pub run: RunId,
 }
 
+/// The media type of packed numbers.
+pub(super) const PACKED: &str = "application/octet-stream";
+
 /// Query parameters: `?stage=&after=&limit=`.
-#[derive(Debug, Deserialize)]
+#[derive(Debug, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
 pub(crate) struct LogQuery {
     stage: Option<StageName>,
     #[serde(default)]
@@ -50,16 +62,57 @@ fn default_lines() -> u32 {
     1000
 }
 
-/// Query parameters: `?before=&limit=`.
-#[derive(Debug, Deserialize)]
+/// Query parameters: `?state=&pipeline=&owner=&q=&sort=&after=&limit=`.
+#[derive(Debug, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
 pub(crate) struct RunsQuery {
-    before: Option<RunId>,
-    #[serde(default = "default_lines")]
+    /// States of runs, separated by commas: `running`, `paused`, `finished`, `failed`, `cancelled`.
+    #[serde(default)]
+    state: String,
+    /// Name of a pipeline.
+    pipeline: Option<String>,
+    /// The name of a token without a project, or `@` and the name of a project.
+    owner: Option<String>,
+    /// Words that the name, the pipeline, the owner or the note of a run contains, in any case.
+    #[serde(default)]
+    q: String,
+    /// `newest` submission first, `oldest` first, or the newest `changed` state first.
+    #[serde(default)]
+    sort: RunOrder,
+    /// `next` of an earlier answer to the same question.
+    after: Option<String>,
+    /// Number of runs.
+    #[serde(default = "default_runs")]
     limit: u32,
 }
 
+fn default_runs() -> u32 {
+    50
+}
+
+impl RunsQuery {
+    fn read(self) -> Result<RunListQuery, Failure> {
+        let Self { state, pipeline, owner, q, sort, after, limit } = self;
+        let known = |word: &str| {
+            let expected = "`running`, `paused`, `finished`, `failed` or `cancelled`";
+            RunState::named(word)
+                .ok_or_else(|| Failure::invalid(format!("`state` names `{word}`; expected {expected}")))
+        };
+        let states = state.split(',').filter(|word| !word.is_empty()).map(known).collect::<Result<_, _>>()?;
+        if limit == 0 {
+            return Err(Failure::invalid("`limit` is 0; expected at least 1".to_owned()));
+        }
+        if q.len() > limits::SEARCH_BYTES {
+            let most = limits::SEARCH_BYTES;
+            return Err(Failure::invalid(format!("`q` has {} bytes; expected at most {most}", q.len())));
+        }
+        Ok(RunListQuery { states, pipeline, owner: owner.map(Group::new), words: q, order: sort, after, limit })
+    }
+}
+
 /// `?stage=&key=&after=&limit=`.
-#[derive(Debug, Deserialize)]
+#[derive(Debug, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
 pub(crate) struct PointQuery {
     stage: Option<StageName>,
     key: Option<String>,
@@ -72,21 +125,34 @@ fn default_points() -> usize {
     limits::CURVE_POINTS
 }
 
-/// `?run=&worker=&after=&since=&limit=`; `since` in milliseconds since 1970.
-#[derive(Debug, Deserialize)]
+/// `?run=&worker=&after=&since=&wait=&limit=`; `since` in milliseconds since 1970.
+#[derive(Debug, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
 pub(crate) struct HistoryCall {
     run: Option<RunId>,
     worker: Option<WorkerId>,
     #[serde(default)]
     after: i64,
     since: Option<i64>,
+    /// Seconds to wait for rows, if there are none.
+    #[serde(default)]
+    wait: u32,
     #[serde(default = "default_lines")]
     limit: u32,
 }
 
-pub(crate) async fn health(State(actor_handle): State<Arc<ActorHandle>>) -> Json<serde_json::Value> {
+/// The answer to `GET /v1/health`.
+#[derive(Debug, Serialize, JsonSchema)]
+pub(crate) struct Health {
+    status: &'static str,
+    /// `ok`, or `trouble` if the store does not take or give what it should.
+    storage: &'static str,
+    version: &'static str,
+}
+
+pub(crate) async fn health(State(actor_handle): State<Arc<ActorHandle>>) -> Json<Health> {
     let storage = if actor_handle.storage().is_some() { "trouble" } else { "ok" };
-    Json(serde_json::json!({"status": "ok", "storage": storage, "version": env!("CARGO_PKG_VERSION")}))
+    Json(Health { status: "ok", storage, version: env!("CARGO_PKG_VERSION") })
 }
 
 pub(crate) async fn workers(
@@ -102,38 +168,37 @@ fn place(actor_handle: &ActorHandle) -> Result<SemaphorePermit<'_>, Failure> {
     actor_handle.clients.try_acquire().map_err(full)
 }
 
-/// A turn among the questions that read much: few at a time, or they would fill memory and take the threads from heartbeats.
-pub(super) async fn turn(actor_handle: &ActorHandle) -> Result<(SemaphorePermit<'_>, SemaphorePermit<'_>), Failure> {
-    let most = limits::READS_WAITING;
-    let full = |_| Failure::busy(format!("{most} calls for lists and curves already wait"));
-    let waiting = actor_handle.readers.try_acquire().map_err(full)?;
-    // The semaphore is never closed.
-    let closed = |_| Failure::busy("the server is stopping".to_owned());
-    Ok((waiting, actor_handle.reads.acquire().await.map_err(closed)?))
-}
-
 pub(crate) async fn submit(
     State(actor_handle): State<Arc<ActorHandle>>,
     Extension(caller): Extension<Arc<Caller>>,
-    Message(submit, _): Message<Submit>,
+    headers: HeaderMap,
+    Message(mut submit, _): Message<Submit>,
 ) -> Result<(Extension<Object>, Json<Submitted>), Failure> {
+    if let Some(key) = headers.get(IDEMPOTENCY_KEY) {
+        let most = limits::TEXT_BYTES;
+        let key = key.to_str().ok().filter(|key| !key.is_empty() && key.len() <= most);
+        let key =
+            key.ok_or_else(|| Failure::invalid(format!("`{IDEMPOTENCY_KEY}` has 1 to {most} characters of ASCII")))?;
+        if submit.idempotency_key.as_deref().is_some_and(|other| other != key) {
+            let message = format!("`{IDEMPOTENCY_KEY}` and the body's `idempotency_key` differ; expected one of them");
+            return Err(Failure::invalid(message));
+        }
+        submit.idempotency_key = Some(key.to_owned());
+    }
     let _place = place(&actor_handle)?;
     let run = actor_handle.submit(submit, caller.owner(), caller.sees()).await?;
     Ok((Extension(Object::Changed(run.to_string())), Json(Submitted { run })))
 }
 
-/// Runs by submission: the newest ones, or those before a given run. Further calls with `before` return earlier runs.
+/// Runs in short, in pages.
 pub(crate) async fn runs(
     State(actor_handle): State<Arc<ActorHandle>>,
     Extension(caller): Extension<Arc<Caller>>,
     Query(query): Query<RunsQuery>,
-) -> Result<impl IntoResponse, Failure> {
+) -> Result<Json<Listing<RunSummary>>, Failure> {
+    let asked = query.read()?;
     let _turn = turn(&actor_handle).await?;
-    let records = actor_handle.records_for(caller.sees());
-    let views = records.run_views(query.before.as_ref(), query.limit).await?;
-    // The list may be long, so it is joined outside the threads that answer heartbeats.
-    let list = blocking(move || format!("[{}]", views.join(","))).await;
-    Ok(([(header::CONTENT_TYPE, "application/json")], list))
+    Ok(Json(actor_handle.records_for(caller.sees()).run_list(&asked).await?))
 }
 
 pub(crate) async fn run(
@@ -194,26 +259,60 @@ pub(crate) async fn points(
     State(actor_handle): State<Arc<ActorHandle>>,
     Extension(caller): Extension<Arc<Caller>>,
     Path(run): Path<RunId>,
+    headers: HeaderMap,
     Query(query): Query<PointQuery>,
-) -> Result<Json<StageMetrics>, Failure> {
+) -> Result<Response, Failure> {
     let _turn = turn(&actor_handle).await?;
     let keys = query.key.is_some().then_some(query.key.as_slice());
-    let page = Page { after: query.after, limit: query.limit.min(limits::CURVE_POINTS) };
+    let packed = accepts_packed(&headers);
+    // Values of one name alone are as many as a client asks for.
+    let most = if packed && query.key.is_some() { limits::PACKED_POINTS } else { limits::CURVE_POINTS };
+    let page = Page { after: query.after, limit: query.limit.min(most) };
     let records = actor_handle.records_for(caller.sees());
-    Ok(Json(records.points(&run, query.stage.as_ref(), keys, page).await?))
+    let metrics = records.points(&run, query.stage.as_ref(), keys, page).await?;
+    // Beside the threads that answer heartbeats: there may be many numbers.
+    Ok(blocking(move || match packed {
+        true => ([(header::CONTENT_TYPE, PACKED), (header::VARY, "accept")], pack(&metrics)).into_response(),
+        false => ([(header::VARY, "accept")], Json(metrics)).into_response(),
+    })
+    .await)
+}
+
+/// Returns true if a client asks for numbers as they are in memory.
+pub(super) fn accepts_packed(headers: &HeaderMap) -> bool {
+    headers.get(header::ACCEPT).and_then(|value| value.to_str().ok()).is_some_and(|accepts| accepts.contains(PACKED))
+}
+
+/// Packs values: the length of a head as `u32`, the head as JSON padded with blanks to a multiple of four bytes, then for
+/// each series of the head its steps as `u64` and its values as `f64`. All numbers are little-endian.
+fn pack(metrics: &StageMetrics) -> Vec<u8> {
+    let series = || metrics.iter().flat_map(|(stage, keys)| keys.iter().map(move |(key, curve)| (stage, key, curve)));
+    let heads: Vec<_> =
+        series().map(|(stage, key, curve)| json!({"stage": stage, "key": key, "rows": curve.points.len()})).collect();
+    let mut head = json!(heads).to_string();
+    while head.len() % 4 != 0 {
+        head.push(' ');
+    }
+    let mut packed = u32::try_from(head.len()).unwrap_or(u32::MAX).to_le_bytes().to_vec();
+    packed.extend(head.into_bytes());
+    for (_, _, curve) in series() {
+        packed.reserve(16 * curve.points.len());
+        packed.extend(curve.points.iter().flat_map(|point| point.step.to_le_bytes()));
+        packed.extend(curve.points.iter().flat_map(|point| point.value.to_le_bytes()));
+    }
+    packed
 }
 
 /// Returns events in pages.
 pub(crate) async fn history(
     State(actor_handle): State<Arc<ActorHandle>>,
     Extension(caller): Extension<Arc<Caller>>,
-    query: Result<Query<HistoryCall>, QueryRejection>,
+    Query(query): Query<HistoryCall>,
 ) -> Result<Json<Vec<HistoryRow>>, Failure> {
-    let Query(HistoryCall { run, worker, after, since, limit }) =
-        query.map_err(|error| Failure::invalid(error.body_text()))?;
-    let _turn = turn(&actor_handle).await?;
+    let HistoryCall { run, worker, after, since, wait, limit } = query;
     let asked = HistoryQuery { run, worker, after, since_ms: since, limit: limit.min(limits::HISTORY_READ) };
-    Ok(Json(actor_handle.records_for(caller.sees()).history(&asked).await?))
+    let wait = Duration::from_secs(wait.min(limits::HISTORY_WAIT_S).into());
+    Ok(Json(events::wait_for_rows(&actor_handle, caller.sees(), &asked, wait).await?))
 }
 
 /// Executes a registry command for a client, because this process holds the store.

@@ -4,10 +4,11 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
 
-use protocol::message::{RunView, StageState};
+use protocol::message::{Listing, RunSummary, RunView, StageState};
 use protocol::{Digest, Group, RunId, StageName, limits};
 use registry::{
-    Buckets, Curve, HistoryQuery, HistoryRow, LogRow, OpenError, Page, ReadStore, Window, Write, WriteError,
+    Buckets, Curve, HistoryQuery, HistoryRow, LogRow, OpenError, Page, QueryError, ReadStore, RunListQuery, Window,
+    Write, WriteError,
 };
 
 use super::clock::wall_clock;
@@ -15,13 +16,13 @@ use super::start_error::StartError;
 use crate::batch::Refused;
 use crate::decide::decide;
 use crate::event::{Effect, Event};
+use crate::journal;
 use crate::policy::Policy;
 use crate::rejected::Rejected;
 use crate::state::State;
 use crate::state::run::Run;
 use crate::time::{Millis, Moment};
 use crate::view::WorkerView;
-use crate::{journal, state};
 
 /// The answer to `GET /v1/runs/{run}/metrics`: values by stage, key and step.
 pub type StageMetrics = BTreeMap<StageName, BTreeMap<String, Curve>>;
@@ -95,29 +96,29 @@ impl Records {
         &self.store
     }
 
-    /// Runs by submission, each as JSON: the newest `limit`, or those before a given run.
+    /// A part of the list of runs.
     ///
     /// # Errors
-    /// If the tables cannot be read.
-    pub async fn run_views(&self, before: Option<&RunId>, limit: u32) -> Result<Vec<String>, Refused> {
-        let limit = limit.min(limits::RUNS_LISTED);
-        let ended = self.store.ended_views(before, limit).await.map_err(WriteError::from)?;
-        let place = |run: RunId| (state::run::number_of(&run), run);
-        let mut views: BTreeMap<_, String> = ended.into_iter().map(|(run, view)| (place(run), view)).collect();
-        let first_after = before.map_or(u64::MAX, |run| state::run::number_of(run).unwrap_or_default());
-        // A run that has ended since the state was read, or was resumed, is in both.
-        let ending = self.ending.iter().map(|(run, view)| (place(run.clone()), view.clone()));
-        views.extend(ending.filter(|((number, _), _)| number.is_some_and(|number| number < first_after)));
-        let live = self.state.runs.range(..first_after).rev().filter(|(_, run)| self.shows(run));
-        for (_, run) in live.take(limit as usize) {
-            let view = serde_json::to_string(&self.state.view(run, self.now));
-            let view = view.map_err(|e| Rejected::Invalid(format!("run `{}`: {e}", run.id)))?;
-            views.insert(place(run.id.clone()), view);
+    /// If `after` is of no list, or the tables cannot be read.
+    pub async fn run_list(&self, asked: &RunListQuery) -> Result<Listing<RunSummary>, Refused> {
+        let asked = RunListQuery { limit: asked.limit.clamp(1, limits::RUNS_LISTED), ..asked.clone() };
+        let page = self.store.run_list(&asked).await.map_err(|error| match error {
+            QueryError::Invalid(why) => Refused::from(Rejected::Invalid(why)),
+            error => WriteError::from(error).into(),
+        })?;
+        let mut items = page.rows;
+        for row in &mut items {
+            let summary = match (self.state.run(&row.run), self.ending.get(&row.run)) {
+                (Ok(run), _) => self.state.summary(run, self.now),
+                (Err(_), Some(view)) => RunSummary::of(&read(&row.run, view)?),
+                (Err(_), None) => continue,
+            };
+            *row = RunSummary { created_ms: row.created_ms, changed_ms: row.changed_ms, ..summary };
         }
-        while views.len() > limit as usize {
-            views.pop_first();
-        }
-        Ok(views.into_values().collect())
+        // The state and the tables are not of one moment.
+        items.retain(|row| asked.states.is_empty() || asked.states.contains(&row.state));
+        let items = items.into_iter().map(RunSummary::shortened).collect();
+        Ok(Listing { items, next: page.next })
     }
 
     /// A run as clients see it, active or ended.
@@ -236,6 +237,14 @@ impl Records {
             stages.insert(name, self.store.buckets(&run, &stage, keys, window).await.map_err(WriteError::from)?);
         }
         Ok(stages)
+    }
+
+    /// Returns the ids of the oldest event and of the newest one ever added.
+    ///
+    /// # Errors
+    /// If the tables do not read.
+    pub async fn history_span(&self) -> Result<(Option<i64>, i64), Refused> {
+        Ok(self.store.history_span().await.map_err(WriteError::from)?)
     }
 
     /// Returns the events, oldest first.

@@ -8,15 +8,14 @@ use std::time::Duration;
 use access::Scope;
 use axum::Router;
 use axum::extract::DefaultBodyLimit;
-use axum::http::StatusCode;
 use axum::middleware;
 use axum::routing::{MethodRouter, get};
 use protocol::limits;
 use tokio::sync::watch;
 
 use super::Config;
+use super::api;
 use super::auth::{self, Gate};
-use super::failure::Failure;
 use super::listener::{self, Connections, Listener};
 use super::route::Route;
 use super::start_error::StartError;
@@ -79,12 +78,12 @@ impl RouteServer {
     ) {
         let route = Route { method: "GET", path, scopes, body: limits::CALL_BYTES, time: TIME };
         let admit = middleware::from_fn_with_state((Arc::clone(&self.gate), route), auth::admit);
-        let absent = || async { Failure::new(StatusCode::NOT_FOUND, "not-found", "no such path".to_owned()) };
         let router = Router::new()
             .route(path, handler.route_layer(DefaultBodyLimit::max(route.body)).route_layer(admit))
             // Reveals only that a server is running.
             .route("/v1/health", get(|| async { "ok" }))
-            .fallback(absent)
+            .fallback(api::absent)
+            .method_not_allowed_fallback(api::no_such_method)
             .layer(middleware::from_fn_with_state(self.gate, auth::check_host));
         listener::serve(vec![self.listener], router, self.connections, stopped).await;
     }

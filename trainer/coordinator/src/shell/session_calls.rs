@@ -6,6 +6,7 @@ use access::{Caller, Scope};
 use axum::extract::{Request, State};
 use axum::http::{HeaderName, header};
 use axum::{Extension, Json};
+use schemars::JsonSchema;
 use serde::Serialize;
 
 use super::actor_handle::ActorHandle;
@@ -17,7 +18,7 @@ use super::sessions::{self, Current, Holder, LASTS_S};
 use super::token_table::Standing;
 
 /// The caller and its scopes, which determine the buttons of the page.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, JsonSchema)]
 pub(crate) struct Who {
     name: String,
     #[serde(skip_serializing_if = "Option::is_none")]

@@ -4,27 +4,29 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use access::Caller;
-use axum::extract::{Path, State};
+use axum::extract::State;
 use axum::{Extension, Json};
 use pipeline::Pipeline;
 use protocol::{Digest, RunId, Seed, StageName};
-use registry::WriteError;
+use registry::{RunListQuery, RunOrder, WriteError};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use super::actor_handle::ActorHandle;
+use super::extract::Path;
 use super::failure::Failure;
-use super::queries::turn;
 use super::records::{Records, read};
+use super::turn::turn;
 use crate::batch::Refused;
 use crate::rejected::Rejected;
 
-/// Runs of one page of the search for the previous run, and the pages searched. A pipeline that none of the last 400 runs has
-/// counts as new.
+/// Runs of one page of the search for the previous run of a pipeline, and the pages searched. Behind 400 newer runs of the
+/// pipeline no previous run is found.
 const SEARCHED: (u32, usize) = (100, 4);
 
 /// The answer to `GET /v1/runs/{run}/settings`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct RunSettings {
     pub run: RunId,
     /// The newest earlier run of a pipeline with the same name.
@@ -37,7 +39,7 @@ pub struct RunSettings {
 }
 
 /// Settings of one stage.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct SettingsOfStage {
     pub stage: StageName,
     /// Kind and settings, with all defaults.
@@ -89,27 +91,27 @@ async fn of_run(records: &Records, run: &RunId) -> Result<RunSettings, Refused> 
 
 /// The newest run of the pipeline before `run`.
 async fn previous(records: &Records, run: &RunId, pipeline: &str) -> Result<Option<RunId>, Refused> {
-    #[derive(Deserialize)]
-    struct Named {
-        run: RunId,
-        pipeline: String,
-    }
     let (limit, pages) = SEARCHED;
-    let mut before = run.clone();
+    let mut asked = RunListQuery {
+        states: Vec::new(),
+        pipeline: Some(pipeline.to_owned()),
+        owner: None,
+        words: String::new(),
+        order: RunOrder::Newest,
+        after: None,
+        limit,
+    };
+    let mut passed = false;
     for _ in 0..pages {
-        let views = records.run_views(Some(&before), limit).await?;
-        let mut earliest = None;
-        for view in views.iter().rev() {
-            let earlier: Named = read(&before, view)?;
-            if earlier.pipeline == pipeline {
-                return Ok(Some(earlier.run));
+        let page = records.run_list(&asked).await?;
+        for row in page.items {
+            if passed {
+                return Ok(Some(row.run));
             }
-            earliest = Some(earlier.run);
+            passed = row.run == *run;
         }
-        match earliest {
-            Some(earliest) => before = earliest,
-            None => return Ok(None),
-        }
+        let Some(next) = page.next else { return Ok(None) };
+        asked.after = Some(next);
     }
     Ok(None)
 }

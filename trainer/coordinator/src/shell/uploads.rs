@@ -8,7 +8,7 @@ use std::time::Duration;
 use access::Scope;
 use axum::Json;
 use axum::body::Body;
-use axum::extract::{Path, State};
+use axum::extract::State;
 use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
 use axum::response::Response;
 use checkpoint::BlobError;
@@ -21,6 +21,7 @@ use registry::{Store, Write, WriteError};
 
 use super::actor_handle::ActorHandle;
 use super::body::Message;
+use super::extract::Path;
 use super::failure::Failure;
 use super::secrets::{self, Proof};
 use super::storage::ask;

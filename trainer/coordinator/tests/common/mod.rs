@@ -90,6 +90,7 @@ impl PureCoordinator {
 
     pub(crate) fn submit(&mut self, until: &str, workers: WorkerRange) -> RunId {
         let event = Event::Submit {
+            submission: None,
             pipeline: Box::new(pipelines::quickstart(1, workers, &[])),
             source: String::new(),
             idempotency_key: None,

@@ -18,6 +18,7 @@ fn submit() -> Ask {
     let pipeline = pipeline::read("p.yaml", TEXT, &[]).expect("a pipeline");
     let (pipeline, source) = (Box::new(pipeline), TEXT.to_owned());
     Ask::Event(Box::new(Event::Submit {
+        submission: None,
         pipeline,
         source,
         idempotency_key: None,

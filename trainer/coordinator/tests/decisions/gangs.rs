@@ -27,6 +27,7 @@ impl Gang {
             }
         }
         let submit = coordinator::Event::Submit {
+            submission: None,
             owner: protocol::Owner::local("me"),
             pipeline: Box::new(pipeline),
             source: String::new(),

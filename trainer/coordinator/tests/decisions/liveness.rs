@@ -164,6 +164,7 @@ fn a_gang_has_no_more_members_than_a_batch_has_slices() {
             }
         }
         let submit = Event::Submit {
+            submission: None,
             pipeline: Box::new(pipeline),
             source: String::new(),
             idempotency_key: None,
@@ -186,6 +187,7 @@ fn another_owners_run_keeps_its_placement() {
     let mut coordinator = PureCoordinator::new(Policy::default());
     let mut submit = |name: &str, min| {
         let event = Event::Submit {
+            submission: None,
             pipeline: Box::new(pipelines::quickstart(1, WorkerRange { min, max: min }, &[])),
             source: String::new(),
             idempotency_key: None,
@@ -300,6 +302,7 @@ fn every_generation_has_a_secret_of_its_own() {
 
 fn submit(coordinator: &mut PureCoordinator, seed: u64) -> RunId {
     let submit = Event::Submit {
+        submission: None,
         pipeline: Box::new(pipelines::quickstart(seed, WorkerRange::default(), &[])),
         source: String::new(),
         idempotency_key: None,
@@ -415,6 +418,7 @@ fn a_pipeline_of_more_than_a_thousand_stages_is_refused() {
         .collect();
     let mut take = |pipeline: &pipeline::Pipeline| {
         let event = Event::Submit {
+            submission: None,
             pipeline: Box::new(pipeline.clone()),
             source: String::new(),
             idempotency_key: None,

@@ -9,6 +9,7 @@ use crate::common::{PureCoordinator, pipelines};
 
 fn submit(coordinator: &mut PureCoordinator, seed: u64, until: &str) {
     let event = Event::Submit {
+        submission: None,
         pipeline: Box::new(pipelines::quickstart(seed, WorkerRange { min: 1, max: 1 }, &[])),
         source: String::new(),
         idempotency_key: None,

@@ -28,7 +28,8 @@ fn submit(coordinator: &mut PureCoordinator, pipeline: Pipeline) -> RunId {
     let pipeline = Box::new(pipeline);
     let until = pipeline.stage(&"vae".into()).is_some().then(|| "dataset".into());
     let owner = protocol::Owner::local("me");
-    let event = Event::Submit { pipeline, source: String::new(), idempotency_key: None, until, owner };
+    let event =
+        Event::Submit { submission: None, pipeline, source: String::new(), idempotency_key: None, until, owner };
     let effects = coordinator.happen(event).expect("submitted");
     let run = effects.into_iter().find_map(|effect| match effect {
         Effect::Submitted(run) => Some(run),

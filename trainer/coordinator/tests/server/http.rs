@@ -196,6 +196,20 @@ async fn a_run_goes_through_over_http_and_survives_a_restart() -> TestResult {
     let run = handle.submit(submission(Some("once"))?).await?;
     let again: coordinator::shell::Submitted = client.call("POST", "/v1/runs", submission(Some("once"))?).await?;
     assert_eq!(again.run, run);
+    let body = serde_json::to_vec(&submission(None)?)?;
+    let by_header = |key: &str| {
+        let request = Request::builder().method("POST").uri("/v1/runs").header("content-type", "application/json");
+        request.header("idempotency-key", key).body(Body::from(body.clone()))
+    };
+    let (status, answer) = client.send(by_header("once")?).await?;
+    assert_eq!(
+        (status.as_u16(), serde_json::from_slice::<coordinator::shell::Submitted>(&answer)?.run),
+        (200, run.clone())
+    );
+    let other = Submit { source: "name: other".into(), ..submission(Some("once"))? };
+    let (status, error) = client.refused("/v1/runs", other).await?;
+    assert_eq!((status, error.code.as_str()), (409, "conflict"), "{error:?}");
+    assert_eq!(client.send(by_header("")?).await?.0.as_u16(), 400);
 
     let joined = join(&client, "w").await?;
     let data = assignment(&client, "w", &joined, "dataset").await?;

@@ -7,7 +7,9 @@ use std::time::{Duration, Instant};
 
 use access::{Scope, Scopes, Tokens};
 use coordinator::{Allowances, Config, Connections, Coordinator, Handle};
-use protocol::message::{ApiError, Assignment, DesiredAssignments, Joined, LogBatch, MetricBatch, MetricRow, Poll};
+use protocol::message::{
+    ApiError, Assignment, DesiredAssignments, Joined, Listing, LogBatch, MetricBatch, MetricRow, Poll, RunSummary,
+};
 use protocol::proof::SECRET_HEADER;
 use registry::{Holder, Store};
 use serde::Serialize;
@@ -182,15 +184,37 @@ async fn runs_are_listed_in_parts() {
     let mut reader = Caller::connect(handle.address(), READER);
     let mut list = |query: &str| {
         let (status, answer) = reader.call("GET", &format!("/v1/runs?{query}"), b"");
-        assert_eq!(status, 200);
-        let views: Vec<serde_json::Value> = serde_json::from_slice(&answer).unwrap();
-        views.iter().map(|view| view["run"].as_str().unwrap().to_owned()).collect::<Vec<_>>()
+        assert_eq!(status, 200, "{query}");
+        let list: Listing<RunSummary> = serde_json::from_slice(&answer).unwrap();
+        let rows = list.items.iter().map(|row| serde_json::to_vec(row).unwrap().len());
+        assert!(rows.max().unwrap_or_default() <= RunSummary::BYTES);
+        (list.items.iter().map(|row| row.run.to_string()).collect::<Vec<_>>(), list.next)
     };
-    assert_eq!(list("limit=1000000"), runs);
-    assert_eq!(list("limit=3"), runs[4..]);
-    assert_eq!(list(&format!("limit=3&before={}", runs[4])), runs[1..4]);
-    assert_eq!(list(&format!("limit=3&before={}", runs[1])), runs[..1]);
-    assert!(list(&format!("before={}", runs[0])).is_empty());
+    let (newest, none) = list("limit=1000000");
+    assert_eq!((newest.iter().rev().cloned().collect::<Vec<_>>(), none), (runs.clone(), None));
+    for (query, expected) in [
+        ("limit=3", newest.clone()),
+        ("limit=2&sort=oldest", runs.clone()),
+        ("limit=1&state=cancelled", newest.iter().step_by(2).cloned().collect()),
+        ("limit=2&state=running,cancelled&pipeline=p", newest.clone()),
+        (
+            "limit=5&state=running&owner=token-of-one-who-may-submit",
+            newest.iter().skip(1).step_by(2).cloned().collect(),
+        ),
+        ("limit=2&sort=changed&state=cancelled", newest.iter().step_by(2).cloned().collect()),
+        ("limit=3&q=CANCEL+p-", Vec::new()),
+        ("limit=3&q=submit+p-", newest.clone()),
+        ("pipeline=q", Vec::new()),
+        ("owner=@p", Vec::new()),
+    ] {
+        let (mut all, mut next) = list(query);
+        while let Some(after) = next {
+            let (more, further) = list(&format!("{query}&after={after}"));
+            all.extend(more);
+            next = further;
+        }
+        assert_eq!(all, expected, "{query}");
+    }
     handle.shutdown().await;
 }
 

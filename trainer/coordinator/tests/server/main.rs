@@ -9,8 +9,11 @@ mod shell;
 
 mod access;
 mod crowd;
+mod errors;
+mod events;
 mod http;
 mod limits;
+mod openapi;
 mod owners;
 mod page;
 mod tls;

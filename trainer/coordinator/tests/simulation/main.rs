@@ -147,6 +147,7 @@ fn a_damaged_input_is_made_again_within_the_run() {
     world.now = Millis(CHAOS_MS);
     let pipeline = Box::new(pipelines::quickstart(9, WorkerRange::default(), &[]));
     let submit = Event::Submit {
+        submission: None,
         pipeline,
         source: String::new(),
         idempotency_key: None,
@@ -184,6 +185,7 @@ fn two_runs_of_one_pipeline_compute_once_and_a_third_finds_everything() {
     let mut world = World::new(7);
     world.now = Millis(CHAOS_MS);
     let submit = || Event::Submit {
+        submission: None,
         pipeline: Box::new(pipelines::quickstart(9, WorkerRange::default(), &[])),
         source: String::new(),
         idempotency_key: None,

@@ -92,7 +92,7 @@ impl FakeStore {
                     assert!(before.is_none(), "two runs have the key {key}");
                 }
             }
-            Write::RunOwner { .. } | Write::ModelOwner { .. } => {}
+            Write::Submission { .. } | Write::RunOwner { .. } | Write::ModelOwner { .. } => {}
             Write::RunState { run, state } => drop(self.runs.insert(run.clone(), state.clone())),
             Write::RunEnded { run, state, view, archive } => {
                 self.runs.insert(run.clone(), state.clone());

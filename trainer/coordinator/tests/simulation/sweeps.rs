@@ -25,6 +25,7 @@ fn sized(workers: usize, seed: u64, trials: u64) -> World {
     let pipeline = Box::new(pipelines::swept(3, trials));
     let idempotency_key = Some("once".to_owned());
     let submit = Event::Submit {
+        submission: None,
         pipeline,
         source: String::new(),
         idempotency_key,
@@ -86,6 +87,7 @@ fn a_sweep_is_found_again_and_shows_what_became_of_its_trials() {
     world.run();
     let results = world.store.results.len();
     let again = Event::Submit {
+        submission: None,
         pipeline: Box::new(pipelines::swept(3, TRIALS)),
         source: String::new(),
         idempotency_key: None,
@@ -124,6 +126,7 @@ fn a_metric_that_nobody_reports_ends_the_run_at_once() {
     let stage = pipeline.stages.iter_mut().find(|stage| stage.sweep.is_some()).expect("the swept stage");
     stage.sweep.as_mut().expect("a sweep").metric = "fdi".into();
     let submit = Event::Submit {
+        submission: None,
         pipeline: Box::new(pipeline),
         source: String::new(),
         idempotency_key: None,

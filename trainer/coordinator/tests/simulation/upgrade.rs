@@ -42,6 +42,7 @@ fn make_the_store() {
     let mut world = world(3);
     let pipeline = Box::new(pipelines::swept(3, TRIALS));
     let submit = Event::Submit {
+        submission: None,
         pipeline,
         source: String::new(),
         idempotency_key: Some("once".into()),

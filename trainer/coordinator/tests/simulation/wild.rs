@@ -17,6 +17,7 @@ pub(crate) fn events(state: &State, ended: &[Run]) -> Vec<Event> {
         Event::Started { alone: true, park: true },
         Event::Drain,
         Event::Submit {
+            submission: None,
             pipeline: Box::new(crate::pipelines::quickstart(0, Default::default(), &[])),
             source: String::new(),
             idempotency_key: None,

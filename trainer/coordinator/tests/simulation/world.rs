@@ -140,6 +140,7 @@ impl World {
                     },
                 };
                 let event = Event::Submit {
+                    submission: None,
                     pipeline: Box::new(pipeline),
                     source: String::new(),
                     idempotency_key: random.chance(30).then(|| format!("key-{i}")),

@@ -1,6 +1,6 @@
 //! Datasets: their clips with a search over captions, and a clip to be played.
 
-import { CallError, get } from "../api.js";
+import { CallError, get, runPath } from "../api.js";
 import { Clips, FORMATS } from "../features.js";
 import { count, duration, grouped, number, plain, short } from "../format.js";
 import { Figures } from "../motions.js";
@@ -10,6 +10,8 @@ import { html, nothing } from "../vendor/lit-html.js";
 
 /** Rows of the list at once. */
 const PAGE = 40;
+/** Newest runs whose datasets are listed. */
+const RUNS = 30;
 
 /** @param {Context} context @returns {View} */
 export function datasets(context) {
@@ -18,7 +20,8 @@ export function datasets(context) {
 
   /** @param {AbortSignal} signal */
   async function load(signal) {
-    const runs = /** @type {Run[]} */ (await get("/v1/runs?limit=200", signal)).reverse();
+    const rows = /** @type {RunList} */ (await get(`/v1/runs?limit=${RUNS}`, signal)).items;
+    const runs = /** @type {Run[]} */ (await Promise.all(rows.map((row) => get(runPath(row.run), signal))));
     const all = runs.flatMap((run) => run.stages.filter((stage) => isDone(stage) && stage.kind.startsWith("data.")).flatMap((stage) => Object.values(stage.outputs).map((digest) => ({ digest, run, stage }))));
     list = [...new Map(all.map((it) => [it.digest, it])).values()];
   }

@@ -4,7 +4,7 @@ import { get, post, runPath, CallError } from "../api.js";
 import { whatToDo } from "../advice.js";
 import { curves, mainKey } from "../chart.js";
 import { count, duration, number } from "../format.js";
-import { badge, bar, command, failed, firstLine, icon, isOver, joinCommand, left, mainStages, outcome, pace, prose, reached, reason, runState, spark } from "../parts.js";
+import { badge, bar, command, failed, firstLine, icon, isOver, joinCommand, left, mainStages, pace, prose, reached, reason, runState, spark } from "../parts.js";
 import { Rates } from "../rates.js";
 import { address } from "../router.js";
 import { controls, may } from "../session.js";
@@ -19,7 +19,9 @@ const [LIST_EVERY, CURVES_EVERY] = [5, 5];
 
 /** @param {Context} context @returns {View} */
 export function now(context) {
-  /** @type {Run[]} */
+  /** @type {RunRow[]} The newest runs in short. */
+  let rows = [];
+  /** @type {Run[]} Those that are under way, and failed ones, in full. */
   let runs = [];
   /** @type {WorkerRow[]} */
   let workers = [];
@@ -34,14 +36,18 @@ export function now(context) {
     const whole = beats % LIST_EVERY === 0;
     if (whole) {
       const [list, all, health] = await Promise.all([get(`/v1/runs?limit=${NEWEST}`, signal), get("/v1/workers", signal), get("/v1/health", signal)]);
-      runs = /** @type {Run[]} */ (list).reverse();
+      rows = /** @type {RunList} */ (list).items;
       workers = all;
       storage = health.storage;
     }
-    const live = runs.filter((run) => !isOver(run)).slice(0, LIVE);
-    const fresh = await Promise.all(live.map((run) => get(runPath(run.run), signal)));
-    runs = runs.map((run) => fresh.find((other) => other.run === run.run) ?? run);
-    for (const run of runs) if (!isOver(run)) rates.see(run);
+    const under = rows.filter((row) => !isOver(row)).slice(0, LIVE);
+    // A run that failed stays as it is.
+    const broken = unmended().filter((row) => !runs.some((run) => run.run === row.run && isOver(run))).slice(0, LIVE);
+    const fresh = /** @type {Run[]} */ (await Promise.all([...under, ...broken].map((row) => get(runPath(row.run), signal))));
+    const known = new Map([...runs, ...fresh].map((run) => [run.run, run]));
+    runs = rows.flatMap((row) => known.get(row.run) ?? []);
+    const live = runs.filter((run) => !isOver(run));
+    for (const run of live) rates.see(run);
     if (beats % CURVES_EVERY === 0) await Promise.all(live.map((run) => look(run, signal)));
     beats += 1;
   }
@@ -72,15 +78,17 @@ export function now(context) {
   /** Failed runs that no later run of their pipeline has made good. */
   function unmended() {
     const later = new Set();
-    return runs.filter((run) => {
+    return rows.filter((run) => {
       const newest = !later.has(run.pipeline);
       later.add(run.pipeline);
       return newest && run.state === "failed";
     });
   }
 
-  /** @param {Run} run */
-  function failure(run) {
+  /** @param {RunRow} row */
+  function failure(row) {
+    const run = runs.find((run) => run.run === row.run);
+    if (!run) return nothing;
     const stage = failed(run);
     const advice = whatToDo(stage?.message);
     return html`<li class="card want bad">
@@ -150,13 +158,11 @@ export function now(context) {
     return names.length === 0 ? "no worker" : `${count(names.length, "worker")}: ${names.slice(0, 6).join(", ")}${names.length > 6 ? ", …" : ""}`;
   }
 
-  /** @param {Run} run */
+  /** @param {RunRow} run */
   function ended(run) {
-    const seconds = mainStages(run).reduce((sum, stage) => sum + stage.wall_s, 0);
-    const [done, all] = reached(run);
     return html`<li><a class="line-link" href=${address("runs", run.run)}>${badge(runState(run))}<b class="name">${run.run}</b>
-      <span class="dim grow clip" dir="auto">${run.state === "finished" ? outcome(run) : prose(reason(run) || `${done} of ${all} stages`)}</span>
-      <span class="dim num">${seconds > 0 ? duration(seconds) : ""}</span></a></li>`;
+      <span class="dim grow clip" dir="auto">${prose(run.note || `${run.done} of ${run.stages} stages`)}</span>
+      <span class="dim num">${run.wall_s > 0 ? duration(run.wall_s) : ""}</span></a></li>`;
   }
 
   function empty() {
@@ -176,10 +182,10 @@ export function now(context) {
       ...running.filter((run) => mainStages(run).some((stage) => stage.wants_workers)).map(waiting),
       ...runs.filter((run) => run.state === "paused").slice(0, 5).map(stopped),
     ];
-    const over = runs.filter(isOver).slice(0, 10);
+    const over = rows.filter(isOver).slice(0, 10);
     const idle = workers.filter((worker) => worker.state === "idle").length;
     const here = workers.filter((worker) => worker.state === "idle" || worker.state === "working").length;
-    if (runs.length === 0) return html`<h1 tabindex="-1" class="unseen">Now</h1>${empty()}`;
+    if (rows.length === 0) return html`<h1 tabindex="-1" class="unseen">Now</h1>${empty()}`;
     return html`
       <div class="row head"><h1 tabindex="-1">Now</h1><span class="dim">${count(running.length, "run")} under way · <a href="/workers">${count(here, "worker")}, ${idle} idle</a></span></div>
       ${wants.length > 0 ? html`<section aria-labelledby="wants"><h2 id="wants">Wants you</h2><ul class="cards">${wants}</ul></section>` : nothing}

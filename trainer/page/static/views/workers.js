@@ -1,10 +1,10 @@
 //! Workers: who is here, what they hold and held, and what waits for them.
 
-import { get } from "../api.js";
+import { get, runPath } from "../api.js";
 import { count, date, duration, plain, time } from "../format.js";
 import { History, inWords } from "../history.js";
 import { timeLine } from "../lanes.js";
-import { badge, command, firstLine, isOver, joinCommand, mainStages, prose } from "../parts.js";
+import { badge, command, firstLine, joinCommand, mainStages, prose } from "../parts.js";
 import { address } from "../router.js";
 import { serverNow } from "../session.js";
 import { html, nothing } from "../vendor/lit-html.js";
@@ -59,6 +59,8 @@ export function lanesOf(rows, now) {
   }
   return [...lanes.values()];
 }
+/** Waiting runs whose stages are asked for. */
+const WAITING = 20;
 
 /** @param {Context} context @returns {View} */
 export function workers(context) {
@@ -81,8 +83,10 @@ export function workers(context) {
     list = await get("/v1/workers", signal);
     await history.load(signal);
     if (beats % 3 === 0) {
-      const runs = /** @type {Run[]} */ (await get("/v1/runs?limit=100", signal));
-      queue = runs.filter((run) => !isOver(run)).flatMap((run) => mainStages(run).filter((stage) => stage.wants_workers).map((stage) => ({ run, stage })));
+      const list = /** @type {RunList} */ (await get("/v1/runs?limit=100&state=running", signal));
+      const waiting = list.items.filter((run) => run.wants_workers).slice(0, WAITING);
+      const runs = /** @type {Run[]} */ (await Promise.all(waiting.map((run) => get(runPath(run.run), signal))));
+      queue = runs.flatMap((run) => mainStages(run).filter((stage) => stage.wants_workers).map((stage) => ({ run, stage })));
     }
     beats += 1;
   }

@@ -363,6 +363,21 @@ macro_rules! stage_kinds {
             }
         )*
 
+        impl schemars::JsonSchema for StageSettings {
+            fn schema_name() -> std::borrow::Cow<'static, str> {
+                "StageSettings".into()
+            }
+
+            fn json_schema(_: &mut schemars::SchemaGenerator) -> schemars::Schema {
+                schemars::json_schema!({
+                    "description": "Settings of a stage of any kind; `trainer schema` describes those of each.",
+                    "type": "object",
+                    "properties": {"kind": {"enum": [$($name::KIND),*]}},
+                    "required": ["kind"],
+                })
+            }
+        }
+
         impl serde::Serialize for StageSettings {
             fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
                 #[derive(serde::Serialize)]

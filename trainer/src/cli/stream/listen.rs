@@ -19,15 +19,15 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use access::{Scope, Tokens};
-use axum::Json;
+use axum::extract::ws::rejection::WebSocketUpgradeRejection;
 use axum::extract::ws::{CloseFrame, Message, WebSocket, WebSocketUpgrade, close_code};
-use axum::http::StatusCode;
+use axum::http::{StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
 use coordinator::RouteServer;
 use futures::stream::{SplitSink, SplitStream};
 use futures::{SinkExt, StreamExt};
-use protocol::message::ApiError;
+use protocol::message::{self, ApiError};
 use serde_json::json;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::mpsc::error::TryRecvError;
@@ -152,7 +152,12 @@ pub(super) async fn listen(
         streams,
         silent: Silent::default(),
     });
-    let handler = get(move |upgrade: WebSocketUpgrade| std::future::ready(Arc::clone(&server).admit(upgrade)));
+    let handler = get(move |upgrade: std::result::Result<WebSocketUpgrade, WebSocketUpgradeRejection>| {
+        std::future::ready(match upgrade {
+            Ok(upgrade) => Arc::clone(&server).admit(upgrade),
+            Err(refused) => refuse(refused.status(), "invalid", refused.body_text(), None),
+        })
+    });
     let (_stop, stopped) = watch::channel(false);
     tokio::select! {
         () = listener.serve("/v1/stream", &[Scope::Read], handler, stopped) => Ok(0),
@@ -213,6 +218,13 @@ async fn close(sink: &mut Sink, end: End) {
     let _ = timeout(SLOW, sink.send(Message::Close(Some(close)))).await;
 }
 
+/// Refuses a call as the coordinator does.
+fn refuse(status: StatusCode, code: &str, message: String, hint: Option<String>) -> Response {
+    let problem = message::Problem::new(status.as_u16(), ApiError { code: code.to_owned(), message, hint });
+    let kind = [(header::CONTENT_TYPE, message::Problem::CONTENT_TYPE)];
+    (status, kind, json!(problem).to_string()).into_response()
+}
+
 impl StreamServer {
     /// Accepts a connection if there is a place.
     fn admit(self: Arc<Self>, upgrade: WebSocketUpgrade) -> Response {
@@ -220,8 +232,7 @@ impl StreamServer {
             let message = format!("this server runs at most {} streams at once, and all are in use", self.streams);
             let hint =
                 Some("try again when a stream has ended, or start the server with a larger `--streams`".to_owned());
-            let error = ApiError { code: "busy".to_owned(), message, hint };
-            return (StatusCode::SERVICE_UNAVAILABLE, Json(error)).into_response();
+            return refuse(StatusCode::SERVICE_UNAVAILABLE, "busy", message, hint);
         }
         let upgrade = upgrade.max_message_size(MOST_BYTES).max_frame_size(MOST_BYTES);
         upgrade.max_write_buffer_size(WRITE_BYTES).on_upgrade(move |socket| async move {

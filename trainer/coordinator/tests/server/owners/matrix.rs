@@ -77,6 +77,12 @@ fn cases(lab: &Lab, kind: &Kind, method: &'static str, path: &'static str) -> Op
                 case(format!("{path}?run={}", lab.runs[&project]), Value::Null, reads(kind, project));
             }
         }
+        ("GET", "/v1/events") => {
+            case(format!("{path}?after=0&lasts=0"), Value::Null, filtered);
+            for project in Project::ALL {
+                case(format!("{path}?lasts=0&run={}", lab.runs[&project]), Value::Null, reads(kind, project));
+            }
+        }
         ("GET", "/v1/metrics") => {
             for project in Project::ALL {
                 case(format!("{path}?run={}", lab.runs[&project]), Value::Null, reads(kind, project));
@@ -207,7 +213,7 @@ async fn lists_hold_what_is_seen_and_all_of_it() -> TestResult {
             names
         };
         let runs = lab.call(kind.name, "GET", "/v1/runs", &Value::Null).await?.1;
-        assert_eq!(names(&runs, "run"), expect(&|project| lab.runs[&project].to_string()), "{}", kind.name);
+        assert_eq!(names(&runs["items"], "run"), expect(&|project| lab.runs[&project].to_string()), "{}", kind.name);
         let models = lab.registry(kind.name, &json!({"command": "list"})).await?.1;
         assert_eq!(names(&models["data"]["models"], "model"), expect(&Project::model), "{}", kind.name);
         // The worker is visible to all; its task only to callers who see the run.
@@ -237,7 +243,7 @@ async fn lists_hold_what_is_seen_and_all_of_it() -> TestResult {
         assert_eq!(lab.call(name, "GET", &path, &Value::Null).await?.0, status, "{name}");
         assert_eq!(lab.call(name, "GET", &format!("{path}/logs"), &Value::Null).await?.0, status, "{name}");
         let runs = lab.call(name, "GET", "/v1/runs", &Value::Null).await?.1;
-        assert_eq!(runs.as_array().map(Vec::len), Some(count), "{name}: {runs}");
+        assert_eq!(runs["items"].as_array().map(Vec::len), Some(count), "{name}: {runs}");
     }
     for (name, status) in [("bob", 404), ("carol", 403), ("alice", 200)] {
         let resumed = lab.call(name, "POST", &format!("/v1/runs/{run}/resume"), &Value::Null).await?;

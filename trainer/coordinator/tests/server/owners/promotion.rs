@@ -49,7 +49,7 @@ async fn a_submission_that_would_move_what_is_not_its_owners_to_move_is_refused(
         ("mona", "talks", "staging", Some("belongs to another owner")),
         ("carol", &walks, "", Some("belongs to another owner")),
     ] {
-        let runs = |lab: &Value| lab.as_array().map(Vec::len);
+        let runs = |list: &Value| list["items"].as_array().map(Vec::len);
         let before = runs(&lab.call("root", "GET", "/v1/runs", &Value::Null).await?.1);
         let answer = lab.submit(name, &submit(&quickstart(model, alias)?)?).await?;
         match (refused, answer) {

@@ -77,7 +77,7 @@ async fn a_token_ends_at_its_time() -> TestResult {
     lab.handle.replace_tokens(until("expires=2020-12-31")?);
     let (status, answer) = lab.call("rita", "GET", "/v1/runs", &Value::Null).await?;
     assert_eq!(status, StatusCode::UNAUTHORIZED);
-    assert!(answer["message"].as_str().is_some_and(|why| why.contains("`rita` has expired")), "{answer}");
+    assert!(answer["detail"].as_str().is_some_and(|why| why.contains("`rita` has expired")), "{answer}");
     lab.handle.shutdown().await;
     Ok(())
 }

@@ -3,6 +3,6 @@
 mod beside;
 mod clips;
 mod files;
-mod http;
+pub(crate) mod http;
 mod in_browser;
 mod sessions;

@@ -38,7 +38,7 @@ async fn a_token_names_its_workers_by_its_pattern() {
     let site = Site::start(60_000).await;
     let refused = post(&site.server("nodes"), OTHER, "/v1/workers", &join_of("lab-1")).await;
     assert_eq!(code(&refused), (403, "forbidden"));
-    assert!(refused.1["message"].as_str().unwrap().contains("`nodes-*`, not `lab-1`"), "{refused:?}");
+    assert!(refused.1["detail"].as_str().unwrap().contains("`nodes-*`, not `lab-1`"), "{refused:?}");
     assert!(site.handle.workers().is_empty());
     Worker::join(&site, "lab", "lab-1").await;
     site.handle.shutdown().await;
