@@ -50,6 +50,9 @@ async fn pages(store: &Store, asked: &RunListQuery, at_most: usize) -> (Vec<RunS
     (rows, longest)
 }
 
+/// Returns true for the rows of the answer.
+type Expected = Box<dyn Fn(&RunSummary) -> bool>;
+
 #[tokio::test]
 async fn a_page_of_a_hundred_thousand_runs_takes_as_long_as_one_of_ten() {
     let dir = tempfile::tempdir().unwrap();
@@ -61,7 +64,7 @@ async fn a_page_of_a_hundred_thousand_runs_takes_as_long_as_one_of_ten() {
     let all = RunListQuery { limit: 50, ..RunListQuery::default() };
     let failed = RunListQuery { states: vec![RunState::Failed], ..all.clone() };
     let words = |words: &str| RunListQuery { words: words.into(), ..all.clone() };
-    let cases: Vec<(&str, RunListQuery, Box<dyn Fn(&RunSummary) -> bool>)> = vec![
+    let cases: Vec<(&str, RunListQuery, Expected)> = vec![
         ("all", all.clone(), Box::new(|_| true)),
         ("the oldest first", RunListQuery { order: RunOrder::Oldest, ..all.clone() }, Box::new(|_| true)),
         ("the newest change first", RunListQuery { order: RunOrder::Changed, ..all.clone() }, Box::new(|_| true)),

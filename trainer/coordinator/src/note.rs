@@ -1,4 +1,4 @@
-//! One sentence on how a run stands: why it failed, what it waits for, what it computes, or what came of it.
+//! One sentence on how a run stands: the reason of a failure, what it waits for or computes, or its result.
 
 use protocol::message::{RunState, StageState, StageView};
 
@@ -19,7 +19,7 @@ pub(crate) fn note(state: RunState, stages: &[StageView]) -> String {
         return said(broken);
     }
     if state == RunState::Finished {
-        let measured = main().filter(|stage| stage.state.is_done() && stage.kind.starts_with("evaluate")).last();
+        let measured = main().rfind(|stage| stage.state.is_done() && stage.kind.starts_with("evaluate"));
         return measured.map(result).unwrap_or_default();
     }
     if state.is_final() {

@@ -1,6 +1,6 @@
 //! The stage kinds: artifacts in, artifacts out, training in between.
 //!
-//! Folders, each of which uses only those before it: `metrics` (formulas over arrays), `parts` (trained networks from
+//! A folder uses only folders before it in this list: `metrics` (formulas over arrays), `parts` (trained networks from
 //! artifacts), `generate` (motions from models), `train` (the loop and its data), `evaluation`, `kinds`, `run`
 //! (running a kind outside a worker). Not its job: leases, databases, HTTP. A stage's only access to the world is
 //! [`context`].

@@ -45,7 +45,6 @@ const LONG: Duration = Duration::from_secs(3600);
 
 type Entry = (Route, Described, MethodRouter<Arc<ActorHandle>>);
 
-#[expect(clippy::too_many_arguments, reason = "a row of the table")]
 fn entry<H: Handler<T, Arc<ActorHandle>>, T: 'static>(
     method: &'static str,
     path: &'static str,

@@ -34,7 +34,7 @@ pub struct RunSettings {
     pub seed: Seed,
     /// The pipeline's file as the user wrote it.
     pub source: String,
-    /// Stages in topological order, without those that a sweep made.
+    /// Stages of the pipeline in topological order, without a sweep's trials.
     pub stages: Vec<SettingsOfStage>,
 }
 

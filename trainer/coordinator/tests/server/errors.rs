@@ -28,7 +28,9 @@ async fn every_refusal_is_a_problem_with_a_code() {
     let admin = format!("Bearer {}", token(Scope::Admin));
     let reader = format!("Bearer {}", token(Scope::Read));
     let json = ("content-type", "application/json");
-    let cases: Vec<(&str, &str, Vec<(&str, &str)>, u16, &str, &str)> = vec![
+    // Method, path, headers; status, code, words of the answer.
+    type Case<'a> = (&'a str, &'a str, Vec<(&'a str, &'a str)>, u16, &'a str, &'a str);
+    let cases: Vec<Case<'_>> = vec![
         ("GET", "/v1/runs?limit=abc", vec![], 400, "invalid", "limit"),
         ("GET", "/v1/runs?limit=0", vec![], 400, "invalid", "`limit` is 0"),
         ("GET", "/v1/runs?limit=1&limit=2", vec![], 400, "invalid", "limit"),

@@ -53,7 +53,7 @@ pub const GPT: Place = Place::new("transformer of T2M-GPT", &["trans.", "generat
 /// MMM's transformer.
 pub const MMM: Place =
     Place::new("transformer of MMM", &["trans.", "generator.", ""], "trans_base.learn_tok_emb.weight");
-/// MDM, of which the average of the weights is preferred.
+/// MDM; the average of its weights is preferred.
 pub const MDM: Place =
     Place::new("MDM", &["model_avg.", "model.", "state_dict.", "denoiser.", ""], "embed_timestep.time_embed.0.weight");
 /// DisCoRD's U-Net.
