@@ -302,13 +302,14 @@ impl Store {
         let witness = Witness::begin(&dir, &stored).map_err(|e| io(&dir, e))?;
         reserve::keep(&dir);
         remove_files_of_earlier_builds(&dir).map_err(|e| io(&dir, e))?;
+        // By the writer's connection: a reader's would close the database later than the store.
+        for (task, held) in sqlite::held(&mut conn).await.map_err(|e| io(&dir, io::Error::other(e)))? {
+            held.into_iter().for_each(|digest| blobs.hold(&task, digest));
+        }
         let session = Session { conn, epoch: stored.epoch, witness };
         let proofs = Arc::new(Proofs::new(lease.as_ref().map(Lease::checked)));
         let writer = Writer::start(session, Arc::clone(&proofs), Arc::clone(&lock)).map_err(|e| io(&dir, e))?;
         let records = Arc::new(SqliteRecords::new(sqlite::open_readers(&dir, false)));
-        for (task, held) in records.held().await.map_err(|e| io(&dir, io::Error::other(e)))? {
-            held.into_iter().for_each(|digest| blobs.hold(&task, digest));
-        }
         let catalog = Box::new(SqliteCatalog { writer, records: Arc::clone(&records) });
         let opened_ms = clock::now_ms();
         let read =

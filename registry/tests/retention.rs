@@ -30,7 +30,7 @@ async fn checkpoints_are_pruned_by_policy_and_only_the_unneeded_is_collected() {
 
     let joint = Keep { latest: 1, best: 1, metric: "joint".into(), ..Keep::default() };
     let refused = store.prune_checkpoints(&task, joint, false).await.unwrap_err().to_string();
-    assert!(refused.contains("`joint`") && refused.contains("there is: loss"), "{refused}");
+    assert!(refused.contains("`joint`") && refused.contains("they record loss"), "{refused}");
     assert_eq!(store.checkpoints(&task).await.unwrap().len(), 5, "nothing is lost by a metric that nobody saved");
     let gone = store.prune_checkpoints(&task, Keep { best: 1, ..Keep::default() }, false).await.unwrap();
     assert_eq!(gone.len(), 2);

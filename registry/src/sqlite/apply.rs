@@ -47,8 +47,8 @@ pub(super) async fn apply(
                 set_run(conn, run.as_str(), &pipeline.to_string(), source, state, idempotency_key.as_deref()).await?;
             }
             Write::Submission { run: of, digest } => {
-                let set = sqlx::query("UPDATE runs SET submission = ? WHERE run = ?");
-                run(conn, set.bind(digest.to_string()).bind(of.as_str())).await?;
+                let set = sqlx::query("INSERT OR IGNORE INTO submissions (run, digest) VALUES (?, ?)");
+                run(conn, set.bind(of.as_str()).bind(digest.to_string())).await?;
             }
             Write::RunOwner { run, owner } => owners::own_run(conn, run, owner).await?,
             Write::ModelOwner { model, owner } => owners::claim(conn, model, owner).await?,

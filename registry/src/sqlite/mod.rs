@@ -29,6 +29,7 @@ use async_trait::async_trait;
 
 pub(crate) use open::{Opened, check_to_read, open_readers, open_writer, raise_epoch, reach_epoch};
 pub(crate) use query::SqliteRecords;
+pub(crate) use retention::held;
 pub(crate) use writer::{Session, Writer};
 
 use crate::WriteError;

@@ -26,6 +26,13 @@ use crate::versions::{Model, Promotion, Version};
 
 type Result<T> = std::result::Result<T, QueryError>;
 
+/// A query for rows of runs with their submissions.
+macro_rules! runs {
+    ($which:literal) => {
+        concat!("SELECT runs.*, submissions.digest AS submission FROM runs LEFT JOIN submissions USING (run) ", $which)
+    };
+}
+
 /// A pool of read-only connections.
 #[derive(Debug)]
 pub(crate) struct SqliteRecords(SqlitePool);
@@ -133,19 +140,19 @@ impl Records for SqliteRecords {
 
     async fn runs(&self) -> Result<Vec<RunRow>> {
         let mut conn = self.connection().await?;
-        let rows = sqlx::query("SELECT * FROM runs ORDER BY created_ms DESC, rowid DESC").fetch_all(&mut *conn).await?;
+        let rows = sqlx::query(runs!("ORDER BY created_ms DESC, runs.rowid DESC")).fetch_all(&mut *conn).await?;
         rows.iter().map(run_row).collect()
     }
 
     async fn run(&self, run: &RunId) -> Result<Option<RunRow>> {
         let mut conn = self.connection().await?;
-        let find = sqlx::query("SELECT * FROM runs WHERE run = ?").bind(run.as_str());
+        let find = sqlx::query(runs!("WHERE run = ?")).bind(run.as_str());
         find.fetch_optional(&mut *conn).await?.as_ref().map(run_row).transpose()
     }
 
     async fn run_by_key(&self, key: &str) -> Result<Option<RunRow>> {
         let mut conn = self.connection().await?;
-        let find = sqlx::query("SELECT * FROM runs WHERE idempotency_key = ?").bind(key);
+        let find = sqlx::query(runs!("WHERE idempotency_key = ?")).bind(key);
         find.fetch_optional(&mut *conn).await?.as_ref().map(run_row).transpose()
     }
 
@@ -265,11 +272,7 @@ impl Records for SqliteRecords {
 
     async fn held(&self) -> Result<BTreeMap<TaskId, BTreeSet<Digest>>> {
         let mut conn = self.connection().await?;
-        let mut held: BTreeMap<TaskId, BTreeSet<Digest>> = BTreeMap::new();
-        for row in sqlx::query("SELECT task, digest FROM held_blobs").fetch_all(&mut *conn).await? {
-            held.entry(TaskId::new(row.try_get::<String, _>(0)?)).or_default().insert(digest(&row, "digest")?);
-        }
-        Ok(held)
+        retention::held(&mut conn).await
     }
 
     async fn needs(&self) -> Result<Needs> {

@@ -1,6 +1,6 @@
 //! Retention in the tables: checkpoints by policy, shards of finished stages, pins, and the blobs that rows need.
 
-use std::collections::{BTreeSet, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 
 use protocol::stage::Keep;
 use protocol::{Digest, TaskId};
@@ -54,6 +54,15 @@ pub(super) async fn pin(
     let set =
         "INSERT INTO pins (digest, reason, at_ms) VALUES (?, ?, ?) ON CONFLICT DO UPDATE SET reason = excluded.reason";
     run(conn, sqlx::query(set).bind(name).bind(reason).bind(clock::now_ms())).await.map(|_| ())
+}
+
+/// Reads the blobs of held tasks.
+pub(crate) async fn held(conn: &mut SqliteConnection) -> Result<BTreeMap<TaskId, BTreeSet<Digest>>, QueryError> {
+    let mut held: BTreeMap<TaskId, BTreeSet<Digest>> = BTreeMap::new();
+    for row in sqlx::query("SELECT task, digest FROM held_blobs").fetch_all(&mut *conn).await? {
+        held.entry(TaskId::new(row.try_get::<String, _>(0)?)).or_default().insert(digest(&row, "digest")?);
+    }
+    Ok(held)
 }
 
 /// Records that a held task stores a blob.

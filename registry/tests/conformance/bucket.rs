@@ -152,7 +152,7 @@ fn parts_that_a_killed_process_left_are_listed_and_removed() {
     let bucket = Bucket::start();
     let (_dir, place) = open(client(&bucket, NAME, SECRET));
     let (store, bytes) = (BlobStore::new(place), bytes(20 << 20));
-    bucket.cut_after(9 << 20);
+    bucket.cut_after(17 << 20);
     std::thread::scope(|scope| {
         let sending = scope.spawn(|| store.put(&bytes));
         while bucket.cuts() == 0 && !sending.is_finished() {

@@ -49,7 +49,7 @@ fn what_is_wrong_is_said() {
         bvh("joints nested 100,000 deep")
     );
     let npy = npy::parse(Path::new("x.npy"), &file(named::npy(), "2^60 numbers"), true).expect_err("huge").to_string();
-    assert!(npy.contains("x.npy: 0 bytes of data for shape [1152921504606846976]"), "{npy}");
+    assert!(npy.contains("x.npy: has 0 bytes of data for shape [1152921504606846976]"), "{npy}");
     let header = WeightsFile::open(Bytes(file(named::safetensors(), "a header of 2^60 bytes"))).expect_err("huge");
     assert_eq!(header, "declares a header of 1152921504606846976 bytes, but has 10 bytes; expected a safetensors file");
     let rules =

@@ -524,7 +524,7 @@ mod tests {
         assert_eq!(fs::read_to_string(at("all.html")).unwrap().matches("<figure>").count(), 3);
         write_all("three", &sections, &at("all.png")).unwrap();
         let refused = write_all("three", &sections, &at("all.bvh")).unwrap_err().to_string();
-        assert!(refused.contains("3 motions, expected one"), "{refused}");
+        assert!(refused.contains("3 motions; expected one"), "{refused}");
         let many = [(String::new(), vec![&motion; 101])];
         assert!(write_all("x", &many, &at("x.png")).unwrap_err().to_string().contains("at most 100"));
         let outs = Outs::new(&[at("n.npy"), at("n.html"), at("n.glb")], 2).unwrap();

@@ -311,7 +311,7 @@ mod tests {
         for part in [
             "has the same clip id `a_b`",
             "a_b.txt:1: the line has 1 field",
-            "`b` may be c_b or d_b",
+            "it may be c_b or d_b",
             "`c_b` is in more than one",
         ] {
             assert!(text.contains(part), "{part}: {text}");

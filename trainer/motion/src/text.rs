@@ -330,7 +330,7 @@ mod tests {
             assert!(error.contains(part), "{line}: {error}");
         }
         let errors = parse_file(Path::new("texts/1.txt"), "a#a/DET#0#0\n\nb#b\n").unwrap_err();
-        assert!(errors[0].to_string().starts_with("texts/1.txt:3: 2 field(s)"), "{}", errors[0]);
+        assert!(errors[0].to_string().starts_with("texts/1.txt:3: the line has 2 field(s)"), "{}", errors[0]);
     }
 
     #[test]

@@ -141,7 +141,7 @@ fn a_metric_that_nobody_reports_ends_the_run_at_once() {
     let message = view.stages.iter().find(|stage| stage.name.as_str() == "pcm").and_then(|stage| stage.message.clone());
     assert_eq!(view.state, RunState::Failed);
     assert!(
-        message.as_deref().is_some_and(|m| m.contains("`fdi`") && m.contains("there is: latent_fid")),
+        message.as_deref().is_some_and(|m| m.contains("`fdi`") && m.contains("it reports latent_fid")),
         "{message:?}"
     );
 }
