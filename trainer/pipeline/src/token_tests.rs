@@ -83,7 +83,7 @@ fn what_does_not_fit_is_refused_where_it_stands() {
         // Mistakes in MMM's own settings.
         ("generator: mmm, ", "generator: mmm, text: words, ", 12, "embeds the captions of `kit`"),
         ("generator: mmm, ", "generator: mmm, dataset: kit, ", 12, "but `dataset` is `kit`"),
-        ("generator: mmm, ", "generator: mmm, network: {word_blocks: 10}, ", 12, "`network.layers`, 9"),
+        ("generator: mmm, ", "generator: mmm, network: {word_blocks: 10}, ", 12, "`network.layers` is 9"),
         ("guidance: 0}", "guidance: 2}", 22, "`mmm` has no guidance"),
         // Kinds that need denoising, or latents.
         (

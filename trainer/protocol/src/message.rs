@@ -754,7 +754,7 @@ impl Problem {
 }
 
 /// Codes of refusals with their titles.
-pub const CODES: [(&str, &str); 25] = [
+pub const CODES: [(&str, &str); 26] = [
     ("arrived-damaged", "The blob was damaged on its way"),
     ("busy", "The server has too much to do"),
     ("conflict", "The request conflicts with the current state"),
@@ -774,6 +774,7 @@ pub const CODES: [(&str, &str); 25] = [
     ("slow", "The request came too slowly"),
     ("stale-fence", "The grant has been superseded"),
     ("storage", "The store does not take data"),
+    ("tls", "The server speaks TLS"),
     ("too-large", "The data is too large"),
     ("unauthorized", "The call shows no valid token"),
     ("unproven", "The data is not proven complete"),

@@ -106,7 +106,7 @@ export function runs(context) {
       keep();
     };
     return html`<div class="row head"><h1 tabindex="-1">Runs</h1></div>
-      <div class="row filters"><label class="field grow"><span class="unseen">Filter runs</span><input type="search" placeholder="Filter by name, state, owner or reason   /" .value=${words} @input=${search}></label>
+      <div class="row filters"><label class="field grow"><span class="unseen">Filter runs</span><input type="search" placeholder="Filter by name, owner or reason   /" .value=${words} @input=${search}></label>
         <div class="chips" role="group" aria-label="State">${STATES.map((name) => html`<button type="button" aria-pressed=${name === state ? "true" : "false"} @click=${() => { state = name; keep(); }}>${name}</button>`)}</div></div>
       ${list.length === 0
         ? html`<p class="card dim">${!known ? "Loading…" : words || state !== "all" ? (next ? "None of the newest runs is like this." : "No run is like this.") : html`Nothing has run yet. <a href="/">Now</a> shows how to begin.`}</p>`

@@ -354,7 +354,7 @@ mod tests {
         assert_eq!(lcm.accepts(&sampler(2, &[699, 299])), Ok(()));
         assert_eq!(pcm.accepts(&sampler(2, &[])), Ok(()));
         for family in [Family::Autoregressive, Family::Mmm] {
-            assert!(family.accepts(&sampler(1, &[])).unwrap_err().contains("has none"), "{family:?}");
+            assert!(family.accepts(&sampler(1, &[])).unwrap_err().contains("has no guidance"), "{family:?}");
         }
         for family in [Family::Mld, lcm, pcm, mdm, Family::Autoregressive, Family::Masked, Family::Mmm] {
             assert_eq!(family.accepts(&family.published()), Ok(()), "{family:?}");

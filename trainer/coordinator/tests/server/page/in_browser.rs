@@ -216,7 +216,7 @@ async fn a_browser_shows_hostile_texts_as_texts_and_every_view_on_a_phone() -> T
         browser.evaluate("document.dispatchEvent(new KeyboardEvent('keydown', {key: '/', bubbles: true}))");
         browser.until("location.pathname === '/runs' && document.querySelector('input[type=search]')");
         browser.evaluate("document.querySelector('input[type=search]').focus()");
-        browser.write("hostile fail");
+        browser.write("hostile data says");
         browser.until(&format!("document.querySelectorAll('tbody tr').length === 1 && document.body.innerText.includes('{failed}')"));
         browser.evaluate("document.querySelector('tbody a').focus()");
         browser.press("Enter");
