@@ -555,7 +555,7 @@ mod tests {
     #[test]
     fn a_missing_tensor_is_named_with_those_there_are() {
         let error = Tensors::default().with("b", [1], vec![0.0]).take("mu", 1, "latents.safetensors").unwrap_err();
-        assert_eq!(error.to_string(), "latents.safetensors: no tensor `mu`; there are [\"b\"]");
+        assert_eq!(error.to_string(), "latents.safetensors: no tensor `mu`; the file has [\"b\"]");
         assert!(Tensors::from_bytes(Bytes::from_static(&[1, 2, 3]), "x").is_err());
     }
 
