@@ -145,7 +145,7 @@ mod tests {
         npy::write(&dir.path().join("Mean.npy"), &[251], &[0.0; 251]).expect("a file");
         check_format(dir.path(), DataFormat::Kit).expect("its own");
         let refused = check_format(dir.path(), DataFormat::Humanml3d).expect_err("another");
-        assert!(refused.error.to_string().contains("251 features, as `kit` has"), "{refused:?}");
+        assert!(refused.error.to_string().contains("251 features, like `kit`"), "{refused:?}");
         assert!(refused.hint.is_some_and(|hint| hint.contains("dataset.format=kit")));
     }
 

@@ -243,9 +243,11 @@ fn what_does_not_fit_is_refused_with_the_reason() {
     let other_vae = untrained(&bench, other_vae(&bench), Family::Mld);
     let good = untrained(&bench, vae, Family::Mld);
     let sampler = Sampler { steps: 3, guidance: 2.0, ..Sampler::default() };
-    for (model, kind_of, reason) in
-        [(other_shape, latents, "3x4"), (other_vae, latents, "is not the VAE of `latents`"), (good, dataset, "kind Dataset")]
-    {
+    for (model, kind_of, reason) in [
+        (other_shape, latents, "3x4"),
+        (other_vae, latents, "is not the VAE of `latents`"),
+        (good, dataset, "kind Dataset"),
+    ] {
         let inputs = [("model", model), ("latents", kind_of), ("dataset", dataset)];
         let refused = bench.run("eval", &latent_fid(1, sampler.clone(), false), &inputs).unwrap_err();
         assert!(refused.to_string().contains(reason), "{refused}");

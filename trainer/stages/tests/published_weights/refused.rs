@@ -55,7 +55,7 @@ fn what_makes_no_whole_network_is_refused_with_all_that_is_wrong() {
         "changed.safetensors: ",
         "`decoder.norm.bias` [",
         "is missing",
-        "`final_layer.bias` has shape [5], expected [263]",
+        "`final_layer.bias` has shape [5]; expected [263]",
         "`encoder.input_blocks.0.norm9.bias` [2] is not part of this network",
     ] {
         assert!(said.contains(part), "{part}: {said}");
@@ -133,5 +133,5 @@ fn what_is_of_another_kind_or_of_another_vae_is_refused() {
         crate::world::vae(&mut world, &file, &config["vae"]).output()
     };
     let said = world.import(&settings, &[("vae", other), ("text", text)]).unwrap_err();
-    assert!(said.contains("the VAE in it") && said.contains("the values differ"), "{said}");
+    assert!(said.contains("its VAE, `state_dict.vae.`") && said.contains("the values differ"), "{said}");
 }
