@@ -51,7 +51,7 @@ def test_values_are_whole_and_exact(finished: stride.Run, server: stride.Server)
 
 
 def test_logs_are_read(finished: stride.Run) -> None:
-    assert any(line.text for line in finished.logs(stage="vae"))
+    assert any(line.text for line in finished.logs(stage="dataset"))
 
 
 def test_errors_have_code_and_hint(server: stride.Server) -> None:
