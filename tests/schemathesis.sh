@@ -18,7 +18,10 @@ environment=${STRIDE_PYTHON_ENV:-$target/python}
 
 dir=$(mktemp -d)
 cleanup() {
-    [ -z "${server:-}" ] || kill "$server" 2>/dev/null || true
+    if [ -n "${server:-}" ]; then
+        kill "$server" 2>/dev/null || true
+        wait "$server" || true
+    fi
     rm -rf "$dir"
 }
 trap cleanup EXIT
