@@ -344,7 +344,9 @@ fn p13_lines_are_kept_in_order_though_their_worker_is_killed() {
         assert!(before.is_none_or(|before| before < line), "out of order: {row}");
     }
     assert!(
-        after.iter().any(|row| row["worker"] == "w2" && row["text"].as_str().unwrap_or_default().contains("goes on"))
+        after
+            .iter()
+            .any(|row| row["worker"] == "w2" && row["text"].as_str().unwrap_or_default().contains("continues from"))
     );
 }
 
@@ -387,7 +389,7 @@ fn p14_pause_resume_cancel_and_sigterm_end_with_saved_work() {
     cluster.signal("w1", Signal::SIGTERM);
     assert_eq!(cluster.ended("w1"), Some(0));
     cluster.join("w3");
-    wait_for("w3 to go on from the checkpoint", || cluster.said("w3").contains("goes on").then_some(()));
+    wait_for("w3 to go on from the checkpoint", || cluster.said("w3").contains("continues from").then_some(()));
     cluster.wait_step(&run, "vae", before);
     let view = cluster.wait_end(&run);
     assert_eq!(stage_of(&view, "vae")["state"], "resumed");

@@ -64,7 +64,7 @@ fn an_encoder_of_the_hub_without_a_network() {
     // A folder of that name takes precedence, and has no revision.
     fs::create_dir_all(bench.path().join("tiny/clip")).expect("a folder of ours");
     let refused = bench.run(&["run", "p.yaml"]).expect_code(2);
-    assert!(refused.stderr.contains("tiny/clip: no `config.json`"), "{}", refused.stderr);
+    assert!(refused.stderr.contains("tiny/clip: the folder has no `config.json`"), "{}", refused.stderr);
     pipeline(&bench, ", revision: main");
     let refused = bench.run(&["run", "p.yaml"]).expect_code(2);
     assert!(refused.stderr.contains("`revision` is set, but `path` is the folder"), "{}", refused.stderr);
