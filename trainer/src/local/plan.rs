@@ -107,7 +107,7 @@ impl Plan {
         }
         let wall = seconds / self.workers.max(1) as f64;
         let mut text = format!(
-            "\nabout {} with one worker, at best {} with {}; estimated from {} updates on {} clips per stage\n",
+            "\nabout {} with one worker, at best {} with {}; estimated by {} updates on {} clips per stage\n",
             long(seconds),
             long(wall),
             self.workers,
