@@ -36,8 +36,8 @@ pub fn loops(root: &Path) -> Vec<String> {
 }
 
 /// The imports that close loops between the folders of the crate with the root file `root`, each as
-/// `FOLDER -> FOLDER: NAME`. A folder stands for all files in it, beside the other files and folders of its parent; the
-/// file of a folder's own module (`mod.rs`) is one file of that folder.
+/// `FOLDER -> FOLDER: NAME`. A folder represents all files in it, beside the other files and folders of its parent. Its
+/// module file (`mod.rs`) is one of its files.
 ///
 /// # Panics
 ///

@@ -157,8 +157,8 @@ fn no_files_import_each_other_in_a_loop() {
 /// Folders may import each other although no two of their files do.
 #[test]
 fn no_folders_import_each_other_in_a_loop() {
-    // These have such folders today.
-    let but = ["trainer/coordinator/src/lib.rs", "trainer/protocol/src/lib.rs"];
+    // This crate has such folders today.
+    let but = ["trainer/coordinator/src/lib.rs"];
     let held = roots().into_iter().filter(|root| !but.iter().any(|but| root.ends_with(but)));
     let loops: Vec<String> = held.flat_map(|root| imports::folder_loops(&root)).collect();
     assert!(loops.is_empty(), "move what both folders need into one below both:\n{}", loops.join("\n"));

@@ -8,7 +8,7 @@ use std::process::Command;
 
 /// Commits whose added lines count as new.
 const COMMITS: usize = 20;
-/// Hits that new text may have whatever its length, so that one quotation does not fail a small change.
+/// Hits that a text of any length may have, so that one quotation does not fail a small change.
 const ALLOWED: usize = 2;
 
 const OPENINGS: [&str; 7] = ["What", "Who", "Whose", "Whom", "Whether", "Where", "How"];

@@ -31,7 +31,7 @@ pub(super) async fn apply(
     writes: &[Write],
 ) -> Result<()> {
     let mut fences = Fences::read(conn, writes).await?;
-    // One time for the end of a run and of its last stage, in whatever order their rows come.
+    // One time for the end of a run and of its last stage, in any order of their rows.
     let now = clock::now_ms();
     let (mut decisions, mut shards) = (Vec::new(), BTreeMap::new());
     for write in writes {

@@ -219,7 +219,7 @@ impl Browser {
         }
     }
 
-    /// What axe-core finds wrong with the page: the rule, the number of elements and the first of them. Empty without axe-core.
+    /// Problems that axe-core finds on the page: the rule, the number of elements and the first element. Empty without axe-core.
     pub fn inaccessible(&mut self) -> Vec<String> {
         let Some(axe) = axe() else { return Vec::new() };
         self.evaluate(&format!("{axe};1"));

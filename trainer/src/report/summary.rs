@@ -40,7 +40,7 @@ struct StageSummary {
     wall_s: f64,
     #[serde(skip_serializing_if = "Option::is_none")]
     message: Option<String>,
-    /// The swept stage of which this one is a trial.
+    /// The swept stage, if this stage is one of its trials.
     #[serde(skip_serializing_if = "Option::is_none")]
     of: Option<StageName>,
 }

@@ -88,7 +88,7 @@ impl AttemptContext for Solo {
         self.device.clone()
     }
     fn data(&self) -> Arc<DataAccess> {
-        // What it computes is compared and not stored.
+        // Its results are compared and not stored.
         Arc::new(DataAccess::unverified())
     }
     fn blobs(&self) -> Arc<dyn Blobs> {
