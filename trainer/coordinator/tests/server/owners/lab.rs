@@ -13,6 +13,7 @@ use reqwest::{Method, StatusCode};
 use serde_json::{Value, json};
 
 use crate::shell::{SECRET, offer};
+use crate::workers::bystanders::PATIENCE;
 
 pub(crate) type TestResult<T = ()> = Result<T, Box<dyn std::error::Error + Send + Sync>>;
 
@@ -255,7 +256,7 @@ impl Lab {
         let request = self.clients[name].request(Method::from_bytes(method.as_bytes())?, path);
         let request = request.header("content-type", "application/json").header(SECRET_HEADER, secret);
         let request = if method == "GET" { request } else { request.body(body.to_owned()) };
-        let answer = request.send().await?;
+        let answer = request.timeout(PATIENCE).send().await?;
         let status = answer.status();
         Ok((status, String::from_utf8_lossy(&answer.bytes().await?).into_owned()))
     }

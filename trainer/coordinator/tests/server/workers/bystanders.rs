@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
+use std::time::Duration;
 
 use access::{Server, Tokens};
 use coordinator::{Config, Coordinator, Handle, Policy};
@@ -20,6 +21,9 @@ use serde_json::Value;
 
 /// Long enough for a slow machine, short enough to wait for.
 pub(crate) const LEASE_MS: u64 = 1500;
+
+/// Longer than any call takes. The error of a call without an answer has its path.
+pub(crate) const PATIENCE: Duration = Duration::from_secs(90);
 
 /// Each token contains its name. `nodes` and `lab` belong to workers.
 pub(crate) const TOKENS: [(&str, &str, &str); 6] = [
@@ -110,7 +114,7 @@ pub(crate) async fn post(server: &Server, secret: &str, path: &str, body: &impl 
 }
 
 pub(crate) async fn answer(request: RequestBuilder) -> (u16, Value) {
-    let answer = request.send().await.unwrap();
+    let answer = request.timeout(PATIENCE).send().await.unwrap();
     let status = answer.status().as_u16();
     let bytes = answer.bytes().await.unwrap();
     let text = || Value::String(String::from_utf8_lossy(&bytes).into_owned());

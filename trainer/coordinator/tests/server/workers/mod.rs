@@ -1,7 +1,7 @@
 //! Attacks by a valid worker token or a faulty worker on others: names, grants, manifests and blobs.
 
 mod blobs;
-mod bystanders;
+pub(super) mod bystanders;
 mod fuzz;
 mod grants;
 mod matrix;
