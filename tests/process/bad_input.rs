@@ -89,6 +89,9 @@ fn a_command_line_that_is_probably_not_meant_is_refused_with_what_to_write() {
         &generate(&["a", "person", "walks"]),
         &["`a person walks` without quotes is 3 sentences", "hint: for one motion"],
     );
+    let bare = ["generate", "a", "person", "walks"];
+    refused(&bench, &bare, &["`a person walks` without quotes is 3 sentences", "hint: for one motion"]);
+    refused(&bench, &["generate", "a person walks"], &["--model <MODEL>"]);
     refused(&bench, &generate(&["a person walks", "--guidance", "-3"]), &["--guidance", "expected 0 or more"]);
     refused(&bench, &generate(&["a person walks", "--seconds", "-4"]), &["expected more than 0"]);
     // Accepted as intended; the remaining error is the missing store.

@@ -212,8 +212,18 @@ struct RegistryArgs {
     verb: registry::cli::Verb,
 }
 
-/// Runs the command.
-pub(crate) fn main(cli: Cli) -> ExitCode {
+/// Runs the command that the process was started with.
+pub(crate) fn main() -> ExitCode {
+    let cli = match Cli::try_parse() {
+        Ok(cli) => cli,
+        Err(error) => match sentences::without_quotes(&error, std::env::args().skip(1)) {
+            Some(problem) => {
+                print::problem(&problem, Output::Table);
+                return ExitCode::from(problem.exit);
+            }
+            None => error.exit(),
+        },
+    };
     if let Verb::Worker(WorkerVerb::Join(args)) = cli.verb {
         // A worker is synchronous, with its own threads and its own logging.
         worker::init_logging();

@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use clap::Args;
+use clap::error::ErrorKind;
 use mocap::requests::{self, Length, Request};
 
 use crate::report::problem::{Problem, Result};
@@ -51,6 +52,15 @@ fn check_quotes(prompts: &[String]) -> Result<()> {
         "for one motion, write \"{sentence}\"; for {count} motions, pass the words as lines: printf '{lines}\\n' | \
          trainer generate --captions - ..."
     )))
+}
+
+/// Explains a refused `trainer generate a person walks`: its missing quotes matter more than its missing options.
+/// `words` are the arguments of the process.
+pub(super) fn without_quotes(error: &clap::Error, mut words: impl Iterator<Item = String>) -> Option<Problem> {
+    if error.kind() != ErrorKind::MissingRequiredArgument || words.next()? != "generate" {
+        return None;
+    }
+    check_quotes(&words.take_while(|word| !word.starts_with('-')).collect::<Vec<_>>()).err()
 }
 
 impl SentenceArgs {
