@@ -151,11 +151,10 @@ fn an_upload_in_parts_that_is_given_up_leaves_nothing_and_goes_on_from_here() {
 fn parts_that_a_killed_process_left_are_listed_and_removed() {
     let bucket = Bucket::start();
     let (_dir, place) = open(client(&bucket, NAME, SECRET));
-    let (store, bytes) = (BlobStore::new(place), bytes(20 << 20));
-    bucket.cut_after(17 << 20);
+    let (store, bytes) = (BlobStore::new(place), bytes(96 << 20));
     std::thread::scope(|scope| {
         let sending = scope.spawn(|| store.put(&bytes));
-        while bucket.cuts() == 0 && !sending.is_finished() {
+        while bucket.parts() == 0 && !sending.is_finished() {
             std::thread::yield_now();
         }
         bucket.close();
