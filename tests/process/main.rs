@@ -20,6 +20,7 @@ mod kinds;
 mod memory;
 mod mocap;
 mod motions;
+mod page;
 mod reading;
 mod registry;
 mod released;

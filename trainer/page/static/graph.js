@@ -88,7 +88,7 @@ export function graph(run, stages, why) {
       <rect class="edge-mark" x=${x} y=${y + 8} width="3" height=${HEIGHT - 16}></rect>
       <title>${`${stage.name}, ${stage.kind}${reason ? `: ${reason}` : ""}`}</title>
       <text class="name" x=${x + 14} y=${y + 22}>${sign(stage.state)} ${cut(stage.name, 15)}</text>
-      <text class="kind" x=${x + 14} y=${y + 40}>${cut(below, 23)}</text>
+      <text class="kind" x=${x + 14} y=${y + 40}>${cut(below, 17)}</text>
       ${stage.state === "running" ? svg`<rect class="track" x=${x + 14} y=${y + 47} width=${WIDTH - 28} height="3" rx="1.5"></rect><rect class="done" x=${x + 14} y=${y + 47} width=${(WIDTH - 28) * share(stage.progress)} height="3" rx="1.5"></rect>` : ""}
     </a>`;
   };
