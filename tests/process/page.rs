@@ -47,7 +47,7 @@ fn a_run_and_the_next_one_are_seen_on_the_page() {
     browser.write(TOKEN);
     browser.press("Enter");
     browser.until(&format!("document.querySelector('main')?.textContent.includes('{second}')"));
-    // That nobody was signed in is the one refusal to expect.
+    // Before the sign-in one call is refused, as it must be.
     let before = browser.complaints().len();
 
     // Only what depends on the changed setting ran again, and the page names the setting.

@@ -216,7 +216,7 @@ struct RegistryArgs {
 pub(crate) fn main() -> ExitCode {
     let cli = match Cli::try_parse() {
         Ok(cli) => cli,
-        Err(error) => match sentences::without_quotes(&error, std::env::args().skip(1)) {
+        Err(error) => match sentences::without_quotes(&error, std::env::args_os().skip(1)) {
             Some(problem) => {
                 print::problem(&problem, Output::Table);
                 return ExitCode::from(problem.exit);

@@ -1,5 +1,6 @@
 //! Sentences on a command line and in files, with lengths and seeds.
 
+use std::ffi::OsString;
 use std::path::PathBuf;
 
 use clap::Args;
@@ -56,7 +57,8 @@ fn check_quotes(prompts: &[String]) -> Result<()> {
 
 /// Explains a refused `trainer generate a person walks`: its missing quotes matter more than its missing options.
 /// `words` are the arguments of the process.
-pub(super) fn without_quotes(error: &clap::Error, mut words: impl Iterator<Item = String>) -> Option<Problem> {
+pub(super) fn without_quotes(error: &clap::Error, words: impl Iterator<Item = OsString>) -> Option<Problem> {
+    let mut words = words.map(|word| word.to_string_lossy().into_owned());
     if error.kind() != ErrorKind::MissingRequiredArgument || words.next()? != "generate" {
         return None;
     }
