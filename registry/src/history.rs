@@ -34,6 +34,8 @@ pub enum HistoryKind {
     Released,
     /// An attempt ended without a result; another one follows.
     Retried,
+    /// A stage made no progress for long.
+    Stalled,
     /// A checkpoint was committed.
     Checkpoint,
     /// A stage has its value.
@@ -47,7 +49,7 @@ pub enum HistoryKind {
 }
 
 impl HistoryKind {
-    pub(crate) const ALL: [Self; 18] = [
+    pub(crate) const ALL: [Self; 19] = [
         Self::Submitted,
         Self::Paused,
         Self::Resumed,
@@ -61,6 +63,7 @@ impl HistoryKind {
         Self::Adopted,
         Self::Released,
         Self::Retried,
+        Self::Stalled,
         Self::Checkpoint,
         Self::Finished,
         Self::Failed,
@@ -84,6 +87,7 @@ impl HistoryKind {
             Self::Adopted => "adopted",
             Self::Released => "released",
             Self::Retried => "retried",
+            Self::Stalled => "stalled",
             Self::Checkpoint => "checkpoint",
             Self::Finished => "finished",
             Self::Failed => "failed",

@@ -170,6 +170,10 @@ impl Records for ScopedRecords {
         self.all.history_span().await
     }
 
+    async fn told(&self, hook: &str) -> Result<Option<i64>> {
+        self.all.told(hook).await
+    }
+
     async fn run_times(&self, runs: &[RunId]) -> Result<BTreeMap<RunId, Times>> {
         let owners = self.run_owners(runs).await?;
         let mut times = self.all.run_times(runs).await?;

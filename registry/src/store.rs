@@ -431,6 +431,11 @@ impl Store {
         }
     }
 
+    /// Notes that a hook has been told of the history up to this row.
+    pub async fn tell(&self, hook: &str, id: i64) -> Result<(), WriteError> {
+        self.order(Order::Told { hook: hook.to_owned(), id }).await.map(drop)
+    }
+
     /// Removes history from before a time, in milliseconds since 1970; returns the number of rows that went.
     pub async fn prune_history(&self, before_ms: i64) -> Result<u64, WriteError> {
         match self.order(Order::PruneHistory { before_ms }).await? {

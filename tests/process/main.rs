@@ -32,3 +32,4 @@ mod sweeps;
 mod tokens;
 mod verify;
 mod versions;
+mod webhooks;

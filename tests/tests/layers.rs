@@ -74,6 +74,7 @@ fn dependencies_point_one_way() {
     never("registry", &["burn", "coordinator", "stages", "models", "worker"]);
     never("coordinator", &["burn", "stages", "models", "worker"]);
     never("page", &["burn", "tokio", "sqlx", "axum", "hyper", "registry", "coordinator", "access"]);
+    never("webhooks", &["burn", "axum", "coordinator", "stages", "worker"]);
     never("motion", &["burn", "tokio", "sqlx", "axum", "registry", "checkpoint"]);
     never("mocap", &["burn", "tokio", "sqlx", "axum", "registry", "checkpoint"]);
     never("text-models", &["burn", "tokio", "sqlx", "axum", "reqwest", "hf-hub", "onig", "registry", "checkpoint"]);

@@ -24,7 +24,7 @@ pub use expiry::Expiry;
 pub use names::Names;
 pub use options::{ConnectionOptions, ServerOptions, TokenOptions};
 pub use scope::{Scope, Scopes};
-pub use secret::{FileError, Token, TokenError};
+pub use secret::{FileError, Token, TokenError, entries, read_secret};
 pub use tokens::{Promoter, Tokens, digest_of};
 
 /// Default port of a server.

@@ -108,11 +108,11 @@ pub struct FileError {
 }
 
 impl FileError {
-    pub(crate) fn new(path: &Path, message: impl fmt::Display) -> Self {
+    pub fn new(path: &Path, message: impl fmt::Display) -> Self {
         Self { path: path.to_owned(), line: None, message: message.to_string(), hint: None }
     }
 
-    pub(crate) fn line(path: &Path, line: usize, message: impl fmt::Display) -> Self {
+    pub fn line(path: &Path, line: usize, message: impl fmt::Display) -> Self {
         Self { line: Some(line), ..Self::new(path, message) }
     }
 
@@ -128,7 +128,7 @@ impl FileError {
 }
 
 /// Reads a file that must be closed to other users.
-pub(crate) fn read_secret(path: &Path) -> Result<String, FileError> {
+pub fn read_secret(path: &Path) -> Result<String, FileError> {
     let failed = |error: std::io::Error| FileError::new(path, error);
     let file = open_regular(path).map_err(failed)?;
     let metadata = file.metadata().map_err(failed)?;
@@ -146,7 +146,7 @@ pub(crate) fn read_secret(path: &Path) -> Result<String, FileError> {
 }
 
 /// Lines that are neither empty nor comments, with their numbers and words.
-pub(crate) fn entries(text: &str) -> impl Iterator<Item = (usize, Vec<&str>)> {
+pub fn entries(text: &str) -> impl Iterator<Item = (usize, Vec<&str>)> {
     let lines = text.lines().enumerate().map(|(i, line)| (i + 1, line.split_whitespace().collect::<Vec<_>>()));
     lines.filter(|(_, words)| words.first().is_some_and(|word| !word.starts_with('#')))
 }

@@ -65,6 +65,12 @@ pub enum Event {
     },
     /// Members of a gang complain of each other; see [`Heard::words`](crate::state::Heard::words).
     GangDivided { task: TaskId, fence: Fence },
+    /// A stage that work has begun on made no progress for long. It is only noted.
+    Quiet {
+        key: Digest,
+        /// The time without progress. Milliseconds.
+        for_ms: u64,
+    },
     /// No member of a gang has advanced by a step for too long.
     GangStalled { task: TaskId, fence: Fence },
     /// A checkpoint was uploaded and is to be committed.
@@ -132,6 +138,7 @@ impl Event {
             | Self::LeaseExpired { .. }
             | Self::WorkerGone { .. }
             | Self::GangDivided { .. }
+            | Self::Quiet { .. }
             | Self::GangStalled { .. }
             | Self::Control { .. }
             | Self::WorkerForgotten { .. }

@@ -75,7 +75,7 @@ pub(crate) fn of(state: &State, fact: &Fact, why: Option<&str>) -> Vec<HistoryEn
     }
 }
 
-fn about(execution: &StageExecution, kind: HistoryKind) -> HistoryEntry {
+pub(crate) fn about(execution: &StageExecution, kind: HistoryKind) -> HistoryEntry {
     let (run, stage) = (Some(execution.run.clone()), Some(execution.stage.clone()));
     HistoryEntry { run, stage, ..HistoryEntry::new(kind) }
 }

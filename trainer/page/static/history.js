@@ -36,7 +36,7 @@ export class History {
 const WORDS = {
   submitted: "submitted", paused: "paused", resumed: "resumed", joined: "joined", returned: "came back", lost: "was lost", left: "left",
   granted: "got it", regrouped: "the gang goes on", adopted: "was taken in", released: "was given back", retried: "tries again",
-  finished: "finished", failed: "failed", promoted: "promoted", "rolled-back": "rolled back",
+  stalled: "stands still", finished: "finished", failed: "failed", promoted: "promoted", "rolled-back": "rolled back",
 };
 
 /** @param {HistoryRow} row */

@@ -20,6 +20,9 @@ pub(crate) struct AllowanceArgs {
     /// Days that the history of runs, stages and workers is kept
     #[arg(long, env = "STRIDE_KEEP_HISTORY_DAYS", default_value_t = Allowances::default().history.as_secs() / 86_400, value_name = "DAYS")]
     keep_history_days: u64,
+    /// Minutes without progress after which a stage that work has begun on is said to stand still
+    #[arg(long, env = "STRIDE_STALLED_AFTER_MINUTES", default_value_t = Allowances::default().quiet.as_secs() / 60, value_parser = clap::value_parser!(u64).range(1..), value_name = "MINUTES")]
+    stalled_after_minutes: u64,
     /// Calls per second of one token, workers' tokens excepted
     #[arg(long, env = "STRIDE_MAX_CALLS_PER_SECOND", default_value_t = Allowances::default().calls, value_name = "COUNT")]
     max_calls_per_second: u32,
@@ -36,6 +39,7 @@ impl AllowanceArgs {
             log_bytes: self.max_log_mib << 20,
             values: self.max_values,
             history: Duration::from_secs(self.keep_history_days.saturating_mul(86_400)),
+            quiet: Duration::from_secs(self.stalled_after_minutes.saturating_mul(60)),
             calls: self.max_calls_per_second,
         };
         if let Some(most) = self.max_connections_per_token {

@@ -9,6 +9,7 @@ use clap::Args;
 use coordinator::{Coordinator, Handle};
 use registry::{Holder, Store};
 use tokio::signal::unix::{SignalKind, signal};
+use webhooks::Hooks;
 
 use super::allowance_args::AllowanceArgs;
 use super::endpoint_args::EndpointArgs;
@@ -40,6 +41,10 @@ pub(crate) struct ServeArgs {
     /// The store's folder
     #[arg(long, env = "STRIDE_STORE", default_value = ".stride", value_name = "DIR")]
     store: PathBuf,
+    /// File with lines `NAME URL SECRET [on=failed,stalled] [project=NAME]`: addresses that get a signed message when a
+    /// run ends or stands still and when a model is promoted
+    #[arg(long, env = "STRIDE_WEBHOOKS", value_name = "FILE")]
+    webhooks: Option<PathBuf>,
     #[command(flatten)]
     blobs: super::args::BlobArgs,
     #[command(flatten)]
@@ -58,8 +63,16 @@ impl ServeArgs {
         Ok(tokens)
     }
 
-    /// Reads the token file again. A file with an error changes nothing.
+    fn hooks(&self) -> Result<Hooks> {
+        Ok(self.webhooks.as_deref().map(Hooks::read).transpose()?.unwrap_or_default())
+    }
+
+    /// Reads the files of tokens and webhooks again. A file with an error changes nothing.
     fn reload(&self, handle: &Handle) {
+        match self.hooks() {
+            Ok(hooks) => handle.replace_hooks(hooks),
+            Err(problem) => print::note(&format!("keeping the earlier webhooks: {:#}", problem.error)),
+        }
         match self.tokens() {
             Ok(tokens) => {
                 handle.replace_tokens(tokens);
@@ -87,6 +100,7 @@ pub(crate) async fn serve(args: ServeArgs) -> Result<u8> {
     coordinator::shell::raise_descriptor_limit();
     let mut config = args.endpoint.config(args.bind, args.tokens()?, args.insecure)?;
     args.allowances.set(&mut config);
+    config.hooks = args.hooks()?;
     // Report errors before the store is created.
     config.check()?;
     let open = config.tokens.is_empty();

@@ -38,7 +38,7 @@ class HistoryRow(Answer):
     attempt: int | None = None
     id: int
     """Grows from row to row."""
-    kind: Literal['submitted', 'paused', 'resumed', 'ended', 'joined', 'returned', 'lost', 'left', 'granted', 'regrouped', 'adopted', 'released', 'retried', 'checkpoint', 'finished', 'failed', 'promoted', 'rolled-back']
+    kind: Literal['submitted', 'paused', 'resumed', 'ended', 'joined', 'returned', 'lost', 'left', 'granted', 'regrouped', 'adopted', 'released', 'retried', 'stalled', 'checkpoint', 'finished', 'failed', 'promoted', 'rolled-back']
     model: str | None = None
     run: str | None = None
     stage: str | None = None

@@ -4,11 +4,12 @@ use std::sync::Arc;
 
 use protocol::message::Grant;
 use protocol::{Digest, RunId, StageName};
-use registry::Write;
+use registry::{HistoryEntry, HistoryKind, Write};
 
 use super::deciding::Deciding;
 use crate::event::Effect;
 use crate::fact::Fact;
+use crate::history;
 use crate::register::Registration;
 use crate::rejected::Rejected;
 use crate::state::execution::{ExecutionState, StageExecution};
@@ -17,6 +18,16 @@ use crate::time::Millis;
 use crate::value::Known;
 
 impl Deciding<'_> {
+    /// Notes that an execution makes no progress.
+    pub(crate) fn quiet(&mut self, key: Digest, for_ms: u64) -> bool {
+        let Some(execution) = self.state.executions.get(&key).filter(|execution| !execution.is_over()) else {
+            return false;
+        };
+        let why = format!("no progress for {} minutes", for_ms / 60_000);
+        self.history.push(HistoryEntry { why: Some(why), ..history::about(execution, HistoryKind::Stalled) });
+        true
+    }
+
     pub(crate) fn looked_up(
         &mut self,
         key: Digest,

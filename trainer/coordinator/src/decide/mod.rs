@@ -108,6 +108,7 @@ impl Deciding<'_> {
             }
             Event::GangDivided { task, fence } => return self.gang_divided(&task, fence),
             Event::GangStalled { task, fence } => return self.gang_stalled(&task, fence),
+            Event::Quiet { key, for_ms } => return Ok(self.quiet(key, for_ms)),
             Event::Checkpoint { commit } => return self.checkpoint(commit),
             Event::Outcome { report } => return self.outcome(report),
             Event::Control { run, action, archived } => return self.control(&run, action, archived),

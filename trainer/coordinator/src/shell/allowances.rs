@@ -13,6 +13,8 @@ pub struct Allowances {
     pub values: u64,
     /// Age at which history goes.
     pub history: Duration,
+    /// Time without progress after which a stage is noted as stalled.
+    pub quiet: Duration,
     /// Maximum number of calls per second for a token without the scope `worker`.
     pub calls: u32,
 }
@@ -24,6 +26,7 @@ impl Default for Allowances {
             log_bytes: 256 << 20,
             values: 50_000_000,
             history: Duration::from_secs(90 * 86_400),
+            quiet: Duration::from_secs(30 * 60),
             calls: 100,
         }
     }

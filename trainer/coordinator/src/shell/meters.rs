@@ -16,12 +16,19 @@ pub(crate) struct Meters {
     pub(super) commits: Histogram,
     pub(super) values: Counter,
     pub(super) lines: Counter,
+    pub(super) messages: Family<Labels, Counter>,
 }
 
 impl Default for Meters {
     fn default() -> Self {
         let commits = Histogram::new(exponential_buckets(0.001, 2.0, 14));
-        Self { answers: Family::default(), commits, values: Counter::default(), lines: Counter::default() }
+        Self {
+            answers: Family::default(),
+            commits,
+            values: Counter::default(),
+            lines: Counter::default(),
+            messages: Family::default(),
+        }
     }
 }
 
@@ -38,6 +45,11 @@ impl Meters {
     /// Notes how long a transaction of decisions took to be on disk.
     pub(crate) fn committed(&self, took: Duration) {
         self.commits.observe(took.as_secs_f64());
+    }
+
+    /// Counts a try to deliver a message to a webhook, by its result.
+    pub(crate) fn told(&self, result: &str) {
+        self.messages.get_or_create(&vec![("result", result.to_owned())]).inc();
     }
 
     pub(crate) fn recorded(&self, values: usize, lines: usize) {

@@ -25,6 +25,7 @@ mod openapi;
 mod paced;
 mod page_files;
 mod polls;
+mod progress;
 mod queries;
 mod rate;
 mod records;
@@ -44,10 +45,13 @@ mod turn;
 mod uploads;
 mod versions;
 mod vouching;
+mod webhooks;
 
 use std::net::{Ipv4Addr, SocketAddr};
 use std::sync::Arc;
+use std::time::Duration;
 
+use ::webhooks::Hooks;
 use access::{Caller, Scope, Scopes, Token, Tokens};
 use protocol::message::{FailureClass, ReportOutcome, RunView, Submit, TaskOutcome};
 use protocol::{Owner, RunId, WorkerId};
@@ -100,6 +104,10 @@ pub struct Config {
     pub connections: Connections,
     /// Limits of runs and tokens.
     pub allowances: Allowances,
+    /// Addresses that are told of what happens.
+    pub hooks: Hooks,
+    /// Time before the first repetition of a message to a hook; each further one takes six times as long.
+    pub hook_retry: Duration,
     pub policy: Policy,
     /// No worker of an earlier coordinator can reach this one, because `trainer run` starts its own; all of them count
     /// as gone.
@@ -124,6 +132,8 @@ impl Config {
             insecure: false,
             connections: Connections::default(),
             allowances: Allowances::default(),
+            hooks: Hooks::default(),
+            hook_retry: Duration::from_secs(5),
             policy: Policy::default(),
             alone: false,
             park: false,
@@ -201,9 +211,14 @@ impl Coordinator {
         let serve = listener::serve(listeners, router, config.connections.clone(), stopped);
         let server = actor_handle.spawn("the server", serve);
         tracing::info!(%address, "coordinator listens");
+        let quiet = progress::watch(actor_handle.clone(), config.allowances.quiet);
+        let quiet = actor_handle.spawn("the watch over progress", quiet);
+        let (hooks, listed) = watch::channel(config.hooks);
+        let telling = webhooks::serve(actor_handle.clone(), listed, config.hook_retry);
+        let telling = actor_handle.spawn("the webhooks", telling);
         let tls = config.tls.is_some();
-        let tasks = vec![clock, server, audit, actor];
-        Ok(Handle { address, local, tls, token, worker_token, sessions, actor_handle, stop, tasks })
+        let tasks = vec![clock, server, audit, quiet, telling, actor];
+        Ok(Handle { address, local, tls, token, worker_token, sessions, hooks, actor_handle, stop, tasks })
     }
 }
 
@@ -225,6 +240,7 @@ pub struct Handle {
     token: Token,
     worker_token: Token,
     sessions: Arc<Sessions>,
+    hooks: watch::Sender<Hooks>,
     actor_handle: Arc<ActorHandle>,
     stop: watch::Sender<bool>,
     tasks: Vec<JoinHandle<()>>,
@@ -269,6 +285,15 @@ impl Handle {
     /// Replaces the table of tokens. Active calls with a removed token are aborted.
     pub fn replace_tokens(&self, tokens: Tokens) {
         self.actor_handle.tokens.replace(tokens);
+    }
+
+    /// Replaces the list of webhooks. A message that is on its way is sent again.
+    pub fn replace_hooks(&self, hooks: Hooks) {
+        self.hooks.send_if_modified(|listed| {
+            let changed = *listed != hooks;
+            *listed = hooks;
+            changed
+        });
     }
 
     /// Pauses, resumes or cancels a run.

@@ -17,4 +17,5 @@ mod openapi;
 mod owners;
 mod page;
 mod tls;
+mod webhooks;
 mod workers;

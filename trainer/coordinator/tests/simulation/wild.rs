@@ -74,6 +74,7 @@ pub(crate) fn events(state: &State, ended: &[Run]) -> Vec<Event> {
         events.push(Event::LookedUp { key, known: None, source: None, archived });
         events.push(Event::Bundled { key, bundles: vec![Digest::of(b"1"), Digest::of(b"2")] });
         events.push(Event::Bundled { key, bundles: vec![] });
+        events.push(Event::Quiet { key, for_ms: 60_000 });
         events.push(Event::RegisterRefused { key, message: "no".into() });
     }
     let no_task: TaskId = "no/task".into();
