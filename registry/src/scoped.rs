@@ -170,8 +170,8 @@ impl Records for ScopedRecords {
         self.all.history_span().await
     }
 
-    async fn told(&self, hook: &str) -> Result<Option<i64>> {
-        self.all.told(hook).await
+    async fn delivered(&self, hook: &str) -> Result<Option<i64>> {
+        self.all.delivered(hook).await
     }
 
     async fn run_times(&self, runs: &[RunId]) -> Result<BTreeMap<RunId, Times>> {

@@ -431,9 +431,9 @@ impl Store {
         }
     }
 
-    /// Notes that a hook has been told of the history up to this row.
-    pub async fn tell(&self, hook: &str, id: i64) -> Result<(), WriteError> {
-        self.order(Order::Told { hook: hook.to_owned(), id }).await.map(drop)
+    /// Records that a hook has received the history up to this row.
+    pub async fn record_delivery(&self, hook: &str, id: i64) -> Result<(), WriteError> {
+        self.order(Order::Delivered { hook: hook.to_owned(), id }).await.map(drop)
     }
 
     /// Removes history from before a time, in milliseconds since 1970; returns the number of rows that went.

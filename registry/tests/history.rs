@@ -62,10 +62,13 @@ async fn rows_are_found_by_run_and_worker_and_go_by_age() {
     assert_eq!((times.started_ms, times.ended_ms), (Some(rows[1].at_ms), Some(rows[3].at_ms)));
     store.write(vec![Write::History(vec![happened(HistoryKind::Granted, Some("r"), Some("w"))])]).await.unwrap();
 
-    assert_eq!(store.told("lab").await.unwrap(), None);
-    store.tell("lab", rows[1].id).await.unwrap();
-    store.tell("lab", rows[2].id).await.unwrap();
-    assert_eq!((store.told("lab").await.unwrap(), store.told("own").await.unwrap()), (Some(rows[2].id), None));
+    assert_eq!(store.delivered("lab").await.unwrap(), None);
+    store.record_delivery("lab", rows[1].id).await.unwrap();
+    store.record_delivery("lab", rows[2].id).await.unwrap();
+    assert_eq!(
+        (store.delivered("lab").await.unwrap(), store.delivered("own").await.unwrap()),
+        (Some(rows[2].id), None)
+    );
     assert_eq!(store.prune_history(rows[3].at_ms + 3_600_000).await.unwrap(), 5);
     let times = store.stage_times(&"r".into()).await.unwrap()[&"s".into()];
     assert_eq!((times.started_ms, times.ended_ms), (Some(rows[1].at_ms), None), "times stay, and it goes on");

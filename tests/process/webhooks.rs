@@ -1,4 +1,4 @@
-//! `trainer serve --webhooks`: a file with a mistake is refused with its line, and a run that ends is told.
+//! `trainer serve --webhooks`: a file with a mistake is refused with its line, and the end of a run is sent.
 
 use std::fs;
 use std::io::{BufRead as _, BufReader, Read as _, Write as _};
@@ -32,7 +32,7 @@ fn receive(listener: &TcpListener) -> String {
 }
 
 #[test]
-fn a_cancelled_run_is_told_to_a_listed_address() {
+fn a_listed_address_gets_a_message_about_a_cancelled_run() {
     let bench = Bench::new(TRAINER);
     let (hooks, log) = (bench.path().join("hooks"), bench.path().join("serve.log"));
     let write = |text: &str| {

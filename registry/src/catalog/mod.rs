@@ -141,8 +141,8 @@ pub trait Records: Debug + Send + Sync {
     /// Returns the ids of the oldest row of the history and of the newest one ever added.
     async fn history_span(&self) -> Result<(Option<i64>, i64)>;
 
-    /// Returns the last row of the history that a hook has been told of; `None` for an unknown hook.
-    async fn told(&self, hook: &str) -> Result<Option<i64>>;
+    /// Returns the last row of the history that a hook has received; `None` for an unknown hook.
+    async fn delivered(&self, hook: &str) -> Result<Option<i64>>;
 
     /// Returns the times of runs. Their views do not have them.
     async fn run_times(&self, runs: &[RunId]) -> Result<BTreeMap<RunId, Times>>;
@@ -249,8 +249,8 @@ pub enum Order {
     },
     /// Removes history from before a time, in milliseconds since 1970.
     PruneHistory { before_ms: i64 },
-    /// Notes that a hook has been told of the history up to this row.
-    Told { hook: String, id: i64 },
+    /// Records that a hook has received the history up to this row.
+    Delivered { hook: String, id: i64 },
     /// Starts a collection: deletes its rows, then records the blobs that new rows name.
     BeginCollection,
     /// Removes the record that blobs are present, except of blobs that rows have named since the collection began. From

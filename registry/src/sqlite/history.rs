@@ -58,16 +58,17 @@ pub(super) async fn span(conn: &mut SqliteConnection) -> Result<(Option<i64>, i6
     Ok((row.try_get(0)?, row.try_get(1)?))
 }
 
-/// Notes the last row that a hook has been told of.
-pub(super) async fn tell(conn: &mut SqliteConnection, hook: &str, id: i64) -> Result<(), WriteError> {
-    let note = "INSERT INTO webhooks (name, told) VALUES (?, ?) ON CONFLICT DO UPDATE SET told = excluded.told";
+/// Records the last row that a hook has received.
+pub(super) async fn record_delivery(conn: &mut SqliteConnection, hook: &str, id: i64) -> Result<(), WriteError> {
+    let note =
+        "INSERT INTO webhooks (name, delivered) VALUES (?, ?) ON CONFLICT DO UPDATE SET delivered = excluded.delivered";
     run(conn, sqlx::query(note).bind(hook).bind(id)).await.map(drop)
 }
 
-/// The last row that a hook has been told of.
-pub(super) async fn told(conn: &mut SqliteConnection, hook: &str) -> Result<Option<i64>, QueryError> {
-    let row = sqlx::query("SELECT told FROM webhooks WHERE name = ?").bind(hook).fetch_optional(conn).await?;
-    Ok(row.map(|row| row.try_get("told")).transpose()?)
+/// The last row that a hook has received.
+pub(super) async fn delivered(conn: &mut SqliteConnection, hook: &str) -> Result<Option<i64>, QueryError> {
+    let row = sqlx::query("SELECT delivered FROM webhooks WHERE name = ?").bind(hook).fetch_optional(conn).await?;
+    Ok(row.map(|row| row.try_get("delivered")).transpose()?)
 }
 
 /// Rows in the order in which they happened. Those of runs of others than `group` are left out, if there is one.

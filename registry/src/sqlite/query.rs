@@ -194,8 +194,8 @@ impl Records for SqliteRecords {
         history::span(&mut *self.connection().await?).await
     }
 
-    async fn told(&self, hook: &str) -> Result<Option<i64>> {
-        history::told(&mut *self.connection().await?, hook).await
+    async fn delivered(&self, hook: &str) -> Result<Option<i64>> {
+        history::delivered(&mut *self.connection().await?, hook).await
     }
 
     async fn run_times(&self, runs: &[RunId]) -> Result<BTreeMap<RunId, Times>> {

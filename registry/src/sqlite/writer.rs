@@ -193,7 +193,7 @@ async fn run(
         Order::ForgetLeftovers { run, before_ms } => {
             forget::forget_leftovers(conn, run, *before_ms).await.map(Done::Forgotten)
         }
-        Order::Told { hook, id } => history::tell(conn, hook, *id).await.map(|()| Done::Nothing),
+        Order::Delivered { hook, id } => history::record_delivery(conn, hook, *id).await.map(|()| Done::Nothing),
         Order::PruneHistory { before_ms } => history::prune(conn, *before_ms).await.map(Done::PrunedHistory),
         Order::BeginCollection => {
             // Earlier rows of this transaction are committed before the answer, and marking starts after the answer.

@@ -68,9 +68,13 @@ impl ServeArgs {
     }
 
     /// Reads the files of tokens and webhooks again. A file with an error changes nothing.
-    fn reload(&self, handle: &Handle) {
+    async fn reload(&self, handle: &Handle) {
         match self.hooks() {
-            Ok(hooks) => handle.replace_hooks(hooks),
+            Ok(hooks) => {
+                if let Err(error) = handle.replace_hooks(hooks).await {
+                    print::note(&format!("keeping the earlier webhooks: {error}"));
+                }
+            }
             Err(problem) => print::note(&format!("keeping the earlier webhooks: {:#}", problem.error)),
         }
         match self.tokens() {
@@ -118,7 +122,7 @@ pub(crate) async fn serve(args: ServeArgs) -> Result<u8> {
         tokio::select! {
             _ = interrupt.recv() => break None,
             _ = terminate.recv() => break None,
-            _ = hangup.recv() => args.reload(&handle),
+            _ = hangup.recv() => args.reload(&handle).await,
             why = handle.failed() => break Some(why),
         }
     };

@@ -24,7 +24,7 @@ const SHORTEST: usize = 16;
 /// Prefix of secrets that are base64, as Standard Webhooks writes them.
 const PREFIX: &str = "whsec_";
 
-/// An address, with what is sent to it.
+/// An address and the messages that it gets.
 #[derive(Clone, PartialEq, Eq)]
 pub struct Hook {
     /// Its name in logs and in the store.
@@ -32,7 +32,7 @@ pub struct Hook {
     pub url: Url,
     secret: Vec<u8>,
     topics: BTreeSet<Topic>,
-    /// The project whose runs and models it is told of; `None` means all.
+    /// Limits its messages to the runs and models of a project; `None` means all.
     pub project: Option<Group>,
 }
 
@@ -43,7 +43,7 @@ impl fmt::Debug for Hook {
 }
 
 impl Hook {
-    /// Returns true if it is told of `topic`.
+    /// Returns true if it gets messages about `topic`.
     pub fn wants(&self, topic: Topic) -> bool {
         self.topics.contains(&topic)
     }
@@ -155,7 +155,7 @@ fn key(text: &str) -> Result<Vec<u8>, String> {
 fn topic(text: &str) -> Result<Topic, String> {
     let names = || Topic::ALL.map(|topic| format!("`{}`", topic.short())).join(", ");
     let found = Topic::ALL.into_iter().find(|topic| topic.short() == text);
-    found.ok_or_else(|| format!("`{text}` is nothing that a hook is told of; expected {}", names()))
+    found.ok_or_else(|| format!("`{text}` is not a topic; expected {}", names()))
 }
 
 #[cfg(test)]
@@ -176,7 +176,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_lists_hooks_and_what_they_are_told() {
+    fn a_file_lists_hooks_and_their_topics() {
         let hooks = read(&format!(
             "# who\nlab https://chat.example.org/h {SECRET}\nown http://127.0.0.1:9/ whsec_MDEyMzQ1Njc4OWFiY2RlZg== on=stalled project=motion\n"
         ));
@@ -199,7 +199,7 @@ mod tests {
             (format!("lab ftp://127.0.0.1/ {SECRET}\n"), "line 1: the address has another scheme"),
             ("lab https://a.example/ short\n".to_owned(), "line 1: the secret has 5 bytes"),
             ("lab https://a.example/ whsec_%%\n".to_owned(), "line 1: the secret after `whsec_` is not base64"),
-            (format!("lab https://a.example/ {SECRET} on=lunch\n"), "line 1: `lunch` is nothing that"),
+            (format!("lab https://a.example/ {SECRET} on=lunch\n"), "line 1: `lunch` is not a topic"),
             (format!("lab https://a.example/ {SECRET} on=failed on=failed\n"), "line 1: `on=` is given twice"),
             (format!("lab https://a.example/ {SECRET} colour=red\n"), "line 1: unknown key `colour=`"),
             (format!("lab https://a.example/ {SECRET} project=@\n"), "line 1: `@` is not a project name"),

@@ -49,12 +49,12 @@ impl Topic {
         }
     }
 
-    /// Returns true if hooks are told of it without `on=`. A cancelled run is no news to the person who cancelled it.
+    /// Returns true if hooks without `on=` get it. The person who cancels a run knows it.
     pub(crate) fn is_usual(self) -> bool {
         self != Self::Cancelled
     }
 
-    /// The topic of an event; `None` if no hook is told of it.
+    /// The topic of an event; `None` if it has none.
     fn of(row: &HistoryRow) -> Option<Self> {
         match (row.entry.kind, row.entry.why.as_deref()) {
             (HistoryKind::Ended, Some("failed")) => Some(Self::Failed),
@@ -79,7 +79,7 @@ pub struct Message {
 }
 
 impl Message {
-    /// The message about an event; `None` if no hook is told of it. `cause` is the event of the stage whose failure
+    /// The message about an event; `None` if the event has no topic. `cause` is the event of the stage whose failure
     /// ended the run.
     pub fn of(row: &HistoryRow, cause: Option<&HistoryRow>) -> Option<Self> {
         let topic = Topic::of(row)?;

@@ -29,7 +29,7 @@ impl Client {
         access::tls::install_provider();
         let client = reqwest::Client::builder()
             .timeout(PATIENCE)
-            // Only an address that the operator listed is told anything, so a receiver cannot send it elsewhere.
+            // Only listed addresses get messages, so a receiver cannot send them elsewhere.
             .redirect(reqwest::redirect::Policy::none())
             .build();
         client.map(Self).map_err(|error| Undelivered(access::explain(&error)))

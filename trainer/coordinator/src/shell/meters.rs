@@ -48,7 +48,7 @@ impl Meters {
     }
 
     /// Counts a try to deliver a message to a webhook, by its result.
-    pub(crate) fn told(&self, result: &str) {
+    pub(crate) fn sent(&self, result: &str) {
         self.messages.get_or_create(&vec![("result", result.to_owned())]).inc();
     }
 

@@ -201,6 +201,7 @@ impl Coordinator {
             actor::start(store, recovered, secrets, Arc::clone(&tokens), config.allowances.clone());
         actor_handle.decide(Event::Started { alone: config.alone, park: config.park }).await?;
         effects::let_go(&actor_handle).await;
+        webhooks::enlist(&actor_handle.store, &config.hooks).await.map_err(Refused::from)?;
         let (stop, stopped) = watch::channel(false);
         let tick = effects::tick(actor_handle.clone(), config.policy.tick_ms, stopped.clone());
         let clock = actor_handle.spawn("the clock", tick);
@@ -288,12 +289,14 @@ impl Handle {
     }
 
     /// Replaces the list of webhooks. A message that is on its way is sent again.
-    pub fn replace_hooks(&self, hooks: Hooks) {
+    pub async fn replace_hooks(&self, hooks: Hooks) -> Result<(), Refused> {
+        webhooks::enlist(&self.actor_handle.store, &hooks).await?;
         self.hooks.send_if_modified(|listed| {
             let changed = *listed != hooks;
             *listed = hooks;
             changed
         });
+        Ok(())
     }
 
     /// Pauses, resumes or cancels a run.

@@ -1,6 +1,6 @@
-//! Delivery of messages to webhooks: each hook is told of the history's rows in their order.
+//! Delivery of messages to webhooks, in the order of the history's rows.
 //!
-//! The last row that a hook was told of is stored, so a restart repeats at most one message. A message that is not
+//! The last row that a hook received is stored, so a restart repeats at most one message. A message that is not
 //! delivered is sent again, six times as late each time, and at last given up. The hook's later messages wait for it.
 
 use std::collections::BTreeMap;
@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use ::webhooks::{Client, Hook, Hooks, Message, Undelivered};
 use protocol::RunId;
-use registry::{HistoryKind, HistoryQuery, HistoryRow, QueryError, WriteError};
+use registry::{HistoryKind, HistoryQuery, HistoryRow, QueryError, Store, WriteError};
 use tokio::sync::watch;
 use tokio::task::JoinSet;
 use tokio::time::{sleep, timeout};
@@ -31,10 +31,10 @@ pub(super) async fn serve(actor_handle: Arc<ActorHandle>, mut listed: watch::Rec
     let mut stopped = actor_handle.stopped();
     loop {
         // Dropping the set ends the delivery to the earlier hooks.
-        let mut telling = JoinSet::new();
+        let mut sending = JoinSet::new();
         let hooks = listed.borrow_and_update().clone();
         for hook in hooks.iter() {
-            telling.spawn(Teller::tell(Arc::clone(&actor_handle), hook.clone(), retry));
+            sending.spawn(Sender::run(Arc::clone(&actor_handle), hook.clone(), retry));
         }
         tokio::select! {
             _ = stopped.wait_for(|stop| *stop) => return,
@@ -43,19 +43,30 @@ pub(super) async fn serve(actor_handle: Arc<ActorHandle>, mut listed: watch::Rec
     }
 }
 
-/// One hook, and how far it has been told.
-struct Teller {
+/// Records the newest row as the place of each new hook, which gets no earlier row.
+pub(super) async fn enlist(store: &Store, hooks: &Hooks) -> Result<(), WriteError> {
+    for hook in hooks.iter() {
+        if store.delivered(&hook.name).await?.is_none() {
+            let (_, newest) = store.history_span().await?;
+            store.record_delivery(&hook.name, newest).await?;
+        }
+    }
+    Ok(())
+}
+
+/// One hook and its place in the history.
+struct Sender {
     actor_handle: Arc<ActorHandle>,
     hook: Hook,
     client: Client,
     retry: Duration,
-    told: i64,
+    delivered: i64,
     /// The failed stage of each run that has not ended yet.
     causes: BTreeMap<RunId, HistoryRow>,
 }
 
-impl Teller {
-    async fn tell(actor_handle: Arc<ActorHandle>, hook: Hook, retry: Duration) {
+impl Sender {
+    async fn run(actor_handle: Arc<ActorHandle>, hook: Hook, retry: Duration) {
         let client = match Client::new() {
             Ok(client) => client,
             Err(Undelivered(why)) => {
@@ -63,25 +74,28 @@ impl Teller {
                 return;
             }
         };
-        let mut teller = Self { actor_handle, hook, client, retry, told: 0, causes: BTreeMap::new() };
-        let mut changes = teller.actor_handle.changes();
-        while let Err(error) = teller.begin().await {
-            tracing::warn!(hook = %teller.hook.name, %error, "cannot read how far a webhook was told; trying again");
+        let mut sender = Self { actor_handle, hook, client, retry, delivered: 0, causes: BTreeMap::new() };
+        let mut changes = sender.actor_handle.changes();
+        sender.delivered = loop {
+            match sender.actor_handle.store.delivered(&sender.hook.name).await {
+                Ok(place) => break place.unwrap_or_default(),
+                Err(error) => tracing::warn!(hook = %sender.hook.name, %error, "cannot read the place of a webhook"),
+            }
             sleep(PAUSE).await;
-        }
+        };
         loop {
             changes.mark_unchanged();
-            match teller.rows().await {
+            match sender.rows().await {
                 Ok(rows) => {
                     let more = rows.len() >= ROWS as usize;
                     for row in rows {
-                        teller.row(row).await;
+                        sender.row(row).await;
                     }
                     if more {
                         continue;
                     }
                 }
-                Err(error) => tracing::warn!(hook = %teller.hook.name, %error, "cannot read the history"),
+                Err(error) => tracing::warn!(hook = %sender.hook.name, %error, "cannot read the history"),
             }
             sleep(PAUSE).await;
             // A time-out is fine: the history is read again.
@@ -91,36 +105,22 @@ impl Teller {
         }
     }
 
-    /// Finds the row to go on after. A new hook is told of nothing that happened before.
-    async fn begin(&mut self) -> Result<(), WriteError> {
-        let store = &self.actor_handle.store;
-        self.told = match store.told(&self.hook.name).await? {
-            Some(told) => told,
-            None => {
-                let (_, newest) = store.history_span().await?;
-                store.tell(&self.hook.name, newest).await?;
-                newest
-            }
-        };
-        Ok(())
-    }
-
     async fn rows(&self) -> Result<Vec<HistoryRow>, QueryError> {
-        let asked = HistoryQuery { run: None, worker: None, after: self.told, since_ms: None, limit: ROWS };
+        let asked = HistoryQuery { run: None, worker: None, after: self.delivered, since_ms: None, limit: ROWS };
         self.actor_handle.seen_store(self.hook.project.as_ref()).timeline(&asked).await
     }
 
-    /// Tells of a row, if it is news for the hook.
+    /// Sends the message about a row, if there is one for the hook.
     async fn row(&mut self, row: HistoryRow) {
         let id = row.id;
         let cause = row.entry.run.as_ref().and_then(|run| self.causes.get(run));
         if let Some(message) = Message::of(&row, cause).filter(|message| self.hook.wants(message.topic)) {
             self.send(&message).await;
-            if let Err(error) = self.actor_handle.store.tell(&self.hook.name, id).await {
-                tracing::warn!(hook = %self.hook.name, %error, "cannot note a message; a restart repeats it");
+            if let Err(error) = self.actor_handle.store.record_delivery(&self.hook.name, id).await {
+                tracing::warn!(hook = %self.hook.name, %error, "cannot record the delivery of a message; a restart repeats it");
             }
         }
-        self.told = id;
+        self.delivered = id;
         match (row.entry.kind, row.entry.run.clone()) {
             (HistoryKind::Failed, Some(run)) => drop(self.causes.insert(run, row)),
             (HistoryKind::Ended | HistoryKind::Resumed, Some(run)) => drop(self.causes.remove(&run)),
@@ -134,15 +134,15 @@ impl Teller {
         for left in (0..TRIES).rev() {
             let now_s = wall_clock().0 / 1000;
             let Err(Undelivered(why)) = self.client.post(&self.hook, message, now_s).await else {
-                return meters.told("delivered");
+                return meters.sent("delivered");
             };
             let (hook, id) = (&self.hook.name, &message.id);
             if left == 0 {
                 tracing::warn!(hook, id, "a message was not delivered and is given up: {why}");
-                return meters.told("given up");
+                return meters.sent("given up");
             }
             tracing::warn!(hook, id, "a message was not delivered: {why}; trying again in {} s", wait.as_secs());
-            meters.told("not delivered");
+            meters.sent("not delivered");
             sleep(wait).await;
             wait *= 6;
         }
