@@ -12,8 +12,6 @@ mod report;
 use std::process::ExitCode;
 
 fn main() -> ExitCode {
-    // First, because the allocator can be tuned only while there is one thread.
-    worker::process::tune_allocator();
     registry::failpoints::arm_from_env();
     coordinator::failpoints::arm_from_env();
     cli::main()

@@ -2,12 +2,14 @@
 //! of a restart, durable submissions per second compared with an empty store, and heartbeat latency while clients send
 //! expensive calls. `cargo bench -p coordinator --bench many`.
 //!
-//! The restarted coordinator is a separate process, so that its memory excludes the earlier work. Compared values are
-//! measured alternately within one run and by medians, so that other load on the machine affects both equally.
+//! The restarted coordinator is a separate process, and its clients are in this one, so that its memory is its own.
+//! Compared values are measured alternately within one run and by medians, so that other load on the machine affects
+//! both equally.
 
-use std::io::{Read as _, Write as _};
+use std::io::{BufRead as _, BufReader, Read as _, Write as _};
 use std::net::TcpStream;
 use std::path::Path;
+use std::process::Stdio;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
@@ -98,8 +100,15 @@ async fn record_facts(handle: &Arc<Handle>, facts: u64) -> Result {
     Ok(())
 }
 
-fn resident_mb() -> Result<u64> {
-    let status = std::fs::read_to_string("/proc/self/status")?;
+/// The restarted coordinator.
+struct Restarted {
+    address: String,
+    token: String,
+    pid: u32,
+}
+
+fn resident_mb(pid: u32) -> Result<u64> {
+    let status = std::fs::read_to_string(format!("/proc/{pid}/status"))?;
     let line = status.lines().find(|line| line.starts_with("VmRSS:")).ok_or("no VmRSS")?;
     Ok(line.split_whitespace().nth(1).ok_or("no number")?.parse::<u64>()? / 1024)
 }
@@ -121,10 +130,10 @@ struct Caller {
 }
 
 impl Caller {
-    fn connect(handle: &Handle) -> Result<Self> {
-        let stream = TcpStream::connect(handle.address())?;
+    fn connect(server: &Restarted) -> Result<Self> {
+        let stream = TcpStream::connect(&server.address)?;
         stream.set_nodelay(true)?;
-        Ok(Self { stream, token: handle.token().secret().to_owned() })
+        Ok(Self { stream, token: server.token.clone() })
     }
 
     /// Sends a call with the secret of the worker and returns its status and body.
@@ -178,8 +187,8 @@ impl Caller {
 
 /// Sends heartbeats until `stop` and returns the sorted latencies. Each is answered at once, because its version is
 /// never current.
-fn beat(handle: &Handle, stop: &AtomicBool) -> Result<Vec<Duration>> {
-    let mut caller = Caller::connect(handle)?;
+fn beat(server: &Restarted, stop: &AtomicBool) -> Result<Vec<Duration>> {
+    let mut caller = Caller::connect(server)?;
     let join = Join {
         protocol: PROTOCOL_VERSION,
         worker: "w".into(),
@@ -202,14 +211,14 @@ fn beat(handle: &Handle, stop: &AtomicBool) -> Result<Vec<Duration>> {
 }
 
 /// Measures heartbeats while `clients` threads call `work` repeatedly, and counts these calls.
-fn beside(handle: &Handle, what: &str, clients: usize, work: impl Fn(&mut Caller) -> Result + Sync) -> Result {
+fn beside(server: &Restarted, what: &str, clients: usize, work: impl Fn(&mut Caller) -> Result + Sync) -> Result {
     let (stop, calls) = (AtomicBool::new(false), std::sync::atomic::AtomicU64::new(0));
     let times = std::thread::scope(|scope| {
-        let heartbeats = scope.spawn(|| beat(handle, &stop));
+        let heartbeats = scope.spawn(|| beat(server, &stop));
         let clients: Vec<_> = (0..clients)
             .map(|_| {
                 scope.spawn(|| {
-                    let mut caller = Caller::connect(handle)?;
+                    let mut caller = Caller::connect(server)?;
                     while !stop.load(Ordering::Relaxed) {
                         work(&mut caller)?;
                         calls.fetch_add(1, Ordering::Relaxed);
@@ -250,10 +259,10 @@ fn large(stages: usize, seed: u64) -> Result<serde_json::Value> {
     Ok(serde_json::to_value(read)?)
 }
 
-fn heartbeats(handle: &Handle) -> Result {
+fn heartbeats(server: &Restarted, export: protocol::Digest) -> Result {
     let mut out = std::io::stdout();
     writeln!(out, "\n| beside | calls | heartbeats | median | p99 | longest |\n|---|---|---|---|---|---|")?;
-    beside(handle, "nothing", 0, |_| Ok(()))?;
+    beside(server, "nothing", 0, |_| Ok(()))?;
     let small = serde_json::to_value(pipeline(77)?)?;
     let submit = |caller: &mut Caller, pipeline: &serde_json::Value| {
         let submit = Submit { pipeline: pipeline.clone(), source: String::new(), idempotency_key: None, until: None };
@@ -261,23 +270,23 @@ fn heartbeats(handle: &Handle) -> Result {
         caller.post::<serde_json::Value>(&format!("/v1/runs/{}/cancel", submitted.run), &())?;
         Result::Ok(())
     };
-    beside(handle, "submissions, 8 clients", 8, |caller| submit(caller, &small))?;
+    beside(server, "submissions, 8 clients", 8, |caller| submit(caller, &small))?;
     let most = large(limits::STAGES, 78)?;
-    beside(handle, "submissions of 1,000 stages, 4 clients", 4, |caller| submit(caller, &most))?;
+    beside(server, "submissions of 1,000 stages, 4 clients", 4, |caller| submit(caller, &most))?;
     let ask = |caller: &mut Caller, path: &str| match caller.call("GET", path, b"")? {
         (200, _) => Result::Ok(()),
         (status, answer) => Err(format!("{path}: {status} {}", String::from_utf8_lossy(&answer)).into()),
     };
-    let blob = format!("/v1/blobs/{}", std::env::var("MANY_EXPORT")?);
-    beside(handle, "exports of 256 MiB, 4 clients", 4, |caller| ask(caller, &blob))?;
+    let blob = format!("/v1/blobs/{export}");
+    beside(server, "exports of 256 MiB, 4 clients", 4, |caller| ask(caller, &blob))?;
     let command = |caller: &mut Caller, command: serde_json::Value| {
         caller.post::<serde_json::Value>("/v1/registry", &command).map(drop)
     };
-    let (task, poll) = recorded(handle)?;
-    writeln!(out, "| (recorded {CURVES} curves of {STEPS} values; resident {} MB) |", resident_mb()?)?;
+    let (task, poll) = recorded(server)?;
+    writeln!(out, "| (recorded {CURVES} curves of {STEPS} values; resident {} MB) |", resident_mb(server.pid)?)?;
     let run = task.grant.task.as_str().split('/').next().unwrap_or_default();
     let curves = format!("/v1/metrics?run={run}&buckets=500");
-    beside(handle, "four curves of a million values, 4 clients", 4, |caller| ask(caller, &curves))?;
+    beside(server, "four curves of a million values, 4 clients", 4, |caller| ask(caller, &curves))?;
     let line = std::sync::atomic::AtomicU64::new(0);
     let log = |caller: &mut Caller| {
         // Keeps the recorder's lease alive.
@@ -286,16 +295,16 @@ fn heartbeats(handle: &Handle) -> Result {
         let batch = LogBatch { grant: task.grant.clone(), first, lines: vec!["x".to_owned(); 10_000] };
         caller.post_with::<()>(&task.secret, "/v1/logs", &batch)
     };
-    beside(handle, "log lines of one byte, 2 clients", 2, log)?;
+    beside(server, "log lines of one byte, 2 clients", 2, log)?;
     let lines = format!("/v1/runs/{run}/logs?limit=10000");
-    beside(handle, "10,000 log lines read, 4 clients", 4, |caller| ask(caller, &lines))?;
-    beside(handle, "gc, 1 client", 1, |caller| {
+    beside(server, "10,000 log lines read, 4 clients", 4, |caller| ask(caller, &lines))?;
+    beside(server, "gc, 1 client", 1, |caller| {
         command(caller, serde_json::to_value(Command::Gc { dry_run: false, grace_minutes: None })?)
     })?;
-    queue(handle)?;
-    writeln!(out, "| (10,000 runs wait; resident {} MB) |", resident_mb()?)?;
-    beside(handle, "10,000 queued runs", 0, |_| Ok(()))?;
-    beside(handle, "10,000 queued runs and submissions, 8 clients", 8, |caller| submit(caller, &small))?;
+    queue(server)?;
+    writeln!(out, "| (10,000 runs wait; resident {} MB) |", resident_mb(server.pid)?)?;
+    beside(server, "10,000 queued runs", 0, |_| Ok(()))?;
+    beside(server, "10,000 queued runs and submissions, 8 clients", 8, |caller| submit(caller, &small))?;
     // A client that reads all runs, page by page.
     let list = |caller: &mut Caller| {
         let mut after = String::new();
@@ -308,8 +317,8 @@ fn heartbeats(handle: &Handle) -> Result {
             }
         }
     };
-    beside(handle, "lists of all 20,000 runs, 4 clients", 4, list)?;
-    beside(handle, "four curves again, beside 10,000 queued runs, 4 clients", 4, |caller| ask(caller, &curves))?;
+    beside(server, "lists of all 20,000 runs, 4 clients", 4, list)?;
+    beside(server, "four curves again, beside 10,000 queued runs, 4 clients", 4, |caller| ask(caller, &curves))?;
     Ok(())
 }
 
@@ -318,8 +327,8 @@ const CURVES: usize = 4;
 const STEPS: u64 = 1_000_000;
 
 /// Starts a worker that holds a task and records the curves. Returns its task and its heartbeat.
-fn recorded(handle: &Handle) -> Result<(Assignment, Poll)> {
-    let mut caller = Caller::connect(handle)?;
+fn recorded(server: &Restarted) -> Result<(Assignment, Poll)> {
+    let mut caller = Caller::connect(server)?;
     let submit = Submit {
         pipeline: serde_json::to_value(pipeline(99)?)?,
         source: String::new(),
@@ -355,12 +364,12 @@ fn recorded(handle: &Handle) -> Result<(Assignment, Poll)> {
 }
 
 /// Submits 10,000 runs that wait for a worker of their backend.
-fn queue(handle: &Handle) -> Result {
+fn queue(server: &Restarted) -> Result {
     std::thread::scope(|scope| {
         let clients: Vec<_> = (0..16)
             .map(|client| {
                 scope.spawn(move || {
-                    let mut caller = Caller::connect(handle)?;
+                    let mut caller = Caller::connect(server)?;
                     for seed in (0..RUNS).filter(|seed| seed % 16 == client) {
                         let pipeline = serde_json::to_value(pipeline(5_000_000 + seed)?)?;
                         let submit = Submit { pipeline, source: String::new(), idempotency_key: None, until: None };
@@ -377,13 +386,13 @@ fn queue(handle: &Handle) -> Result {
     })
 }
 
-/// The restarted process: a timed restart, submissions alternating with an empty store, and heartbeats.
+/// The restarted process: a timed restart, submissions alternating with an empty store, and service until its input ends.
 async fn again(dir: &Path) -> Result {
     let mut out = std::io::stdout();
     let begun = Instant::now();
     let handle = Arc::new(start(dir).await?);
     let took = begun.elapsed();
-    writeln!(out, "restart in {took:.2?}, resident {} MB", resident_mb()?)?;
+    writeln!(out, "restart in {took:.2?}, resident {} MB", resident_mb(std::process::id())?)?;
     let store = tempfile::tempdir()?;
     let empty = Arc::new(start(store.path()).await?);
     let (mut old, mut new, mut ratios) = (Vec::new(), Vec::new(), Vec::new());
@@ -417,11 +426,14 @@ async fn again(dir: &Path) -> Result {
         Err(refused) => writeln!(out, "a pipeline of one stage too many: {refused}")?,
         Ok(_) => return Err("a pipeline of too many stages was taken".into()),
     }
-    let beating = Arc::clone(&handle);
-    tokio::task::spawn_blocking(move || heartbeats(&beating)).await??;
-    writeln!(out, "\nresident at the end {} MB", resident_mb()?)?;
+    writeln!(out, "{SERVES}{} {}", handle.address(), handle.token().secret())?;
+    // Until the clients' process closes it.
+    tokio::task::spawn_blocking(|| std::io::stdin().read_to_end(&mut Vec::new())).await??;
     shut(handle).await
 }
+
+/// Begins the line with the restarted coordinator's address and token.
+const SERVES: &str = "serves ";
 
 #[tokio::main(flavor = "multi_thread", worker_threads = 2)]
 async fn main() -> Result {
@@ -440,6 +452,21 @@ async fn main() -> Result {
     writeln!(out, "{RUNS} runs ended, {} facts recorded, in {:.0?}", handle.facts(), begun.elapsed())?;
     shut(handle).await?;
     let mut child = std::process::Command::new(std::env::current_exe()?);
-    let ended = child.env("MANY_AGAIN", dir.path()).env("MANY_EXPORT", export.to_string()).status()?;
-    if ended.success() { Ok(()) } else { Err("the second life failed".into()) }
+    // As `trainer serve` sets it.
+    child.env("MALLOC_ARENA_MAX", "2");
+    let mut child = child.env("MANY_AGAIN", dir.path()).stdin(Stdio::piped()).stdout(Stdio::piped()).spawn()?;
+    let mut serving = None;
+    for line in BufReader::new(child.stdout.take().ok_or("no output")?).lines() {
+        let line = line?;
+        if let Some((address, token)) = line.strip_prefix(SERVES).and_then(|line| line.split_once(' ')) {
+            serving = Some(Restarted { address: address.to_owned(), token: token.to_owned(), pid: child.id() });
+            break;
+        }
+        writeln!(out, "{line}")?;
+    }
+    let serving = serving.ok_or("the restarted coordinator does not serve")?;
+    heartbeats(&serving, export)?;
+    writeln!(out, "\nresident at the end {} MB", resident_mb(serving.pid)?)?;
+    drop(child.stdin.take());
+    if child.wait()?.success() { Ok(()) } else { Err("the restarted coordinator failed".into()) }
 }

@@ -224,6 +224,12 @@ pub(crate) fn main() -> ExitCode {
             None => error.exit(),
         },
     };
+    // The allocator can be tuned only while there is one thread.
+    if cli.verb.coordinates() {
+        worker::process::tune_allocator_of_a_server();
+    } else {
+        worker::process::tune_allocator();
+    }
     if let Verb::Worker(WorkerVerb::Join(args)) = cli.verb {
         // A worker is synchronous, with its own threads and its own logging.
         worker::init_logging();
@@ -272,6 +278,15 @@ fn init_logging() {
 }
 
 impl Verb {
+    /// Returns true if the process coordinates runs, whose workers are other processes.
+    fn coordinates(&self) -> bool {
+        match self {
+            Self::Run(args) => args.verify.is_none(),
+            Self::Serve(_) | Self::Resume(_) => true,
+            _ => false,
+        }
+    }
+
     /// Makes files of a store readable for its user only. For other files, the user's umask decides.
     fn keep_to_oneself(&self) {
         let store_only = match self {
