@@ -24,7 +24,7 @@ use crate::hardship::{Hardship, Random, Seed};
 use crate::measure::Kill;
 
 /// The quickstart with fewer clips and steps, so that many seeds are affordable.
-const SETS: [&str; 14] = [
+const SETS: [&str; 16] = [
     "dataset.clips=60",
     "stages.vae.steps=150",
     "stages.vae.checkpoint.every=40",
@@ -39,6 +39,9 @@ const SETS: [&str; 14] = [
     "stages.fid_teacher.repeats=1",
     "stages.fid_lcm.repeats=1",
     "stages.fid_pcm.repeats=1",
+    // So few clips do not show every activity.
+    "stages.activities_lcm.activities=[{name: walk, words: [walks, walking]}, {name: jump, words: [jumps, jumping]}]",
+    "stages.activities.activities=[{name: walk, words: [walks, walking]}, {name: jump, words: [jumps, jumping]}]",
 ];
 const WORKERS: [&str; 3] = ["w1", "w2", "w3"];
 /// Mean time between two disturbances.
