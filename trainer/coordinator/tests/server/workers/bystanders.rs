@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use access::{Server, Tokens};
 use coordinator::{Config, Coordinator, Handle, Policy};
@@ -156,8 +156,9 @@ impl Worker {
 
     /// Polls until it gets a task of `stage`.
     pub(crate) async fn given(&self, stage: &str) -> Assignment {
-        let (mut version, mut ready) = (0, vec![]);
+        let (mut version, mut ready, asked) = (0, vec![], Instant::now());
         loop {
+            assert!(asked.elapsed() < PATIENCE, "`{stage}` is not given");
             let poll = self.poll_of(ready, version);
             let (status, answer) = post(&self.server, &self.secret, &self.poll_path(), &poll).await;
             assert_eq!(status, 200, "{answer}");
