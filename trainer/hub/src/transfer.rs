@@ -30,7 +30,7 @@ pub(crate) struct Wanted<'a> {
     pub(crate) token: Option<&'a str>,
     /// Largest accepted size, in bytes.
     pub(crate) most: u64,
-    /// Returns true if the address always has the same bytes, so that those of any earlier attempt fit.
+    /// True if the address always has the same bytes, so that those of any earlier attempt fit.
     pub(crate) fixed: bool,
     /// Pause after the first failed attempt; each later one doubles it.
     pub(crate) pause: Duration,
@@ -83,19 +83,15 @@ pub(crate) fn transfer(
 ) -> Result<(), Interrupted> {
     let (mut most, mut failed, mut pause) = (0, 0, wanted.pause);
     loop {
-        let away = match attempt(client, wanted, part, arrived) {
-            Ok(()) => return Ok(()),
-            Err((Interrupted::Away(why), after)) => (why, after),
-            Err((other, _)) => return Err(other),
-        };
+        let Err(Failed { why, after }) = attempt(client, wanted, part, arrived) else { return Ok(()) };
         let bytes = length(part);
         failed = if bytes > most { 1 } else { failed + 1 };
         pause = if bytes > most { wanted.pause } else { pause * 2 };
         most = most.max(bytes);
-        if failed >= ATTEMPTS {
-            return Err(Interrupted::Away(away.0));
+        if failed >= ATTEMPTS || !matches!(why, Interrupted::Away(_)) {
+            return Err(why);
         }
-        std::thread::sleep(away.1.unwrap_or(pause).min(PATIENCE));
+        std::thread::sleep(after.unwrap_or(pause).min(PATIENCE));
     }
 }
 
@@ -123,18 +119,29 @@ fn identity_file(part: &Path) -> PathBuf {
     name.into()
 }
 
-type Attempt<T> = Result<T, (Interrupted, Option<Duration>)>;
-
-fn away(why: impl Into<String>) -> (Interrupted, Option<Duration>) {
-    (Interrupted::Away(why.into()), None)
+/// Reason for the end of an attempt.
+struct Failed {
+    why: Interrupted,
+    /// Pause that the server asks for.
+    after: Option<Duration>,
 }
 
-fn io(path: &Path) -> impl Fn(std::io::Error) -> (Interrupted, Option<Duration>) + '_ {
-    |error| (Interrupted::Io(path.to_owned(), error), None)
+impl From<Interrupted> for Failed {
+    fn from(why: Interrupted) -> Self {
+        Self { why, after: None }
+    }
+}
+
+fn away(why: impl Into<String>) -> Failed {
+    Interrupted::Away(why.into()).into()
+}
+
+fn io(path: &Path) -> impl Fn(std::io::Error) -> Failed + '_ {
+    |error| Interrupted::Io(path.to_owned(), error).into()
 }
 
 /// Asks once for the bytes that are missing, and appends them.
-fn attempt(client: &Client, wanted: &Wanted<'_>, part: &Path, arrived: &mut dyn FnMut(Arrived)) -> Attempt<()> {
+fn attempt(client: &Client, wanted: &Wanted<'_>, part: &Path, arrived: &mut dyn FnMut(Arrived)) -> Result<(), Failed> {
     let have = length(part);
     let known = fs::read_to_string(identity_file(part)).ok().filter(|_| have > 0);
     let mut request = client.get(wanted.url.clone());
@@ -144,8 +151,9 @@ fn attempt(client: &Client, wanted: &Wanted<'_>, part: &Path, arrived: &mut dyn 
     let continues = have > 0 && (wanted.fixed || known.is_some());
     if continues {
         request = request.header(RANGE, format!("bytes={have}-"));
-        request =
-            known.into_iter().filter(|_| !wanted.fixed).fold(request, |request, tag| request.header(IF_RANGE, tag));
+        if let Some(tag) = known.filter(|_| !wanted.fixed) {
+            request = request.header(IF_RANGE, tag);
+        }
     }
     let response = request.send().map_err(|error| away(chain(&error)))?;
     let start = match response.status() {
@@ -159,9 +167,9 @@ fn attempt(client: &Client, wanted: &Wanted<'_>, part: &Path, arrived: &mut dyn 
         status if status.is_server_error() || status == StatusCode::TOO_MANY_REQUESTS => {
             let after = response.headers().get(RETRY_AFTER).and_then(|value| value.to_str().ok()?.parse().ok());
             let why = Interrupted::Away(format!("the server answered {status}"));
-            return Err((why, after.map(Duration::from_secs)));
+            return Err(Failed { why, after: after.map(Duration::from_secs) });
         }
-        status => return Err((Interrupted::Refused(status), None)),
+        status => return Err(Interrupted::Refused(status).into()),
     };
     append(response, wanted, part, start, arrived)
 }
@@ -189,10 +197,10 @@ fn append(
     part: &Path,
     start: u64,
     arrived: &mut dyn FnMut(Arrived),
-) -> Attempt<()> {
+) -> Result<(), Failed> {
     let of = response.content_length().map(|rest| rest.saturating_add(start));
     if of.is_some_and(|bytes| bytes > wanted.most) {
-        return Err((Interrupted::TooLarge, None));
+        return Err(Interrupted::TooLarge.into());
     }
     let mut file = opened(part, start, strong_tag(response.headers())).map_err(io(part))?;
     let (mut bytes, mut piece) = (start, vec![0; 256 << 10]);
@@ -204,7 +212,7 @@ fn append(
             Err(error) => return Err(away(format!("the transfer ended after {bytes} bytes: {}", chain(&error)))),
         };
         if bytes + count as u64 > wanted.most {
-            return Err((Interrupted::TooLarge, None));
+            return Err(Interrupted::TooLarge.into());
         }
         file.write_all(&piece[..count]).map_err(io(part))?;
         bytes += count as u64;

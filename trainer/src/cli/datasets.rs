@@ -55,7 +55,7 @@ pub(super) fn list(args: &ListArgs) -> u8 {
             json!({
                 "name": known.name, "title": known.title, "home": known.home, "licence": known.licence,
                 "recordings": (known.recordings > 0).then_some(known.recordings), "fetched": known.fetched,
-                "map": (!known.map.is_empty()).then_some(known.map), "how": known.how,
+                "map": (!known.map.is_empty()).then_some(known.map), "how": known.how(),
             })
         });
         print::json(&sets.collect::<Vec<_>>());
@@ -63,10 +63,10 @@ pub(super) fn list(args: &ListArgs) -> u8 {
     }
     let rows = KNOWN.iter().map(|known| {
         let map = if known.map.is_empty() { "-" } else { known.map };
-        [known.name, known.title, known.licence, map, known.how].map(str::to_owned).to_vec()
+        [known.name, known.title, known.licence, map, &known.how()].map(str::to_owned).to_vec()
     });
     print::out(&print::table(&["NAME", "SET", "LICENCE", "JOINT MAP", "HOW"], rows.collect()));
-    print::note("\nother sets: see the chapter \"Public data\" of the book");
+    print::note("\nthe chapter \"Public data\" of the book says how the others are read");
     0
 }
 
@@ -108,7 +108,13 @@ fn known(name: &str) -> Result<&'static Known> {
     let found = KNOWN.iter().find(|known| known.name == name);
     match found {
         Some(known) if known.fetched => Ok(known),
-        Some(known) => Err(Problem::usage(format!("`{name}` is not fetched by this command")).hint(known.how)),
+        Some(known) => {
+            let problem = Problem::usage(format!("this command does not fetch `{name}`"));
+            Err(problem.hint(format!(
+                "its page is {}; the chapter \"Public data\" of the book says how it is read",
+                known.home
+            )))
+        }
         None => {
             let near = spelling::nearest(name, KNOWN.iter().map(|known| known.name));
             let near = near.map_or_else(String::new, |near| format!("did you mean `{near}`? "));
@@ -213,6 +219,11 @@ impl Shown {
 
 fn drawn(bar: Bar, of: Option<u64>) -> ProgressBar {
     if !print::on_terminal() {
+        match bar {
+            Bar::Checked => print::note("checking the files of an earlier attempt"),
+            Bar::Arrived { .. } => print::note("fetching the archive"),
+            Bar::Kept => print::note("checking the files"),
+        }
         return ProgressBar::hidden();
     }
     let template = match (bar, of) {

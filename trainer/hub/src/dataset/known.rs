@@ -25,22 +25,68 @@ pub struct Known {
     pub map: &'static str,
     /// True if `data fetch` fetches it.
     pub fetched: bool,
-    /// How it is obtained and read.
-    pub how: &'static str,
 }
 
-/// The sets that `data list` shows.
-pub const KNOWN: [Known; 1] = [Known {
-    name: "bandai",
-    title: "Bandai-Namco Research Motion Dataset",
-    home: "https://github.com/BandaiNamcoResearchInc/Bandai-Namco-Research-Motiondataset",
-    licence: "CC BY-NC 4.0",
-    licence_text: "https://creativecommons.org/licenses/by-nc/4.0/",
-    recordings: 3_077,
-    map: "bandai",
-    fetched: true,
-    how: "trainer data fetch bandai",
-}];
+/// The sets that `data list` shows. Those that are not fetched have instructions in the book.
+pub const KNOWN: [Known; 5] = [
+    Known {
+        name: "bandai",
+        title: "Bandai-Namco Research Motion Dataset",
+        home: "https://github.com/BandaiNamcoResearchInc/Bandai-Namco-Research-Motiondataset",
+        licence: "CC BY-NC 4.0",
+        licence_text: "https://creativecommons.org/licenses/by-nc/4.0/",
+        recordings: 3_077,
+        map: "bandai",
+        fetched: true,
+    },
+    Known {
+        name: "lafan1",
+        title: "Ubisoft La Forge Animation Dataset",
+        home: "https://github.com/ubisoft/ubisoft-laforge-animation-dataset",
+        licence: "CC BY-NC-ND 4.0",
+        licence_text: "",
+        recordings: 77,
+        map: "lafan1",
+        fetched: false,
+    },
+    Known {
+        name: "cmu",
+        title: "CMU Graphics Lab Motion Capture Database, as BVH",
+        home: "https://sites.google.com/a/cgspeed.com/cgspeed/motion-capture",
+        licence: "see its page",
+        licence_text: "",
+        recordings: 0,
+        map: "cmu",
+        fetched: false,
+    },
+    Known {
+        name: "snapmogen",
+        title: "SnapMoGen",
+        home: "https://huggingface.co/datasets/Ericguo5513/SnapMoGen",
+        licence: "see its page",
+        licence_text: "",
+        recordings: 0,
+        map: "",
+        fetched: false,
+    },
+    Known {
+        name: "bones-seed",
+        title: "BONES-SEED",
+        home: "https://nvlabs.github.io/ProtoMotions/getting_started/seed_bvh_preparation.html",
+        licence: "see its page",
+        licence_text: "",
+        recordings: 0,
+        map: "",
+        fetched: false,
+    },
+];
+
+impl Known {
+    /// The command that fetches the set, or the address of its page.
+    pub fn how(&self) -> String {
+        if self.fetched { format!("trainer data fetch {}", self.name) } else { self.home.to_owned() }
+    }
+}
 
 /// The 2,642 takes of the Bandai-Namco Research Motion Dataset that are used.
 ///
