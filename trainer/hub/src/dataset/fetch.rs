@@ -39,7 +39,10 @@ pub struct Table {
     pub text: String,
 }
 
-/// What is being done.
+/// Makes the tables of a set from the names of its recordings.
+pub type MakeTables<'a> = dyn Fn(&[&str]) -> Result<Vec<Table>, String> + 'a;
+
+/// Progress of a request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Progress {
     /// Files of an earlier attempt are compared with the list.
@@ -81,15 +84,11 @@ impl Fetch<'_> {
         is_taken(self.folder) || Staging::is_accepted(self.folder)
     }
 
-    /// Completes the set. `tables` makes further files from the names of those that are there.
+    /// Completes the set. `tables` makes further files from the names of the recordings.
     ///
     /// # Errors
     /// The folder then does not exist, and the same command continues.
-    pub fn run(
-        &self,
-        tables: &dyn Fn(&[&str]) -> Result<Vec<Table>, String>,
-        progress: &mut dyn FnMut(Progress),
-    ) -> Result<Fetched, FetchError> {
+    pub fn run(&self, tables: &MakeTables<'_>, progress: &mut dyn FnMut(Progress)) -> Result<Fetched, FetchError> {
         if is_taken(self.folder) {
             return self.compare();
         }
@@ -102,7 +101,7 @@ impl Fetch<'_> {
         let kept = all - missing.len();
         if !missing.is_empty() {
             match self.source {
-                Source::Address(address) => self.from_address(address, &staging, &mut missing, progress)?,
+                Source::Address(address) => self.take_from_address(address, &staging, &mut missing, progress)?,
                 Source::Local(path) if path.is_dir() => from_folder(path, &staging, &mut missing, progress)?,
                 Source::Local(path) => {
                     let archive = File::open(path).map_err(io_error(path, 0))?;
@@ -171,7 +170,7 @@ impl Fetch<'_> {
     }
 
     /// Transfers the archive unless it is there, and takes the files out of it.
-    fn from_address(
+    fn take_from_address(
         &self,
         address: &str,
         staging: &Staging,

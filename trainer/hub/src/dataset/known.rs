@@ -27,7 +27,7 @@ pub struct Known {
     pub fetched: bool,
 }
 
-/// The sets that `data list` shows. Those that are not fetched have instructions in the book.
+/// The sets that `data list` shows. The book has instructions for sets that are not fetched.
 pub const KNOWN: [Known; 5] = [
     Known {
         name: "bandai",

@@ -77,7 +77,7 @@ impl Staging {
         self.root.join("files")
     }
 
-    /// Removes from `missing` the files that are there, and from the folder those that differ from the list.
+    /// Removes the checked files from `missing`, and other files from the folder.
     pub(crate) fn check(
         &self,
         missing: &mut BTreeMap<&str, &Listed>,
