@@ -198,7 +198,7 @@ impl Bench {
         fetched
     }
 
-    fn from_server(&self, server: &Server) -> Result<Fetched, FetchError> {
+    fn fetch_from(&self, server: &Server) -> Result<Fetched, FetchError> {
         self.fetch(Source::Address(&server.address), false)
     }
 
@@ -229,13 +229,13 @@ fn names(folder: &Path) -> Vec<String> {
 #[test]
 fn a_set_is_fetched_once() {
     let (bench, server) = (Bench::new(), Server::start(good(), []));
-    let fetched = bench.from_server(&server).expect("fetched");
+    let fetched = bench.fetch_from(&server).expect("fetched");
     assert_eq!(fetched, Fetched { files: 4, kept: 0, missing: 0, was_complete: false });
     bench.expect_complete();
     assert_eq!(server.asked(), [(None, None)]);
     // The user's own captions stay.
     fs::write(bench.folder().join("captions.csv"), "mine").expect("written");
-    assert!(bench.from_server(&server).expect("there").was_complete);
+    assert!(bench.fetch_from(&server).expect("there").was_complete);
     assert_eq!(server.asked(), []);
     assert_eq!(fs::read_to_string(bench.folder().join("captions.csv")).expect("there"), "mine");
 }
@@ -243,7 +243,7 @@ fn a_set_is_fetched_once() {
 #[test]
 fn a_cut_transfer_continues_at_its_byte() {
     let (bench, server) = (Bench::new(), Server::start(good(), [Answer::Cut(5_000), Answer::Cut(7_000)]));
-    bench.from_server(&server).expect("fetched");
+    bench.fetch_from(&server).expect("fetched");
     bench.expect_complete();
     let tag = Some("\"one\"".to_owned());
     let range = |from: usize| (Some(format!("bytes={from}-")), tag.clone());
@@ -254,14 +254,14 @@ fn a_cut_transfer_continues_at_its_byte() {
 fn another_process_continues_a_transfer() {
     let (bench, server) = (Bench::new(), Server::start(good(), vec![Answer::Cut(9_000)]));
     server.change(|world| world.answers.extend(std::iter::repeat_n(Answer::Status(503), 4)));
-    let error = bench.from_server(&server).expect_err("the server is away");
+    let error = bench.fetch_from(&server).expect_err("the server is away");
     assert!(matches!(error, FetchError::Away { .. }) && error.is_transient(), "{error}");
     assert!(error.advice().contains("the same command continues"));
     bench.expect_unfinished();
     assert_eq!(fs::metadata(bench.part("archive.tar.gz.part")).expect("kept").len(), 9_000);
     server.change(|world| world.answers.clear());
     server.asked();
-    bench.from_server(&server).expect("fetched");
+    bench.fetch_from(&server).expect("fetched");
     bench.expect_complete();
     assert_eq!(server.asked(), [(Some("bytes=9000-".into()), Some("\"one\"".into()))]);
 }
@@ -270,18 +270,18 @@ fn another_process_continues_a_transfer() {
 fn a_server_without_ranges_or_with_another_archive_starts_again() {
     let (bench, server) =
         (Bench::new(), Server::start(good(), [Answer::WithoutRanges(9_000), Answer::WithoutRanges(12_000)]));
-    bench.from_server(&server).expect("fetched");
+    bench.fetch_from(&server).expect("fetched");
     bench.expect_complete();
     assert_eq!(server.asked(), [(None, None), (None, None), (None, None)]);
 
     let (bench, server) = (Bench::new(), Server::start(vec![7; 20_000], [Answer::Cut(9_000)]));
     server.change(|world| world.answers.extend(std::iter::repeat_n(Answer::Status(503), 4)));
-    bench.from_server(&server).expect_err("the server is away");
+    bench.fetch_from(&server).expect_err("the server is away");
     server.change(|world| {
         world.answers.clear();
         (world.archive, world.etag) = (good(), "\"two\"".into());
     });
-    bench.from_server(&server).expect("fetched");
+    bench.fetch_from(&server).expect("fetched");
     bench.expect_complete();
 
     // The archive arrived, but the process ended before it knew.
@@ -289,14 +289,14 @@ fn a_server_without_ranges_or_with_another_archive_starts_again() {
     fs::create_dir_all(bench.part("files")).expect("created");
     fs::write(bench.part("archive.tar.gz.part"), good()).expect("written");
     fs::write(bench.part("archive.tar.gz.part.etag"), "\"one\"").expect("written");
-    bench.from_server(&server).expect("fetched");
+    bench.fetch_from(&server).expect("fetched");
     bench.expect_complete();
 }
 
 #[test]
 fn a_refusal_is_reported_at_once() {
     let (bench, server) = (Bench::new(), Server::start(good(), [Answer::Status(404)]));
-    let error = bench.from_server(&server).expect_err("refused");
+    let error = bench.fetch_from(&server).expect_err("refused");
     assert!(matches!(error, FetchError::Refused { .. }) && error.to_string().contains("404"), "{error}");
     assert_eq!(server.asked().len(), 1);
     bench.expect_unfinished();
@@ -318,12 +318,12 @@ fn a_file_with_another_digest_or_size_is_refused_and_the_others_are_kept() {
             names.iter().zip(&contents).map(|(name, (_, bytes))| (name.as_str(), bytes.as_slice())).collect();
         members[2].1 = bytes;
         let (bench, server) = (Bench::new(), Server::start(archive(&members), []));
-        let error = bench.from_server(&server).expect_err("another file");
+        let error = bench.fetch_from(&server).expect_err("another file");
         assert!(matches!(error, FetchError::Content { .. }) && error.to_string().contains(part), "{part}: {error}");
         bench.expect_unfinished();
         assert_eq!(self::names(&bench.part("files")), ["take_0.bvh", "take_1.bvh"]);
         server.change(|world| world.archive = good());
-        assert_eq!(bench.from_server(&server).expect("fetched").kept, 2);
+        assert_eq!(bench.fetch_from(&server).expect("fetched").kept, 2);
         bench.expect_complete();
     }
 }
@@ -342,12 +342,12 @@ fn an_archive_that_lacks_files_or_ends_early_is_refused() {
     ];
     for (bytes, part) in cases {
         let (bench, server) = (Bench::new(), Server::start(bytes, []));
-        let error = bench.from_server(&server).expect_err("no such set");
+        let error = bench.fetch_from(&server).expect_err("no such set");
         assert!(error.to_string().contains(part), "{part}: {error}");
         bench.expect_unfinished();
         assert!(!bench.part("archive.tar.gz").exists(), "a wrong archive is not tried again");
         server.change(|world| (world.archive, world.etag) = (good(), "\"two\"".into()));
-        bench.from_server(&server).expect("fetched");
+        bench.fetch_from(&server).expect("fetched");
         bench.expect_complete();
     }
 }
@@ -368,7 +368,7 @@ fn names_of_members_lead_nowhere() {
     }
     let bytes = builder.into_inner().and_then(GzEncoder::finish).expect("finished");
     let (bench, server) = (Bench::new(), Server::start(bytes, []));
-    bench.from_server(&server).expect("the listed files are there");
+    bench.fetch_from(&server).expect("the listed files are there");
     bench.expect_complete();
     assert_eq!(names(bench.root.path()), ["data"]);
 
@@ -377,7 +377,7 @@ fn names_of_members_lead_nowhere() {
         append(&mut builder, "root/take_0.bvh", kind, b"");
         let bytes = builder.into_inner().and_then(GzEncoder::finish).expect("finished");
         let (bench, server) = (Bench::new(), Server::start(bytes, []));
-        let error = bench.from_server(&server).expect_err("no file").to_string();
+        let error = bench.fetch_from(&server).expect_err("no file").to_string();
         assert!(error.contains("`take_0.bvh` is not a regular file of the archive"), "{kind:?}: {error}");
         bench.expect_unfinished();
         assert!(names(&bench.part("files")).is_empty());
@@ -389,12 +389,12 @@ fn a_full_disk_is_named_and_leaves_nothing_that_looks_complete() {
     let (bench, server) = (Bench::new(), Server::start(good(), []));
     fs::create_dir_all(bench.part("files")).expect("created");
     std::os::unix::fs::symlink("/dev/full", bench.part("archive.tar.gz.part")).expect("linked");
-    let error = bench.from_server(&server).expect_err("the disk is full");
+    let error = bench.fetch_from(&server).expect_err("the disk is full");
     assert!(matches!(error, FetchError::DiskFull { bytes: 25_600, .. }), "{error:?}");
     assert!(error.to_string().contains("the disk is full; the set needs 1 MB more"), "{error}");
     bench.expect_unfinished();
     fs::remove_file(bench.part("archive.tar.gz.part")).expect("removed");
-    bench.from_server(&server).expect("fetched");
+    bench.fetch_from(&server).expect("fetched");
     bench.expect_complete();
 }
 
@@ -404,11 +404,11 @@ fn one_process_fetches_at_a_time() {
     fs::create_dir_all(bench.part("files")).expect("created");
     let lock = File::create(bench.part("lock")).expect("created");
     lock.lock().expect("locked");
-    let error = bench.from_server(&server).expect_err("busy");
+    let error = bench.fetch_from(&server).expect_err("busy");
     assert!(matches!(error, FetchError::Busy { .. }), "{error}");
     assert_eq!(server.asked(), []);
     drop(lock);
-    bench.from_server(&server).expect("fetched");
+    bench.fetch_from(&server).expect("fetched");
 }
 
 #[test]
@@ -420,7 +420,7 @@ fn what_an_earlier_attempt_left_is_checked() {
     fs::write(bench.part("files/take_1.bvh"), &contents[1].1[..50]).expect("written");
     fs::write(bench.part("files/captions.csv"), "half of them").expect("written");
     fs::write(bench.part("files/.tmpX"), "a temporary file").expect("written");
-    assert_eq!(bench.from_server(&server).expect("fetched").kept, 1);
+    assert_eq!(bench.fetch_from(&server).expect("fetched").kept, 1);
     bench.expect_complete();
 }
 
@@ -464,18 +464,18 @@ fn a_clone_or_an_archive_serves_as_well() {
 fn a_folder_with_something_else_is_left_alone() {
     let (bench, server) = (Bench::new(), Server::start(good(), []));
     fs::create_dir_all(bench.folder()).expect("an empty folder is no obstacle");
-    bench.from_server(&server).expect("fetched");
+    bench.fetch_from(&server).expect("fetched");
     bench.expect_complete();
     fs::write(bench.folder().join("take_2.bvh"), "damaged").expect("written");
-    let error = bench.from_server(&server).expect_err("a file differs").to_string();
+    let error = bench.fetch_from(&server).expect_err("a file differs").to_string();
     assert!(error.contains("1 files differ from the published ones: take_2.bvh"), "{error}");
     fs::remove_file(bench.folder().join("take_2.bvh")).expect("removed");
-    assert!(bench.from_server(&server).expect_err("a file is missing").to_string().contains("has 3 of 4 files"));
+    assert!(bench.fetch_from(&server).expect_err("a file is missing").to_string().contains("has 3 of 4 files"));
 
     let bench = Bench::new();
     fs::create_dir_all(bench.folder()).expect("created");
     fs::write(bench.folder().join("mine.txt"), "mine").expect("written");
-    let error = bench.from_server(&server).expect_err("not the set").to_string();
+    let error = bench.fetch_from(&server).expect_err("not the set").to_string();
     assert!(error.contains("is not the set `takes`"), "{error}");
     assert_eq!(names(&bench.folder()), ["mine.txt"]);
 }

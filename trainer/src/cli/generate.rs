@@ -193,6 +193,12 @@ pub(crate) async fn generate(args: GenerateArgs) -> Result<u8> {
     let targets = args.control.targets(&generator, &label, requests.first().and_then(length))?;
     let shared = Shared { label, sampler, loaded };
 
+    if vocabulary.is_none() {
+        let label = &shared.label;
+        print::note(&format!(
+            "note: this store has no training captions of {label}, so words that it never saw cannot be named"
+        ));
+    }
     let (mut rows, mut motions): (Vec<Row>, Vec<Vec<Motion>>) = (Vec::new(), Vec::new());
     for request in &requests {
         let mut known = is_known(&generator, &shared.label, &request.caption)?;
