@@ -241,8 +241,11 @@ impl Remote<'_> {
         fs::create_dir_all(&folder).map_err(io(&folder))?;
         let name = format!("{}.lock", blob.file_name().unwrap_or_default().to_string_lossy());
         let file = File::create(folder.join(name)).map_err(io(&folder))?;
-        file.lock().map_err(io(&folder))?;
-        Ok(file)
+        match file.lock() {
+            // Some network file systems have no locks. Two processes may then fetch one file, which the digest detects.
+            Err(error) if error.kind() == std::io::ErrorKind::Unsupported => Ok(file),
+            locked => locked.map(|()| file).map_err(io(&folder)),
+        }
     }
 
     fn interrupted(&self, name: &str, why: Interrupted) -> Failure {
