@@ -385,6 +385,43 @@ fn names_of_members_lead_nowhere() {
 }
 
 #[test]
+fn long_paths_of_every_form_are_read() {
+    let contents = contents();
+    let folder = "long/".repeat(40);
+    let append_file = |builder: &mut Builder<GzEncoder<Vec<u8>>>, name: &str, bytes: &[u8]| {
+        append(builder, name, EntryType::Regular, bytes);
+    };
+    let mut builder = Builder::new(GzEncoder::new(Vec::new(), Compression::fast()));
+    // As git writes it: the folder in the prefix of the header.
+    let mut header = Header::new_ustar();
+    header.set_path(format!("{}{}", "long/".repeat(25), contents[0].0)).expect("it has a prefix");
+    header.set_size(contents[0].1.len() as u64);
+    header.set_cksum();
+    builder.append(&header, contents[0].1.as_slice()).expect("appended");
+    // As GNU tar writes it.
+    append(&mut builder, "././@LongLink", EntryType::GNULongName, format!("{folder}{}\0", contents[1].0).as_bytes());
+    append_file(&mut builder, "long/long", &contents[1].1);
+    // As Python writes it.
+    let path = format!("{folder}{}", contents[2].0);
+    builder.append_pax_extensions([("path", path.as_bytes())]).expect("appended");
+    append_file(&mut builder, "long/long", &contents[2].1);
+    append_file(&mut builder, &contents[3].0, &contents[3].1);
+    let bytes = builder.into_inner().and_then(GzEncoder::finish).expect("finished");
+    let (bench, server) = (Bench::new(), Server::start(bytes, []));
+    bench.fetch_from(&server).expect("fetched");
+    bench.expect_complete();
+
+    // A damaged extension ends the reading.
+    let mut builder = Builder::new(GzEncoder::new(Vec::new(), Compression::fast()));
+    append(&mut builder, "pax", EntryType::XHeader, b"999999 path=x");
+    let bytes = builder.into_inner().and_then(GzEncoder::finish).expect("finished");
+    let (bench, server) = (Bench::new(), Server::start(bytes, []));
+    let error = bench.fetch_from(&server).expect_err("damaged");
+    assert!(matches!(error, FetchError::Content { .. }), "{error}");
+    bench.expect_unfinished();
+}
+
+#[test]
 fn a_full_disk_is_named_and_leaves_nothing_that_looks_complete() {
     let (bench, server) = (Bench::new(), Server::start(good(), []));
     fs::create_dir_all(bench.part("files")).expect("created");
