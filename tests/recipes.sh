@@ -1,14 +1,14 @@
 #!/usr/bin/env bash
 # Runs published recipes at their own widths, in a few small steps on synthetic clips: tests/recipes.sh [RECIPE...]
 # Each is planned, then run with one, two and three workers, and once with the trainer killed and restarted in every training stage. The
-# digests of all runs must be equal. RECIPE is a name in configs/; the default is those of Free-T2M and of control.
+# digests of all runs must be equal. RECIPE is a name in configs/; the default is those of Free-T2M and of control, and bandai.
 # A worker of free-stablemofusion needs 12 GB of memory, and a training state of it 4.8 GB of disk.
 # TRAINER is the program (a release build: an unoptimised one takes ten times as long), STEPS the steps of each training, BATCH the examples of a step, in three slices.
 set -euo pipefail
 root=$(cd "$(dirname "$0")/.." && pwd)
 trainer=${TRAINER:-$root/target/release/trainer} steps=${STEPS:-2} batch=${BATCH:-6}
 recipes=("$@")
-[ $# -gt 0 ] || recipes=(free-mdm free-stablemofusion free-mld motionlcm-control-temporal motionlcm-control-spatial)
+[ $# -gt 0 ] || recipes=(free-mdm free-stablemofusion free-mld motionlcm-control-temporal motionlcm-control-spatial bandai)
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
 
@@ -29,7 +29,12 @@ digests() {
 
 for recipe in "${recipes[@]}"; do
     file=$root/configs/$recipe.yaml
-    sets=(--set 'dataset={format: synthetic, clips: 40, val: 0.1, test: 0.2}' --set 'text={encoder: hashed}')
+    sets=(--set 'text={encoder: hashed}')
+    if grep -q '^dataset:' "$file"; then
+        sets+=(--set 'dataset={format: synthetic, clips: 40, val: 0.1, test: 0.2}')
+    else
+        sets+=(--set 'stages.dataset={kind: data.synthetic, clips: 40, val: 0.1, test: 0.2}')
+    fi
     for stage in $(training "$file"); do
         sets+=(--set "stages.$stage.steps=$steps" --set "stages.$stage.warmup=0" --set "stages.$stage.batch={global: $batch, slices: 3}")
         sets+=(--set "stages.$stage.checkpoint={every: 1, keep: {latest: 1}}")

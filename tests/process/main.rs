@@ -6,6 +6,7 @@
 mod access;
 mod backends;
 mod bad_input;
+mod bandai;
 mod buckets;
 mod checkpoints;
 mod closed_pipes;

@@ -50,8 +50,13 @@ pub(crate) fn are_written(bench: &Bench) {
     for part in ["`quantum`, `flapdoodle` did not occur in the training of", "nearest known: \""] {
         assert!(unknown.stderr.contains(part), "{}", unknown.stderr);
     }
-    let partly = bench.run(&["generate", "a flapdoodle", "--stage", "mld", "-o", "u.npy", "-o", "json"]).json();
-    assert_eq!((&partly["known"], &partly["unknown_words"]), (&true.into(), &serde_json::json!(["flapdoodle"])));
+    assert_eq!(row["nearest_known"].as_array().map(Vec::len), Some(3), "{row}");
+    for (sentence, known) in [("a flapdoodle", false), ("a person walks flapdoodle", true)] {
+        let partly = bench.run(&["generate", sentence, "--stage", "mld", "-o", "u.npy", "-o", "json"]).json();
+        assert_eq!((&partly["known"], &partly["unknown_words"]), (&known.into(), &serde_json::json!(["flapdoodle"])));
+    }
+    let known = bench.run(&["generate", "a person walks", "--stage", "mld", "-o", "u.npy", "-o", "json"]).json();
+    assert_eq!((&known["unknown_words"], &known["nearest_known"]), (&serde_json::json!([]), &serde_json::json!([])));
     let far =
         bench.run(&["generate", "a", "--model", "smoke@staging", "--guidance", "40", "-o", "u.npy"]).expect_code(0);
     assert!(far.stderr.contains("was trained for guidance 0.5 to 5; at 40"), "{}", far.stderr);

@@ -4,6 +4,7 @@ use std::fs;
 
 use cluster_tests::cluster::Cluster;
 use cluster_tests::{Bench, digests, wait_for};
+use serde_json::Value;
 
 const TRAINER: &str = env!("CARGO_BIN_EXE_trainer");
 
@@ -123,6 +124,10 @@ fn a_bundle_draws_the_same_motion_from_another_store() {
     other.run(&["registry", "import", "smoke.tar.zst", "--model", "renamed"]).expect_code(0);
     assert_eq!(motion(&other, "smoke@1", "y.npy"), expected, "the same bits");
     assert_eq!(motion(&other, "renamed@latest", "z.npy"), expected, "whatever it is called");
+    // A bundle has no captions, so words that the model never saw cannot be named.
+    let said = other.run(&["generate", "quantum flapdoodle", "--model", "smoke@1", "-o", "u.npy", "-o", "json"]);
+    assert!(said.stderr.contains("has no training captions of smoke"), "{}", said.stderr);
+    assert_eq!((&said.json()["unknown_words"], &said.json()["nearest_known"]), (&Value::Null, &Value::Null));
     let metrics = |bench: &Bench, model: &str| {
         bench.run(&["registry", "show", model, "-o", "json"]).expect_code(0).json()["version"]["metrics"].clone()
     };

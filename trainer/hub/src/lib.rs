@@ -1,4 +1,4 @@
-//! Published text encoders by their names on the Hugging Face hub.
+//! What is fetched from public hosts: text encoders of the Hugging Face hub, and published sets of motion ([`dataset`]).
 //!
 //! [`Hub::folder`] returns a folder with the files of a repository that an encoder needs, from the cache or fetched
 //! into it. The cache is that of `huggingface_hub`, which all programs share: `models--ORG--NAME/snapshots/COMMIT/FILE`
@@ -9,14 +9,16 @@
 //! The crate `hf-hub` is not used: its 1.0 adds a second TLS provider, which builds with CMake, and it ignores
 //! `HF_HUB_OFFLINE`. Only a listing and a download are needed. Files arrive whole or not at all: they are written
 //! beside their place, checked against the length and, if the hub sends it, the SHA-256, and then renamed. An
-//! interrupted download starts again.
+//! interrupted transfer continues where the server allows it.
 
 mod cache;
+pub mod dataset;
 mod error;
 mod found;
 mod name;
 mod remote;
 mod settings;
+mod transfer;
 mod wanted;
 
 pub use error::HubError;

@@ -9,9 +9,9 @@ use std::time::Duration;
 use protocol::limits;
 use reqwest::blocking::{Client, Response};
 use reqwest::header::{ETAG, HeaderMap};
+use reqwest::redirect::Policy;
 use reqwest::{StatusCode, Url};
 use serde::Deserialize;
-use sha2::{Digest as _, Sha256};
 
 pub(crate) use crate::wanted::Failure;
 
@@ -20,16 +20,15 @@ use crate::error::HubError;
 use crate::found::Found;
 use crate::name::{Name, is_commit};
 use crate::settings::Settings;
+use crate::transfer::{Arrived, Interrupted, Wanted, chain, client, discard, file_sha256, transfer};
 use crate::wanted::{Encoder, Repository, get_all};
 
 /// Largest size of the hub's answer about a repository, in bytes.
 const LISTING_BYTES: u64 = 16 << 20;
 /// Largest number of files of a repository.
 const FILES: usize = 20_000;
-/// Time limit for connecting.
-const CONNECT: Duration = Duration::from_secs(10);
-/// Time limit for each read.
-const SILENCE: Duration = Duration::from_secs(60);
+/// Pause after the first failed attempt of a download.
+const PAUSE: Duration = Duration::from_secs(1);
 /// Smallest download that is logged, in bytes.
 const TOLD_BYTES: u64 = 1 << 20;
 
@@ -65,12 +64,8 @@ pub(crate) fn fetch(
     encoder: Encoder,
     said: &mut dyn FnMut(&str),
 ) -> Result<Found, Failure> {
-    access::tls::install_provider();
-    // The timeout applies to each read, not to the whole transfer.
-    let client = || Client::builder().connect_timeout(CONNECT).timeout(SILENCE).user_agent("stride");
-    let built = |client: reqwest::blocking::ClientBuilder| client.build().map_err(|e| Failure::Away(chain(&e)));
-    let asks = built(client().redirect(reqwest::redirect::Policy::none()))?;
-    let fetches = built(client().redirect(reqwest::redirect::Policy::limited(5)))?;
+    let asks = client(|builder| builder.redirect(Policy::none())).map_err(Failure::Away)?;
+    let fetches = client(|builder| builder.redirect(Policy::limited(5))).map_err(Failure::Away)?;
     let mut remote = Remote { settings, name, asks, fetches, commit: String::new(), names: BTreeSet::new(), said };
     remote.list()?;
     get_all(&mut remote, encoder)?;
@@ -79,12 +74,6 @@ pub(crate) fn fetch(
         write_whole(&root(settings, name).join("refs").join(&name.revision), commit.as_bytes())?;
     }
     Ok(Found { folder: snapshot(settings, name, &commit), commit, note: None })
-}
-
-/// An error with its causes.
-fn chain(error: &dyn std::error::Error) -> String {
-    let causes = std::iter::successors(error.source(), |cause| cause.source());
-    causes.fold(error.to_string(), |said, cause| format!("{said}: {cause}"))
 }
 
 fn io(file: &Path) -> impl FnOnce(std::io::Error) -> Failure + '_ {
@@ -144,15 +133,21 @@ impl Remote<'_> {
         let answer = request.send().map_err(|e| Failure::Away(chain(&e)))?;
         match answer.status() {
             status if status.is_success() || status.is_redirection() => Ok(answer),
-            StatusCode::UNAUTHORIZED | StatusCode::FORBIDDEN => Err(self.refused(
-                "the repository does not exist, or is private or gated; set HF_TOKEN if you have access".into(),
-            )),
-            StatusCode::NOT_FOUND => Err(self.refused("no such repository or revision".into())),
             status if status.is_server_error() || status == StatusCode::TOO_MANY_REQUESTS => {
                 Err(Failure::Away(format!("the server answered {status}")))
             }
-            status => Err(self.refused(format!("{status}"))),
+            status => Err(self.refusal(status)),
         }
+    }
+
+    fn refusal(&self, status: StatusCode) -> Failure {
+        self.refused(match status {
+            StatusCode::UNAUTHORIZED | StatusCode::FORBIDDEN => {
+                "the repository does not exist, or is private or gated; set HF_TOKEN if you have access".into()
+            }
+            StatusCode::NOT_FOUND => "no such repository or revision".into(),
+            status => format!("{status}"),
+        })
     }
 
     /// Resolves the revision to a commit, and lists its files.
@@ -183,9 +178,8 @@ impl Remote<'_> {
         let root = root(self.settings, self.name);
         let blob = identity.as_ref().map_or_else(|| place.to_owned(), |known| root.join("blobs").join(&known.etag));
         if !blob.is_file() {
-            let answer = self.send(&self.fetches, reqwest::Method::GET, url)?;
             let sha256 = identity.as_ref().and_then(|known| known.sha256.as_deref());
-            self.keep(name, answer, &blob, sha256)?;
+            self.keep(name, url, &blob, sha256)?;
         }
         if blob == place {
             return Ok(());
@@ -202,50 +196,68 @@ impl Remote<'_> {
         }
     }
 
-    /// Writes an answer to `blob`, once it is complete and verified.
-    fn keep(&mut self, name: &str, mut answer: Response, blob: &Path, sha256: Option<&str>) -> Result<(), Failure> {
-        let length = answer.content_length();
-        if length.is_some_and(|bytes| bytes > limits::WEIGHTS_BYTES) {
-            let (bytes, most) = (length.unwrap_or_default(), limits::WEIGHTS_BYTES);
-            return Err(self.refused(format!("`{name}` has {bytes} bytes; expected at most {most}")));
-        }
-        if length.is_some_and(|bytes| bytes >= TOLD_BYTES) {
-            (self.said)(&format!("fetching {name} of {} ({} MB)", self.name, length.unwrap_or_default() >> 20));
-        }
+    /// Fetches a file to `blob`, once it is complete and verified. One process at a time fetches it.
+    fn keep(&mut self, name: &str, url: Url, blob: &Path, sha256: Option<&str>) -> Result<(), Failure> {
         let folder = blob.parent().unwrap_or(Path::new("."));
         fs::create_dir_all(folder).map_err(io(folder))?;
-        let mut kept = tempfile::NamedTempFile::new_in(folder).map_err(io(folder))?;
-        let (mut hasher, mut part, mut written) = (Sha256::new(), vec![0; 256 << 10], 0_u64);
-        loop {
-            let count = answer
-                .read(&mut part)
-                .map_err(|e| Failure::Away(format!("the download of `{name}` ended early: {e}")))?;
-            if count == 0 {
-                break;
+        let _held = self.lock(blob)?;
+        if blob.is_file() {
+            return Ok(());
+        }
+        let mut part = blob.as_os_str().to_owned();
+        part.push(".incomplete");
+        let part = PathBuf::from(part);
+        let wanted = Wanted {
+            url,
+            token: self.settings.token.as_deref(),
+            most: limits::WEIGHTS_BYTES,
+            fixed: sha256.is_some(),
+            pause: PAUSE,
+        };
+        let (mut announced, repository, said) = (false, self.name, &mut *self.said);
+        let mut arrived = |arrived: Arrived| {
+            if let Some(bytes) = arrived.of.filter(|bytes| !announced && *bytes >= TOLD_BYTES) {
+                said(&format!("fetching {name} of {repository} ({} MB)", bytes >> 20));
+                announced = true;
             }
-            written += count as u64;
-            if written > limits::WEIGHTS_BYTES {
-                return Err(self.refused(format!(
-                    "`{name}` has more than {} bytes, the largest supported size",
-                    limits::WEIGHTS_BYTES
-                )));
+        };
+        transfer(&self.fetches, &wanted, &part, &mut arrived).map_err(|why| self.interrupted(name, why))?;
+        if let Some(expected) = sha256 {
+            let found = file_sha256(&part).map_err(io(&part))?;
+            if found != expected {
+                discard(&part);
+                return Err(self.refused(format!("the download of `{name}` has the wrong digest")));
             }
-            hasher.update(&part[..count]);
-            kept.write_all(&part[..count]).map_err(io(blob))?;
         }
-        if length.is_some_and(|length| length != written) {
-            return Err(Failure::Away(format!(
-                "the download of `{name}` ended after {written} of {} bytes",
-                length.unwrap_or_default()
-            )));
+        fs::rename(&part, blob).map_err(io(blob))?;
+        discard(&part);
+        File::open(blob).and_then(|kept| readable(&kept)).map_err(io(blob))
+    }
+
+    /// Takes the lock of a file in the cache, which other programs of the hub take too.
+    fn lock(&self, blob: &Path) -> Result<File, Failure> {
+        let root = root(self.settings, self.name);
+        let folder = self.settings.cache.join(".locks").join(root.file_name().unwrap_or_default());
+        fs::create_dir_all(&folder).map_err(io(&folder))?;
+        let name = format!("{}.lock", blob.file_name().unwrap_or_default().to_string_lossy());
+        let file = File::create(folder.join(name)).map_err(io(&folder))?;
+        match file.lock() {
+            // Some network file systems have no locks. Two processes may then fetch one file, which the digest detects.
+            Err(error) if error.kind() == std::io::ErrorKind::Unsupported => Ok(file),
+            locked => locked.map(|()| file).map_err(io(&folder)),
         }
-        let found = protocol::Digest::from_bytes(hasher.finalize().into()).hex();
-        if sha256.is_some_and(|expected| expected != found) {
-            return Err(self.refused(format!("the download of `{name}` has the wrong digest")));
+    }
+
+    fn interrupted(&self, name: &str, why: Interrupted) -> Failure {
+        match why {
+            Interrupted::Away(why) => Failure::Away(format!("the download of `{name}`: {why}")),
+            Interrupted::Refused(status) => self.refusal(status),
+            Interrupted::TooLarge => {
+                let most = limits::WEIGHTS_BYTES;
+                self.refused(format!("`{name}` has more than {most} bytes, the largest supported size"))
+            }
+            Interrupted::Io(file, source) => Failure::Said(HubError::Io { file, source }),
         }
-        kept.as_file().sync_all().map_err(io(blob))?;
-        let kept = kept.persist(blob).map_err(|e| io(blob)(e.error))?;
-        readable(&kept).map_err(io(blob))
     }
 }
 

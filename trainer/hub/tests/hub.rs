@@ -23,6 +23,8 @@ struct World {
     files: BTreeMap<String, Vec<u8>>,
     /// Method, path, and the token of each request.
     asked: Vec<(String, String, Option<String>)>,
+    /// The parts of files that were asked for.
+    ranges: Vec<String>,
     /// A file that is served with other bytes than its name declares.
     damaged: Option<String>,
     /// Address of the host of large files.
@@ -59,19 +61,27 @@ async fn answer(State(world): State<Shared>, request: Request) -> Response {
             (None, Some(name)) => (name, true),
             (None, None) => return status(StatusCode::NOT_FOUND),
         };
-    let Some(bytes) = world.files.get(name) else { return status(StatusCode::NOT_FOUND) };
+    let Some(bytes) = world.files.get(name).cloned() else { return status(StatusCode::NOT_FOUND) };
     let response = Response::builder();
     if at_hub && is_large(name) {
         let location = format!("{}/large/{name}", world.elsewhere);
-        let etag = format!("\"{}\"", Digest::of(bytes).hex());
+        let etag = format!("\"{}\"", Digest::of(&bytes).hex());
         let response = response.status(StatusCode::FOUND).header(header::LOCATION, location);
         return response.header("x-linked-etag", etag).body(Body::empty()).expect("an answer");
     }
-    let mut bytes = bytes.clone();
+    let mut bytes = bytes;
     if world.damaged.as_deref() == Some(name) {
         bytes[0] ^= 1;
     }
     let response = response.header(header::ETAG, format!("W/\"etag-{}\"", name.replace(['/', '.', '_'], "-")));
+    let mut response = response;
+    if let Some(range) = request.headers().get(header::RANGE).map(|value| value.to_str().expect("text").to_owned()) {
+        let start = range.trim_start_matches("bytes=").trim_end_matches('-').parse::<usize>().expect("a number");
+        let whole = format!("bytes {start}-{}/{}", bytes.len() - 1, bytes.len());
+        response = response.status(StatusCode::PARTIAL_CONTENT).header(header::CONTENT_RANGE, whole);
+        bytes.drain(..start);
+        world.ranges.push(range);
+    }
     let length = bytes.len();
     let body = if request.method() == Method::HEAD { Body::empty() } else { Body::from(bytes) };
     response.header(header::CONTENT_LENGTH, length).body(body).expect("an answer")
@@ -243,6 +253,31 @@ fn what_is_not_there_is_said_with_what_to_do() {
     let elsewhere = tempfile::tempdir().expect("a folder");
     let error = fetch(&server.settings(elsewhere.path()), "", Encoder::SentenceT5).expect_err("nowhere");
     assert!(error.to_string().contains("cannot be reached"), "{error}");
+}
+
+#[test]
+fn an_interrupted_download_continues_at_its_byte() {
+    let cache = tempfile::tempdir().expect("a folder");
+    let server = Server::start(SENTENCE);
+    let settings = server.settings(cache.path());
+    let blobs = cache.path().join("models--org--small/blobs");
+    let part = blobs.join(format!("{}.incomplete", Digest::of(b"whole weights").hex()));
+    fs::create_dir_all(&blobs).expect("created");
+    fs::write(&part, "whole").expect("written");
+    let found = fetch(&settings, "", Encoder::SentenceT5).expect("it is there");
+    assert_eq!(fs::read_to_string(found.folder.join("model.safetensors")).expect("a file"), "whole weights");
+    assert_eq!(std::mem::take(&mut server.world.lock().expect("ours").ranges), ["bytes=5-"]);
+    assert!(!part.exists());
+
+    // Bytes that do not fit are found by the digest; then the download begins again.
+    let cache = tempfile::tempdir().expect("a folder");
+    let settings = server.settings(cache.path());
+    let part = cache.path().join(part.strip_prefix(blobs.ancestors().nth(2).expect("the cache")).expect("below"));
+    fs::create_dir_all(part.parent().expect("a folder")).expect("created");
+    fs::write(&part, "WHOLE").expect("written");
+    let error = fetch(&settings, "", Encoder::SentenceT5).expect_err("damaged").to_string();
+    assert!(error.contains("has the wrong digest"), "{error}");
+    fetch(&settings, "", Encoder::SentenceT5).expect("it is there");
 }
 
 #[test]

@@ -1,6 +1,7 @@
 //! Exchange of motion with other programs: recordings in, animations out. No tensors, no stages.
 
 pub mod arrays;
+pub mod bandai;
 pub mod body;
 pub mod bvh;
 pub mod captions;

@@ -7,6 +7,12 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use protocol::spelling;
 
+/// Words that describe no motion: a prompt of these and unknown words gives an arbitrary one.
+const FUNCTION_WORDS: [&str; 27] = [
+    "a", "an", "and", "are", "at", "figure", "he", "her", "his", "in", "is", "it", "its", "man", "of", "on", "person",
+    "she", "someone", "the", "their", "then", "they", "to", "while", "with", "woman",
+];
+
 /// Words and sentences of training captions.
 #[derive(Debug, Clone, Default)]
 pub struct Vocabulary {
@@ -44,9 +50,9 @@ impl Vocabulary {
         unknown
     }
 
-    /// Returns true if a caption has one of the words of `prompt`.
+    /// Returns true if a caption has a word of `prompt` that may describe a motion.
     pub fn has_any(&self, prompt: &str) -> bool {
-        words(prompt).any(|word| self.words.contains_key(&word))
+        words(prompt).any(|word| self.words.contains_key(&word) && !FUNCTION_WORDS.contains(&word.as_str()))
     }
 
     /// The sentences that share most with `prompt`, at most `count`: rare words count more than frequent ones, and a word that is
@@ -111,7 +117,8 @@ mod tests {
         assert!(!vocabulary.has_any("quantum flapdoodle"));
         assert_eq!(vocabulary.unknown("A person WALKS, up."), [""; 0]);
         assert_eq!(vocabulary.unknown("a person moonwalks"), ["moonwalks"]);
-        assert!(vocabulary.has_any("a person moonwalks"));
+        assert!(!vocabulary.has_any("a person moonwalks"), "the known words describe no motion");
+        assert!(vocabulary.has_any("a person jumps and moonwalks"));
         assert_eq!(vocabulary.unknown(""), [""; 0]);
     }
 

@@ -1,4 +1,4 @@
-//! `trainer data`: inspects recordings and writes sample recordings.
+//! `trainer data`: inspects recordings, writes sample recordings and fetches published ones.
 
 use std::path::{Path, PathBuf};
 
@@ -12,6 +12,7 @@ use motion::DataPath;
 use protocol::Seed;
 use serde_json::json;
 
+use super::datasets::{self, FetchArgs, ListArgs};
 use crate::report::print::{self, Output};
 use crate::report::problem::{Problem, Result};
 
@@ -21,6 +22,11 @@ pub(crate) enum DataVerb {
     Inspect(InspectArgs),
     /// Writes synthetic clips as recordings with their captions
     Sample(SampleArgs),
+    /// Lists published sets of motion
+    List(ListArgs),
+    /// Fetches a published set, checks every file, and adds captions and splits; run it again to continue
+    #[command(after_help = "Example:\n  trainer data fetch bandai --accept-licence")]
+    Fetch(FetchArgs),
 }
 
 impl DataVerb {
@@ -28,6 +34,8 @@ impl DataVerb {
         match self {
             Self::Inspect(args) => args.output,
             Self::Sample(_) => Output::Table,
+            Self::List(args) => args.output,
+            Self::Fetch(args) => args.output,
         }
     }
 }
@@ -69,6 +77,8 @@ pub(crate) fn data(verb: &DataVerb) -> Result<u8> {
     match verb {
         DataVerb::Inspect(args) => inspect(args),
         DataVerb::Sample(args) => sample(args),
+        DataVerb::List(args) => Ok(datasets::list(args)),
+        DataVerb::Fetch(args) => datasets::fetch(args),
     }
 }
 

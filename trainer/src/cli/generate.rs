@@ -22,7 +22,7 @@ use super::remote::check_parent;
 use super::sampler::SamplerArgs;
 use super::sentences::SentenceArgs;
 use super::stream::{self, Opening, StreamArgs};
-use super::words;
+use super::words::{self, Compared};
 use crate::client::Target;
 use crate::reader::Reader;
 use crate::report::print::{self, Output};
@@ -85,8 +85,8 @@ struct Row {
     seconds: f64,
     /// True if the model recognises a word of the sentence.
     known: bool,
-    /// Words of the sentence that its training data lacks.
-    unknown_words: Vec<String>,
+    /// The sentence compared with the training captions, if the store has them.
+    words: Option<Compared>,
     kept: Vec<Range<usize>>,
     timing: Timing,
     missed: Option<Missed>,
@@ -193,14 +193,18 @@ pub(crate) async fn generate(args: GenerateArgs) -> Result<u8> {
     let targets = args.control.targets(&generator, &label, requests.first().and_then(length))?;
     let shared = Shared { label, sampler, loaded };
 
+    if vocabulary.is_none() {
+        let label = &shared.label;
+        print::note(&format!(
+            "note: this store has no training captions of {label}, so words that it never saw cannot be named"
+        ));
+    }
     let (mut rows, mut motions): (Vec<Row>, Vec<Vec<Motion>>) = (Vec::new(), Vec::new());
     for request in &requests {
         let mut known = is_known(&generator, &shared.label, &request.caption)?;
-        let unknown_words = match known {
-            true => words::unknown(vocabulary.as_ref(), &shared.label, &request.caption),
-            false => Vec::new(),
-        };
-        known &= unknown_words.is_empty() || vocabulary.as_ref().is_some_and(|v| v.has_any(&request.caption));
+        let known_to_encoder = vocabulary.as_ref().filter(|_| known);
+        let compared = words::compare(known_to_encoder, &shared.label, &request.caption);
+        known &= compared.as_ref().is_none_or(|words| words.unknown.is_empty() || words.has_known);
         let mut drawn = Vec::new();
         for seed in &seeds {
             let (motion, kept) =
@@ -220,7 +224,7 @@ pub(crate) async fn generate(args: GenerateArgs) -> Result<u8> {
                 frames,
                 seconds: frames as f64 / skeleton.fps,
                 known,
-                unknown_words: unknown_words.clone(),
+                words: compared.clone(),
                 kept,
                 timing,
                 missed,
@@ -333,7 +337,8 @@ impl Row {
             "model": label,
             "prompt": self.prompt,
             "known": self.known,
-            "unknown_words": self.unknown_words,
+            "unknown_words": self.words.as_ref().map(|words| &words.unknown),
+            "nearest_known": self.words.as_ref().map(|words| &words.nearest),
             "frames": self.frames,
             "seconds": self.seconds,
             "kept": self.kept.iter().map(|span| [span.start, span.end]).collect::<Vec<_>>(),

@@ -5,6 +5,7 @@ mod args;
 mod config;
 mod control;
 mod data;
+mod datasets;
 mod doctor;
 mod endpoint_args;
 mod export;
@@ -95,7 +96,7 @@ enum Verb {
         after_help = "Examples:\n  trainer generate \"a person walks in a circle\" --model quickstart@staging -o walk.gif\n  trainer generate \"a person jumps\" -n 4 --seconds 4s --model quickstart@staging -o jump.html -o json"
     )]
     Generate(Box<generate::GenerateArgs>),
-    /// Inspects recordings of motion and writes samples
+    /// Inspects recordings of motion, writes samples and fetches published sets
     #[command(subcommand)]
     Data(data::DataVerb),
     /// Draws the motions of a run's models side by side on one page

@@ -33,22 +33,44 @@ pub(super) async fn vocabulary(reader: &Reader, artifact: Digest) -> Result<Opti
     Ok(is_known.then(|| Vocabulary::of(captions.iter().map(String::as_str))))
 }
 
-/// Prints a note on the words of a sentence that the training data lacks, and returns them.
-pub(super) fn unknown(vocabulary: Option<&Vocabulary>, label: &str, caption: &str) -> Vec<String> {
-    let Some(vocabulary) = vocabulary else { return Vec::new() };
-    let unknown = vocabulary.unknown(caption);
-    if !unknown.is_empty() {
-        print::note(&note(vocabulary, label, caption, &unknown));
-    }
-    unknown
+/// A sentence compared with the training captions.
+#[derive(Debug, Clone)]
+pub(super) struct Compared {
+    /// Words that no training caption has.
+    pub(super) unknown: Vec<String>,
+    /// Training captions nearest to the sentence, if it has unknown words.
+    pub(super) nearest: Vec<String>,
+    /// True if a known word may describe a motion.
+    pub(super) has_known: bool,
 }
 
-fn note(vocabulary: &Vocabulary, label: &str, caption: &str, unknown: &[String]) -> String {
-    let words = unknown.iter().map(|word| format!("`{word}`")).collect::<Vec<_>>().join(", ");
-    let rest =
-        if vocabulary.has_any(caption) { "only the other words have an effect" } else { "the motion is arbitrary" };
-    let nearest = vocabulary.nearest(caption, OFFERED);
-    let offered = nearest.iter().map(|sentence| format!("\"{sentence}\"")).collect::<Vec<_>>().join(", ");
-    let offered = if offered.is_empty() { String::new() } else { format!("; nearest known: {offered}") };
-    format!("note: {words} did not occur in the training of {label}: {rest}{offered}")
+/// Compares a sentence with the training captions, and prints a note on unknown words. `None` without a vocabulary.
+pub(super) fn compare(vocabulary: Option<&Vocabulary>, label: &str, caption: &str) -> Option<Compared> {
+    let vocabulary = vocabulary?;
+    let unknown = vocabulary.unknown(caption);
+    let nearest = if unknown.is_empty() { Vec::new() } else { vocabulary.nearest(caption, OFFERED) };
+    let compared = Compared {
+        unknown,
+        nearest: nearest.into_iter().map(str::to_owned).collect(),
+        has_known: vocabulary.has_any(caption),
+    };
+    if !compared.unknown.is_empty() {
+        print::note(&compared.note(label));
+    }
+    Some(compared)
+}
+
+impl Compared {
+    fn note(&self, label: &str) -> String {
+        let quoted = |texts: &[String], mark: &str| {
+            texts.iter().map(|text| format!("{mark}{text}{mark}")).collect::<Vec<_>>().join(", ")
+        };
+        let words = quoted(&self.unknown, "`");
+        let rest = if self.has_known { "only the other words have an effect" } else { "the motion is arbitrary" };
+        let offered = match quoted(&self.nearest, "\"") {
+            none if none.is_empty() => none,
+            some => format!("; nearest known: {some}"),
+        };
+        format!("note: {words} did not occur in the training of {label}: {rest}{offered}")
+    }
 }

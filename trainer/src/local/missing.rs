@@ -32,6 +32,13 @@ impl Missing {
         format!("{path}: {what}, for `{named}`")
     }
 
+    /// The command that fetches a folder with the name of a published set.
+    pub(crate) fn fetch_command(&self) -> Option<String> {
+        let name = Path::new(&self.path).file_name()?.to_str()?;
+        let known = hub::dataset::KNOWN.iter().find(|known| known.fetched && known.name == name)?;
+        Some(format!("trainer data fetch {} {}", known.name, self.path))
+    }
+
     /// Describes the missing data in one line.
     pub(crate) fn line(&self) -> String {
         format!("{}: {}", self.place(), self.origin)
@@ -136,6 +143,16 @@ mod tests {
         assert!(missing(&pipeline)[1].what.contains("`text_mot_match/model/finest.tar` or"), "{found:#?}");
         std::fs::write(model.join("finest.safetensors"), "x").expect("a file");
         assert_eq!(missing(&pipeline).len(), 2);
+    }
+
+    #[test]
+    fn a_published_set_is_named_with_its_command() {
+        let text = "name: p\nstages:\n  dataset: {kind: data.features, path: none/bandai}\n";
+        let pipeline = pipeline::read("p.yaml", text, &[]).unwrap_or_else(|mistakes| panic!("{mistakes}"));
+        let found = missing(&pipeline);
+        assert_eq!(found[0].fetch_command().as_deref(), Some("trainer data fetch bandai none/bandai"));
+        let pipeline = pipeline::read("p.yaml", &text.replace("bandai", "mine"), &[]).unwrap_or_else(|e| panic!("{e}"));
+        assert_eq!(missing(&pipeline)[0].fetch_command(), None);
     }
 
     #[test]

@@ -113,11 +113,14 @@ pub(crate) fn with_data(mut file: PipelineFile) -> Result<PipelineFile> {
     let missing = missing(&file.pipeline);
     if !missing.is_empty() {
         let lines: Vec<String> = missing.iter().map(|one| format!("\n  {}", one.line())).collect();
-        return Err(Problem::usage(format!("the pipeline needs data that is not on this machine{}", lines.concat()))
-            .hint(
-                "set a folder with, for example, `--set dataset.path=FOLDER`; `trainer plan` shows the rest; `dataset: \
-                 {format: synthetic}` needs no data",
-            ));
+        let problem = Problem::usage(format!("the pipeline needs data that is not on this machine{}", lines.concat()));
+        let hint = match missing.iter().find_map(Missing::fetch_command) {
+            Some(command) => format!("`{command}` fetches it; `trainer plan` shows the rest"),
+            None => "set a folder with, for example, `--set dataset.path=FOLDER`; `trainer plan` shows the rest; \
+                     `dataset: {format: synthetic}` needs no data"
+                .to_owned(),
+        };
+        return Err(problem.hint(hint));
     }
     digest_folders(&mut file.pipeline)?;
     Ok(file)

@@ -122,7 +122,7 @@ impl StageSpec for DataFeatures {
         let map_is_file = self.map_is_file();
         let mut refs = vec![
             Ref::folder("path", &mut self.path)
-                .holding(&[], "use your own recordings, or those of `trainer data sample --format bvh`"),
+                .holding(&[], "use your own recordings, public ones (`trainer data fetch bandai`), or synthetic ones (`trainer data sample --format bvh`)"),
             Ref::folder("captions", &mut self.captions),
             Ref::folder("target", &mut self.target),
         ];
