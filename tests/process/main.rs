@@ -17,6 +17,7 @@ mod failpoints;
 mod files;
 mod hub;
 mod kinds;
+mod launch;
 mod memory;
 mod mocap;
 mod motions;

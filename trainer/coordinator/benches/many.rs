@@ -187,6 +187,7 @@ fn beat(handle: &Handle, stop: &AtomicBool) -> Result<Vec<Duration>> {
         backend: Backend::Ndarray,
         instruction_set: "avx2".into(),
         peer_address: "127.0.0.1:1".into(),
+        labels: Default::default(),
     };
     let joined: Joined = caller.post("/v1/workers", &join)?;
     let poll = Poll { incarnation: joined.incarnation, doing: vec![], ready: vec![], version: u64::MAX };
@@ -334,6 +335,7 @@ fn recorded(handle: &Handle) -> Result<(Assignment, Poll)> {
         backend: Backend::Flex,
         instruction_set: "avx2".into(),
         peer_address: "127.0.0.1:1".into(),
+        labels: Default::default(),
     };
     let joined: Joined = caller.post("/v1/workers", &join)?;
     let poll = Poll { incarnation: joined.incarnation, doing: vec![], ready: vec![], version: 0 };
