@@ -80,7 +80,7 @@ fn the_manifests_of_kubernetes_are_valid_and_a_misspelt_key_is_not() {
     }
 }
 
-/// What `kubectl apply -k` would send, of both folders.
+/// Checks the objects that `kubectl apply -k` would send, for both folders.
 #[test]
 fn kustomize_builds_the_manifests_for_one_namespace() {
     let Some(program) = validator() else { return };

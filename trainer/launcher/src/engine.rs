@@ -1,4 +1,4 @@
-//! What a launcher needs of an engine.
+//! The calls of an engine that a launcher needs, and their errors.
 
 use std::time::Duration;
 

@@ -9,7 +9,7 @@ use std::collections::BTreeMap;
 use std::time::Duration;
 
 use protocol::Labels;
-use protocol::demand::Demand;
+use protocol::demand::{Demand, DemandGroup};
 use protocol::stage::Backend;
 
 use crate::engine::{Job, JobState};
@@ -200,9 +200,14 @@ impl Fleet {
         }
     }
 
-    /// Open slots for workers of this kind, and idle workers of anyone that fit them.
+    /// Open slots for workers of this kind, and idle workers of any launcher that fit them. A slot that needs another
+    /// instruction set than an idle worker of ours is not for this engine's machines.
     fn open_work(&self, demand: &Demand) -> (usize, usize) {
-        let ours = |group: &&protocol::demand::DemandGroup| group.takes(self.plan.backend, &self.plan.labels);
+        let differs = |group: &DemandGroup| {
+            let ours = demand.workers.iter().filter(|worker| worker.idle && self.plan.is_ours(worker.worker.as_str()));
+            ours.filter(|worker| group.takes(worker.backend, &worker.labels)).any(|worker| !group.takes_worker(worker))
+        };
+        let ours = |group: &&DemandGroup| group.takes(self.plan.backend, &self.plan.labels) && !differs(group);
         let ready: u64 = demand.groups.iter().filter(ours).map(|group| group.ready).sum();
         let open = || demand.groups.iter().filter(ours).filter(|group| group.ready > 0);
         let idle = demand.workers.iter().filter(|worker| worker.idle && open().any(|group| group.takes_worker(worker)));

@@ -1,8 +1,8 @@
 //! Kubernetes, through `kubectl`.
 //!
 //! Each worker is an Indexed Job of one pod, made from the Job template of a suspended CronJob. One Job of many pods
-//! would not do: lowering its parallelism ends the pods with the highest indexes, whichever work they have, and an index
-//! that has completed never runs again.
+//! would not do: lowering its parallelism ends the pods with the highest indexes, busy or not, and an index that has
+//! completed never runs again.
 
 use std::time::Duration;
 

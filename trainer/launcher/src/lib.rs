@@ -1,10 +1,10 @@
 //! Starts and ends workers by demand, on the engine that people have: Slurm, Kubernetes, machines with ssh, or this one.
 //!
 //! A launcher is a stateless client of `GET /v1/demand`. The coordinator's lease is the truth: a worker that polls is
-//! alive, whatever the engine reports. The engine's list is a hint, and only shows jobs on their way. A restarted
+//! alive, even if the engine reports its job as lost. The engine's list is a hint, and only shows jobs on their way. A restarted
 //! launcher finds its jobs by the beginning of their names. [`fleet`] decides, and [`follow`] performs it.
 //!
-//! Placement of tasks on workers is the coordinator's work. Restarting a job is no engine's: a new job is submitted.
+//! The coordinator places tasks on workers. No engine restarts a job: the launcher submits a new one.
 
 pub mod cli;
 pub mod command;

@@ -242,7 +242,7 @@ fn a_worker_that_polls_is_alive_whatever_the_engine_reports() {
 fn a_submission_whose_call_hung_is_counted_until_the_engine_has_had_time_to_list_it() {
     let (world, mut fleet) = (World { slots: 1, ..World::new() }, Fleet::new(plan(0, 8)));
     let demand = world.demand();
-    let mut decide = |now: u64, fleet: &mut Fleet| {
+    let decide = |now: u64, fleet: &mut Fleet| {
         fleet.decide(Observation { now: Duration::from_secs(now), stamp: now, demand: &demand, jobs: &[] })
     };
     let first = decide(0, &mut fleet);
@@ -261,4 +261,24 @@ fn a_job_that_pends_without_need_is_withdrawn_after_the_idle_time() {
     world.slots = 1;
     world.run(&mut fleet, IDLE + 5);
     assert_eq!(world.jobs.len(), 1, "one is still wanted");
+}
+
+/// A stage continues on the instruction set of its earlier workers, which the machines of this engine lack.
+#[test]
+fn no_more_workers_come_for_a_slot_that_those_of_this_engine_do_not_fit() {
+    let (mut world, mut fleet) = (World::new(), Fleet::new(plan(0, 8)));
+    let mut submitted = 0;
+    for now in 1..=IDLE {
+        world.advance();
+        let (mut demand, jobs) = (world.demand(), world.listed());
+        demand.groups[0].ready = 1;
+        demand.groups[0].instruction_set = Some("avx512".into());
+        let now = Duration::from_secs(now);
+        for action in fleet.decide(Observation { now, stamp: 1, demand: &demand, jobs: &jobs }) {
+            let Action::Submit { worker } = action else { panic!("{action:?}") };
+            world.jobs.insert(worker, Simulated::default());
+            submitted += 1;
+        }
+    }
+    assert_eq!(submitted, 1);
 }

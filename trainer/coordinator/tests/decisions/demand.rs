@@ -49,7 +49,8 @@ fn work_goes_to_workers_with_its_labels_and_demand_counts_the_others() {
     assert_eq!(groups(&coordinator), [group("", 1, 1, 0, 500)], "the dataset, which the training waits for");
 
     coordinator.join("a");
-    assert_eq!(groups(&coordinator), [group("", 0, 1, 0, 0)], "one worker is at work");
+    let bound = |group: DemandGroup| DemandGroup { instruction_set: Some("avx2".into()), ..group };
+    assert_eq!(groups(&coordinator), [bound(group("", 0, 1, 0, 0))], "one worker is at work");
     finish(&mut coordinator, "a");
     coordinator.now += 2_000;
     assert_eq!(groups(&coordinator), [group("gpu=h100", 3, 3, 0, 2_000)], "a worker without the label does not fit");
@@ -62,8 +63,7 @@ fn work_goes_to_workers_with_its_labels_and_demand_counts_the_others() {
 
     coordinator.join_labelled("b", "avx2", "gpu=h100,zone=x");
     assert!(coordinator.assignment("b").is_some());
-    let at_work = DemandGroup { instruction_set: Some("avx2".into()), ..group("gpu=h100", 2, 3, 0, 0) };
-    assert_eq!(groups(&coordinator), [at_work]);
+    assert_eq!(groups(&coordinator), [bound(group("gpu=h100", 2, 3, 0, 0))]);
 }
 
 #[test]
