@@ -2,6 +2,7 @@
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
 
 /// A Slurm below a folder of its own. It ends with this value.
 #[derive(Debug)]
@@ -57,6 +58,15 @@ impl Slurm {
         self.dir.path().join("slurm.conf")
     }
 
+    /// Entries of the running daemons in `/proc`.
+    fn daemons(&self) -> Vec<PathBuf> {
+        let dir = self.dir.path();
+        let files = std::fs::read_dir(dir).into_iter().flatten().flatten().map(|entry| entry.path());
+        let files = files.filter(|path| path.extension().is_some_and(|end| end == "pid"));
+        let numbers = files.chain([dir.join("munge/pid")]).filter_map(|file| std::fs::read_to_string(file).ok());
+        numbers.map(|number| Path::new("/proc").join(number.trim())).collect()
+    }
+
     fn script(&self, name: &str) -> Command {
         let mut command = Command::new("bash");
         command.arg(self.scripts.join(name)).env("D", self.dir.path()).env_remove("SLURM_CONF").stdin(Stdio::null());
@@ -66,7 +76,12 @@ impl Slurm {
 
 impl Drop for Slurm {
     fn drop(&mut self) {
-        // The folder goes next; daemons that still run then end by themselves.
+        // The daemons need the folder until they have ended.
+        let daemons = self.daemons();
         let _ = self.script("slurm-down.sh").status();
+        let begun = Instant::now();
+        while daemons.iter().any(|process| process.exists()) && begun.elapsed() < Duration::from_secs(20) {
+            std::thread::sleep(Duration::from_millis(50));
+        }
     }
 }

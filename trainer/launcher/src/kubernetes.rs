@@ -62,7 +62,8 @@ impl Kubernetes {
         let spec = &mut job["spec"];
         (spec["completions"], spec["parallelism"]) = (1.into(), 1.into());
         spec["template"]["metadata"]["labels"][LABEL] = self.name.as_str().into();
-        let arguments = spec["template"]["spec"]["containers"][0]["args"].as_array_mut().ok_or_else(|| {
+        let arguments = spec.pointer_mut("/template/spec/containers/0/args").and_then(Value::as_array_mut);
+        let arguments = arguments.ok_or_else(|| {
             let why = format!("the first container of CronJob `{}` has no `args`", self.template);
             EngineError::Refused { program: "kubectl".to_owned(), said: why }
         })?;
