@@ -155,7 +155,7 @@ impl Site {
     }
 
     /// Runs each command of the section: the launcher works on a run, its worker leaves, and a second one is stopped.
-    fn check(mut self) {
+    fn check(self) {
         let lines = self.lines();
         let (mut launched, mut ran) = (None, 0);
         let dir = self.bench.path().to_owned();
@@ -184,7 +184,7 @@ impl Site {
                 let said = self.said(line);
                 assert!(said.contains("OLDEST WAIT") && said.contains("STATE"), "{said}");
             } else if line.contains("launch stop") {
-                let mut launcher: Running = launched.take().expect("a launcher");
+                let launcher: Running = launched.take().expect("a launcher");
                 launcher.signal(Signal::SIGTERM);
                 launcher.wait();
                 self.said(line);
