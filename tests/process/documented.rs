@@ -14,7 +14,7 @@ const TRAINER: &str = env!("CARGO_BIN_EXE_trainer");
 
 /// Creates a folder with `trainer` and `registry`. If `registry` is not built beside the trainer, it runs the
 /// equivalent `trainer registry`.
-fn programs(dir: &Path) -> PathBuf {
+pub(crate) fn programs(dir: &Path) -> PathBuf {
     let bin = dir.join("bin");
     fs::create_dir_all(&bin).expect("a folder");
     let registry = Path::new(TRAINER).with_file_name("registry");
@@ -29,7 +29,7 @@ fn programs(dir: &Path) -> PathBuf {
     bin
 }
 
-fn free_port() -> String {
+pub(crate) fn free_port() -> String {
     let listener = TcpListener::bind("127.0.0.1:0").expect("a free port");
     listener.local_addr().expect("bound").port().to_string()
 }
@@ -45,7 +45,7 @@ fn cluster(port: &str) -> Vec<String> {
     lines.into_iter().map(here).collect()
 }
 
-fn bash(dir: &Path, preamble: &str, line: &str) -> Command {
+pub(crate) fn bash(dir: &Path, preamble: &str, line: &str) -> Command {
     let mut command = Command::new("bash");
     let path = format!("{}:{}", dir.join("bin").display(), std::env::var("PATH").unwrap_or_default());
     command.args(["-euc", &format!("{preamble}\n{line}")]).current_dir(dir).env("PATH", path).stdin(Stdio::null());

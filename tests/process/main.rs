@@ -18,6 +18,7 @@ mod failpoints;
 mod files;
 mod hub;
 mod kinds;
+mod launch;
 mod memory;
 mod mocap;
 mod motions;

@@ -73,6 +73,7 @@ fn dependencies_point_one_way() {
     never("checkpoint", &["burn", "tokio", "sqlx", "axum", "registry", "stages", "pipeline"]);
     never("registry", &["burn", "coordinator", "stages", "models", "worker"]);
     never("coordinator", &["burn", "stages", "models", "worker"]);
+    never("launcher", &["burn", "stages", "models", "worker", "registry", "coordinator", "sqlx", "axum"]);
     never("page", &["burn", "tokio", "sqlx", "axum", "hyper", "registry", "coordinator", "access"]);
     never("webhooks", &["burn", "axum", "coordinator", "stages", "worker"]);
     never("motion", &["burn", "tokio", "sqlx", "axum", "registry", "checkpoint"]);

@@ -5,8 +5,8 @@ use std::time::Duration;
 
 use access::ConnectionOptions;
 use clap::builder::{OsStringValueParser, TypedValueParser as _};
-use protocol::WorkerId;
 use protocol::stage::Backend;
+use protocol::{Labels, WorkerId};
 
 use crate::{Files, JoinError, Options, StageLimits};
 
@@ -21,6 +21,9 @@ pub struct JoinArgs {
     /// The worker's name, unique among live workers [default: host and process id]
     #[arg(long)]
     pub name: Option<String>,
+    /// Label that stages may require, such as `gpu=h100`; may be given several times
+    #[arg(long = "label", value_name = "KEY=VALUE", env = "STRIDE_LABELS", value_delimiter = ',', value_parser = label)]
+    pub labels: Vec<String>,
     /// Computing backend: flex, ndarray, wgpu or cuda
     #[arg(long, default_value = "flex", value_parser = backend)]
     pub backend: Backend,
@@ -83,6 +86,7 @@ impl TryFrom<JoinArgs> for Options {
         Ok(Self {
             server,
             name: args.name.map(WorkerId::new),
+            labels: args.labels.into_iter().filter(|label| !label.is_empty()).collect(),
             backend: args.backend,
             device: args.device,
             cache: args.cache,
@@ -101,6 +105,10 @@ impl TryFrom<JoinArgs> for Options {
             leave_within: Duration::from_secs(args.leave_within),
         })
     }
+}
+
+fn label(text: &str) -> Result<String, String> {
+    text.parse::<Labels>().map(|label| label.to_string()).map_err(|error| error.to_string())
 }
 
 fn backend(text: &str) -> Result<Backend, String> {

@@ -8,9 +8,9 @@ use std::time::Duration;
 
 use access::Server;
 use burn::tensor::Device;
-use protocol::WorkerId;
 use protocol::message::{Join, PROTOCOL_VERSION};
 use protocol::stage::Backend;
+use protocol::{Labels, WorkerId};
 use stages::external::{DataAccess, open_roots};
 use tokio::runtime;
 use tokio::signal::unix::{SignalKind, signal};
@@ -55,6 +55,8 @@ pub struct Options {
     pub server: Server,
     /// The worker's name, unique among live workers. `None`: host and process id.
     pub name: Option<WorkerId>,
+    /// Labels that stages may require.
+    pub labels: Labels,
     pub backend: Backend,
     /// Number of the device of that backend.
     pub device: usize,
@@ -205,6 +207,7 @@ fn work(options: Options, device: Device, kinds: Arc<dyn Kinds>, timing: Timing)
         backend: options.backend,
         instruction_set: models::instruction_set().to_owned(),
         peer_address: advertised.unwrap_or_else(|| endpoint.address().to_string()),
+        labels: options.labels.clone(),
     };
     let end = runtime.block_on(assignments::follow(&client, &offer, &shared));
     shared.end("this worker leaves");

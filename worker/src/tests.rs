@@ -107,6 +107,7 @@ impl Worker {
             backend: Backend::Flex,
             instruction_set: "avx2".into(),
             peer_address,
+            labels: Default::default(),
         };
         let poll = {
             let (shared, handle) = (shared.clone(), server.handle().clone());

@@ -14,12 +14,14 @@ pub enum Scope {
     Worker,
     /// Moving aliases, by a command or by a pipeline.
     Promote,
+    /// Seeing how many workers are wanted, to start them.
+    Launch,
     /// Operations on everyone's data, such as garbage collection and verification; includes all other scopes.
     Admin,
 }
 
 impl Scope {
-    pub const ALL: [Self; 5] = [Self::Read, Self::Submit, Self::Worker, Self::Promote, Self::Admin];
+    pub const ALL: [Self; 6] = [Self::Read, Self::Submit, Self::Worker, Self::Promote, Self::Launch, Self::Admin];
 
     /// The word for it in a token file.
     pub fn name(self) -> &'static str {
@@ -28,6 +30,7 @@ impl Scope {
             Self::Submit => "submit",
             Self::Worker => "worker",
             Self::Promote => "promote",
+            Self::Launch => "launch",
             Self::Admin => "admin",
         }
     }
@@ -56,7 +59,7 @@ impl Scopes {
     pub fn of(scopes: &[Scope]) -> Self {
         let one = |scope: Scope| match scope {
             Scope::Read => scope.bit() | READ_ALL,
-            Scope::Worker => scope.bit(),
+            Scope::Worker | Scope::Launch => scope.bit(),
             Scope::Submit | Scope::Promote => scope.bit() | Scope::Read.bit(),
             Scope::Admin => Scope::ALL.iter().fold(READ_ALL, |all, scope| all | scope.bit()),
         };
@@ -109,10 +112,11 @@ mod tests {
         let allowed = |text: &str| text.parse::<Scopes>().map(|scopes| scopes.to_string());
         assert_eq!(allowed("read").as_deref(), Ok("read"));
         assert_eq!(allowed("worker").as_deref(), Ok("worker"));
+        assert_eq!(allowed("launch").as_deref(), Ok("launch"));
         assert_eq!(allowed("submit").as_deref(), Ok("read,submit"));
         assert_eq!(allowed("promote").as_deref(), Ok("read,promote"));
         assert_eq!(allowed("worker,submit").as_deref(), Ok("read,submit,worker"));
-        assert_eq!(allowed("admin").as_deref(), Ok("read,submit,worker,promote,admin"));
+        assert_eq!(allowed("admin").as_deref(), Ok("read,submit,worker,promote,launch,admin"));
         let read_all = |text: &str| text.parse::<Scopes>().map(Scopes::read_all);
         assert_eq!(
             ["read", "submit", "promote", "worker", "submit,read", "admin"].map(|text| read_all(text) == Ok(true)),

@@ -196,6 +196,7 @@ fn beat(server: &Restarted, stop: &AtomicBool) -> Result<Vec<Duration>> {
         backend: Backend::Ndarray,
         instruction_set: "avx2".into(),
         peer_address: "127.0.0.1:1".into(),
+        labels: Default::default(),
     };
     let joined: Joined = caller.post("/v1/workers", &join)?;
     let poll = Poll { incarnation: joined.incarnation, doing: vec![], ready: vec![], version: u64::MAX };
@@ -343,6 +344,7 @@ fn recorded(server: &Restarted) -> Result<(Assignment, Poll)> {
         backend: Backend::Flex,
         instruction_set: "avx2".into(),
         peer_address: "127.0.0.1:1".into(),
+        labels: Default::default(),
     };
     let joined: Joined = caller.post("/v1/workers", &join)?;
     let poll = Poll { incarnation: joined.incarnation, doing: vec![], ready: vec![], version: 0 };

@@ -83,6 +83,9 @@ pub enum Fact {
         wall_ms: u64,
         /// Start of the current period of work, if a worker is busy with it.
         busy_since: Option<Millis>,
+        /// Start of the current period without work.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        idle_since: Option<Millis>,
     },
     /// The execution continues from data that an earlier try saved.
     ExecutionResumed { key: Digest },

@@ -9,6 +9,7 @@
 
 pub mod batch;
 pub mod decide;
+mod demand;
 pub mod event;
 pub mod fact;
 pub mod failpoints;

@@ -9,7 +9,7 @@ use protocol::message::{
 };
 use protocol::stage::{Backend, Shape};
 use protocol::units::grouped;
-use protocol::{Digest, Generation, Incarnation, StageName, TaskId, WorkerId, canonical};
+use protocol::{Digest, Generation, Incarnation, Labels, StageName, TaskId, WorkerId, canonical};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -38,6 +38,9 @@ pub struct WorkerView {
     pub state: String,
     /// The task that it holds.
     pub task: Option<TaskId>,
+    /// Labels that stages may require.
+    #[serde(default, skip_serializing_if = "Labels::is_empty")]
+    pub labels: Labels,
 }
 
 impl State {
@@ -60,6 +63,7 @@ impl State {
                 instruction_set: worker.instruction_set.clone(),
                 state: state.to_owned(),
                 task,
+                labels: worker.labels.clone(),
             }
         };
         self.workers.iter().map(view).collect()
@@ -248,8 +252,10 @@ impl State {
                     .bound_to()
                     .map(|set| format!(" with {set}, like the earlier workers"))
                     .unwrap_or_default();
+                let requires = &execution.placement.requires;
+                let labels = if requires.is_empty() { String::new() } else { format!(" labelled `{requires}`") };
                 let backend = execution.backend.name();
-                (StageState::Ready, Some(format!("waits for {min} idle `{backend}` {workers}{set}")))
+                (StageState::Ready, Some(format!("waits for {min} idle `{backend}` {workers}{labels}{set}")))
             }
             ExecutionState::Done { .. } | ExecutionState::Failed { .. } => (StageState::Running, None),
         }

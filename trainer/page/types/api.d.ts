@@ -28,7 +28,7 @@ interface RunRow {
   created_ms: number; changed_ms: number; done: number; stages: number; wall_s: number; wants_workers?: number; note?: string;
 }
 interface RunList { items: RunRow[]; next?: string }
-interface WorkerRow { worker: string; incarnation: number; pid: number; backend: string; instruction_set: string; state: string; task: string | null }
+interface WorkerRow { worker: string; incarnation: number; pid: number; backend: string; instruction_set: string; state: string; task: string | null; labels?: string[] }
 interface LogLine { id: number; task: string; attempt: number; worker: string; line: number; at_ms: number; text: string }
 interface Curve { total: number; x: number[]; mean: (number | null)[]; min?: (number | null)[]; max?: (number | null)[]; count?: number[]; nan?: number[]; key?: string }
 interface Who { name: string; project?: string; scopes: string[]; until_ms?: number; now_ms: number; store: string; version: string }

@@ -134,7 +134,11 @@ fn path(pointer: &str) -> String {
 fn range(stage: &Value, pointer: &str) -> Range {
     let keys: Vec<&str> = pointer.trim_start_matches('/').split('/').collect();
     let kind = stage["kind"].as_str().unwrap();
-    let top = if ["workers", "checkpoint"].contains(&keys[0]) { Place::of_placement() } else { Place::of_kind(kind) };
+    let top = if ["workers", "requires", "checkpoint"].contains(&keys[0]) {
+        Place::of_placement()
+    } else {
+        Place::of_kind(kind)
+    };
     let step =
         |place: Place<'static>, key: &&str| if key.parse::<usize>().is_ok() { place.entry() } else { place.key(key) };
     let place = keys.iter().fold(top, step);
@@ -145,10 +149,10 @@ fn range(stage: &Value, pointer: &str) -> Range {
 
 /// Each stage as JSON as in the file, placement included.
 fn written() -> Vec<(String, Value)> {
-    let placement = serde_json::to_value(Placement::default()).unwrap();
+    let placement = Placement::example();
     let stages = stages().into_iter().map(|(name, settings)| {
         let mut value = serde_json::to_value(&settings).unwrap();
-        for key in ["workers", "checkpoint"] {
+        for key in ["workers", "requires", "checkpoint"] {
             value[key] = placement[key].clone();
         }
         (name, value)

@@ -343,13 +343,13 @@ impl Reader {
                 node.map()
                     .unwrap_or(&[])
                     .iter()
-                    .filter(|e| matches!(&*e.key, "workers" | "checkpoint"))
+                    .filter(|e| matches!(&*e.key, "workers" | "requires" | "checkpoint"))
                     .cloned()
                     .collect(),
             ),
         };
-        let placement = self.typed::<Placement>(&placed, &owner, &path, &[]);
-        let skip = ["workers", "checkpoint", "sweep"];
+        let placement = self.overlaid::<Placement>(Placement::example(), &placed, &owner, &path, &[]);
+        let skip = ["workers", "requires", "checkpoint", "sweep"];
         let sweep = match node.entry("sweep") {
             Some(entry) => self.sweep(entry, name, &default).map(Some),
             None => Some(None),

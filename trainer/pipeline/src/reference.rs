@@ -8,6 +8,7 @@ use std::collections::BTreeMap;
 use std::fmt::Write as _;
 
 use protocol::stage::{DataOpen, DataSynthetic, ImportModel, Placement, Shape, StageSettings, Target, TextEmbed};
+use schemars::JsonSchema as _;
 use serde_json::{Map, Value, json};
 
 use crate::described::{described, described_as, generator};
@@ -58,10 +59,14 @@ pub fn json_schema() -> Value {
     top
 }
 
+fn schema_of_placement() -> Value {
+    Placement::json_schema(&mut generator()).to_value()
+}
+
 /// Schema of a stage of this kind.
 fn stage(settings: &StageSettings) -> Value {
     let mut schema = described_kind(settings);
-    let placement = described(&Placement::default());
+    let placement = described_as(schema_of_placement(), &Placement::example());
     let properties = &mut schema["properties"];
     properties["kind"] = json!({"const": settings.kind()});
     for (key, value) in placement["properties"].as_object().into_iter().flatten() {
@@ -119,7 +124,7 @@ pub fn markdown() -> String {
     for settings in &all {
         let _ = writeln!(text, "- [`{0}`](#{1})", settings.kind(), settings.kind().replace('.', ""));
     }
-    let placement = described(&Placement::default());
+    let placement = described_as(schema_of_placement(), &Placement::example());
     let _ = writeln!(text, "\n## Every stage\n\n{}\n", sentence(&placement));
     table(&mut text, &placement);
     let _ = writeln!(text, "\nA training stage may have a hyperparameter search, `sweep`:\n");

@@ -6,8 +6,10 @@
 pub mod artifact;
 mod bounded;
 pub mod canonical;
+pub mod demand;
 pub mod digest;
 pub mod id;
+pub mod labels;
 pub mod limits;
 pub mod message;
 pub mod model_ref;
@@ -22,6 +24,7 @@ pub mod units;
 pub use artifact::{ArtifactKind, FileEntry, Manifest};
 pub use digest::Digest;
 pub use id::{Alias, Attempt, Fence, Generation, Incarnation, ModelName, RunId, Seed, StageName, TaskId, WorkerId};
+pub use labels::Labels;
 pub use model_ref::{ModelRef, Pick};
 pub use owner::{Group, Owner};
 pub use printable::{excerpt, excerpts, json_mistake, printable, show_excerpts};

@@ -16,7 +16,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::stage::{Backend, CheckpointPolicy, Mode, StageSettings};
 use crate::sweep::{SearchKind, Values};
-use crate::{Attempt, Digest, Fence, Generation, Incarnation, Owner, RunId, Seed, StageName, TaskId, WorkerId};
+use crate::{Attempt, Digest, Fence, Generation, Incarnation, Labels, Owner, RunId, Seed, StageName, TaskId, WorkerId};
 
 /// Version of these messages; a worker with another version is refused.
 pub const PROTOCOL_VERSION: u32 = 6;
@@ -38,6 +38,9 @@ pub struct Join {
     pub instruction_set: String,
     /// Address of its collective listener for peers, `host:port`.
     pub peer_address: String,
+    /// Labels that stages may require.
+    #[serde(default, skip_serializing_if = "Labels::is_empty")]
+    pub labels: Labels,
 }
 
 /// The answer to [`Join`].

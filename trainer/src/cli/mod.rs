@@ -13,6 +13,7 @@ mod gallery;
 mod generate;
 mod import;
 mod keep;
+mod launch;
 mod metrics;
 mod model;
 mod out;
@@ -128,6 +129,9 @@ enum Verb {
     /// Prints the JSON Schema of pipelines, for editors
     #[command(after_help = "Example:\n  trainer schema --markdown")]
     Schema(config::SchemaArgs),
+    /// Starts and ends workers by demand: on Slurm, Kubernetes, by ssh, or on this machine
+    #[command(subcommand)]
+    Launch(Box<launcher::cli::LaunchVerb>),
     /// Runs and lists workers
     #[command(subcommand)]
     Worker(WorkerVerb),
@@ -242,7 +246,11 @@ pub(crate) fn main() -> ExitCode {
             }
         };
     }
-    init_logging();
+    match cli.verb {
+        // It reports each job that it starts.
+        Verb::Launch(_) => worker::init_logging(),
+        _ => init_logging(),
+    }
     // A server's messages have many readers; those of other commands only their own user.
     if !matches!(cli.verb, Verb::Serve(_)) {
         protocol::show_excerpts();
@@ -325,6 +333,7 @@ impl Verb {
             Self::Serve(_)
             | Self::Completions(_)
             | Self::Man(_)
+            | Self::Launch(_)
             | Self::Config(_)
             | Self::Schema(_)
             | Self::Worker(WorkerVerb::Join(_))
@@ -358,6 +367,7 @@ async fn perform(verb: Verb) -> Result<u8> {
         Verb::Man(args) => shell::man(&args, Cli::command()),
         Verb::Config(verb) => config::config(&verb),
         Verb::Schema(args) => Ok(config::schema(&args)),
+        Verb::Launch(verb) => launch::launch(*verb).await,
         Verb::Worker(WorkerVerb::List(args)) => remote::workers(args).await,
         Verb::Worker(WorkerVerb::Join(_)) => Ok(0),
         Verb::Registry(args) => Ok(registry::cli::execute(args.verb, &args.store, &args.server, args.output).await),

@@ -19,7 +19,7 @@ use crate::report::problem::{Problem, Result};
 
 const TOKENS: &str = "\
 A token file has one line `NAME SCOPES TOKEN` per caller, such as `alice submit,promote` and the output of
-`openssl rand -hex 32`. Scopes: read, submit, worker, promote, admin. After the token, a line may have
+`openssl rand -hex 32`. Scopes: read, submit, worker, promote, launch, admin. After the token, a line may have
 `workers=nodes-*`, `project=NAME` and `expires=2026-12-31`. With a line `protect ALIAS=NAME,NAME`, only these callers
 may move the alias. On SIGHUP, the server reads the file again. A single token, in a file or as --token, has all
 scopes. Without a token, the server creates one for this user at every start, in the store's folder. Other machines

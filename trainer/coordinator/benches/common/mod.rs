@@ -113,6 +113,7 @@ impl Worker {
             backend: Backend::Flex,
             instruction_set: "avx2".into(),
             peer_address: "127.0.0.1:1".into(),
+            labels: Default::default(),
         };
         let joined: Joined = connection.post("/v1/workers", SECRET, &join).await?;
         Ok(Self {

@@ -81,7 +81,8 @@ impl Deciding<'_> {
         if let Some(instruction_set) = archived.instruction_set.clone() {
             self.record(Fact::ExecutionInstructions { key, instruction_set });
         }
-        self.record(Fact::ExecutionTime { key, wall_ms: archived.wall_ms, busy_since: None });
+        let idle_since = Some(self.now());
+        self.record(Fact::ExecutionTime { key, wall_ms: archived.wall_ms, busy_since: None, idle_since });
         if archived.resumed || archived.has_something() {
             self.resumed(key);
         }

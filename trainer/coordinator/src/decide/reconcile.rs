@@ -151,6 +151,7 @@ impl Deciding<'_> {
                     tasks: Tasks::default(),
                     wall_ms: 0,
                     busy_since: None,
+                    idle_since: Some(self.now()),
                     resumed: false,
                     instruction_set: None,
                     users: Set::default(),
@@ -211,11 +212,15 @@ impl Deciding<'_> {
 
     fn count_time_of(&mut self, key: Digest, now: Millis) {
         let Some(execution) = self.state.executions.get(&key) else { return };
-        let (wall_ms, busy_since) = match (execution.is_busy(), execution.busy_since) {
-            (true, None) => (execution.wall_ms, Some(now)),
-            (false, Some(since)) => (execution.wall_ms + now.since(since), None),
+        let wall_ms = execution.wall_ms;
+        let time = match (execution.is_busy(), execution.busy_since) {
+            (true, None) => Fact::ExecutionTime { key, wall_ms, busy_since: Some(now), idle_since: None },
+            (false, Some(since)) => {
+                let wall_ms = wall_ms + now.since(since);
+                Fact::ExecutionTime { key, wall_ms, busy_since: None, idle_since: Some(now) }
+            }
             (true, Some(_)) | (false, None) => return,
         };
-        self.record(Fact::ExecutionTime { key, wall_ms, busy_since });
+        self.record(time);
     }
 }

@@ -22,7 +22,7 @@ impl Deciding<'_> {
             // Time without a running coordinator does not count as work.
             if let Some(since) = execution.busy_since {
                 let wall_ms = execution.wall_ms + before.since(since);
-                self.record(Fact::ExecutionTime { key, wall_ms, busy_since: None });
+                self.record(Fact::ExecutionTime { key, wall_ms, busy_since: None, idle_since: Some(now) });
             }
             // Workers that are still busy continue undisturbed.
             if execution.state == ExecutionState::Open && execution.has_something() && (alone || !execution.is_busy()) {

@@ -18,6 +18,7 @@ impl Deciding<'_> {
         if !protocol::id::is_name(join.worker.as_str()) {
             return Err(Rejected::Invalid(format!("`{}` is not a worker name", join.worker)));
         }
+        join.labels.check().map_err(|error| Rejected::Invalid(error.to_string()))?;
         if let Some(known) = self.state.workers.get(&join.worker) {
             known.gives_way_to(&join.worker, &by)?;
         }

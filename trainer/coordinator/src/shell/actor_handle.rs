@@ -16,6 +16,7 @@ use tokio::task::JoinHandle;
 use super::allowances::Allowances;
 use super::blocking::blocking;
 use super::clock::{Clock, wall_clock, wall_ms};
+use super::demand::Launchers;
 use super::meters::Meters;
 use super::records::{Records, read};
 use super::secrets::Secrets;
@@ -65,6 +66,7 @@ pub(crate) struct ActorHandle {
     pub(crate) reach: Arc<Reach>,
     pub(crate) meters: Meters,
     pub(crate) streams: Streams,
+    pub(crate) launchers: Launchers,
 }
 
 impl ActorHandle {
@@ -99,6 +101,7 @@ impl ActorHandle {
             reach: Arc::default(),
             meters: Meters::default(),
             streams: Streams::default(),
+            launchers: Launchers::default(),
         };
         (handle, queue)
     }

@@ -3,7 +3,7 @@
 use std::sync::{Arc, LazyLock};
 use std::time::Duration;
 
-use access::Scope::{self, Admin, Promote, Read, Submit, Worker};
+use access::Scope::{self, Admin, Launch, Promote, Read, Submit, Worker};
 use axum::extract::{DefaultBodyLimit, Request, State};
 use axum::handler::Handler;
 use axum::http::{Method, StatusCode};
@@ -11,6 +11,7 @@ use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 use axum::routing::{MethodFilter, MethodRouter, get, on};
 use axum::{Json, Router, middleware};
+use protocol::demand::Demand;
 use protocol::limits;
 use protocol::message::{
     self, CommitCheckpoint, DesiredAssignments, Gone, Join, Joined, Listing, LogBatch, MetricBatch, Poll,
@@ -25,6 +26,7 @@ use super::audit;
 use super::auth::{self, Gate};
 use super::bundles::BundleQuery;
 use super::curves::{Curves, CurvesAsked};
+use super::demand::{self, DemandQuery};
 use super::described::{Bytes, Described, EventStream, Nothing, OpenMetrics, Packed, described};
 use super::events::EventsQuery;
 use super::extract::Query;
@@ -107,6 +109,8 @@ fn table() -> Vec<Entry> {
             described::<Nothing, Nothing, Json<BlobStored>>("Tells how much of a blob has arrived").with(UPLOAD)),
         entry("GET",  "/v1/blobs/{digest}",        &[Read, Worker], CALL,                     LONG,  uploads::get_blob,
             described::<Nothing, Nothing, Bytes>("Downloads a blob, or its rest").with(DOWNLOAD)),
+        entry("GET",  "/v1/demand",                &[Launch],       CALL,                     SHORT, demand::demand,
+            described::<Query<DemandQuery>, Nothing, Json<Demand>>("Shows the demand for workers, or waits for a change of it")),
         entry("POST", "/v1/runs",                  &[Submit],       limits::SUBMISSION_BYTES, SHORT, queries::submit,
             described::<Nothing, Json<message::Submit>, Json<Submitted>>("Submits a pipeline").with(SUBMISSION)),
         entry("GET",  "/metrics",                  &[Read],         CALL,                     SHORT, scrape::metrics,

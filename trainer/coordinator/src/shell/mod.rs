@@ -14,6 +14,7 @@ mod body;
 mod bundles;
 mod clock;
 mod curves;
+mod demand;
 mod described;
 mod effects;
 mod events;

@@ -183,9 +183,10 @@ impl State {
                 let execution = self.execution_mut(*key)?;
                 (execution.run, execution.stage) = (run.clone(), stage.clone());
             }
-            Fact::ExecutionTime { key, wall_ms, busy_since } => {
+            Fact::ExecutionTime { key, wall_ms, busy_since, idle_since } => {
                 let execution = self.execution_mut(*key)?;
                 (execution.wall_ms, execution.busy_since) = (*wall_ms, *busy_since);
+                execution.idle_since = *idle_since;
             }
             Fact::ExecutionInstructions { key, instruction_set } => {
                 self.execution_mut(*key)?.instruction_set = Some(instruction_set.clone());

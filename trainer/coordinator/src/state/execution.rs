@@ -92,6 +92,9 @@ pub struct StageExecution {
     pub wall_ms: u64,
     /// The start of the current period in which a task is held.
     pub busy_since: Option<Millis>,
+    /// The start of the current period in which no task is held.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub idle_since: Option<Millis>,
     /// Set if it continued from data of an earlier try.
     pub resumed: bool,
     /// The instruction set of the last workers.
@@ -156,7 +159,9 @@ impl StageExecution {
 
     /// Returns true if a worker may work on it.
     pub fn takes(&self, worker: &Worker) -> bool {
-        worker.backend == self.backend && self.bound_to().is_none_or(|set| worker.instruction_set == set)
+        worker.backend == self.backend
+            && worker.labels.have(&self.placement.requires)
+            && self.bound_to().is_none_or(|set| worker.instruction_set == set)
     }
 
     /// The shards' artifacts in order, once all are done.

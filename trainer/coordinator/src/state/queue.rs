@@ -5,8 +5,8 @@
 //! execution. A decision finds grantable work here without inspecting the executions that wait. Invariant C14 checks
 //! the index.
 
-use protocol::Digest;
 use protocol::stage::Backend;
+use protocol::{Digest, Labels};
 
 use super::execution::StageExecution;
 use super::gang;
@@ -36,13 +36,17 @@ pub struct Need {
     pub backend: Backend,
     /// The instruction set that the execution requires.
     pub instruction_set: Option<String>,
+    /// The labels that each worker must have.
+    pub requires: Labels,
 }
 
 impl Need {
     /// Returns true if a worker fits.
     pub fn takes(&self, worker: &Worker) -> bool {
         let set = self.instruction_set.as_ref();
-        worker.backend == self.backend && set.is_none_or(|set| worker.instruction_set == *set)
+        worker.backend == self.backend
+            && worker.labels.have(&self.requires)
+            && set.is_none_or(|set| worker.instruction_set == *set)
     }
 }
 

@@ -103,5 +103,6 @@ fn need(execution: &StageExecution) -> Option<Need> {
         gang,
         backend: execution.backend,
         instruction_set: execution.bound_to().map(str::to_owned),
+        requires: execution.placement.requires.clone(),
     })
 }

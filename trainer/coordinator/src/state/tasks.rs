@@ -126,6 +126,13 @@ impl Tasks {
         (self.all[first].part != Part::Merge || self.open() == 1).then_some(first)
     }
 
+    /// Number of tasks that wait without a back-off and can be done now.
+    pub fn ready(&self) -> usize {
+        let is_merge = |i: &usize| self.all[*i].part == Part::Merge;
+        let waiting_merge = self.open() > 1 && self.index.free.last().is_some_and(is_merge);
+        self.index.free.size() - usize::from(waiting_merge)
+    }
+
     /// The end of the first back-off or grace period.
     pub fn first_deadline(&self) -> Option<Millis> {
         self.index.deadlines.first().map(|(time, _)| *time)

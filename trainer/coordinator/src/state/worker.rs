@@ -18,7 +18,7 @@ use std::collections::BTreeSet;
 
 use protocol::message::{Join, Member};
 use protocol::stage::Backend;
-use protocol::{Digest, Incarnation, TaskId, WorkerId};
+use protocol::{Digest, Incarnation, Labels, TaskId, WorkerId};
 
 use serde::{Deserialize, Serialize};
 
@@ -106,6 +106,9 @@ pub struct Worker {
     pub instruction_set: String,
     /// The address at which peers reach it.
     pub peer_address: String,
+    /// Labels that stages may require.
+    #[serde(default, skip_serializing_if = "Labels::is_empty")]
+    pub labels: Labels,
     pub presence: Presence,
     /// Number of times that this process was removed from a gang, or was the only one to complain of a removed member.
     /// Each time it is shunned for longer. The number decreases with time.
@@ -134,6 +137,7 @@ impl Worker {
             backend: join.backend,
             instruction_set: join.instruction_set.clone(),
             peer_address: join.peer_address.clone(),
+            labels: join.labels.clone(),
             presence: Presence::Here,
             suspicions: 0,
             suspected: None,

@@ -110,6 +110,10 @@ impl PureCoordinator {
     }
 
     pub(crate) fn join_with(&mut self, name: &str, instruction_set: &str) -> Incarnation {
+        self.join_labelled(name, instruction_set, "")
+    }
+
+    pub(crate) fn join_labelled(&mut self, name: &str, instruction_set: &str, labels: &str) -> Incarnation {
         let join = Join {
             protocol: PROTOCOL_VERSION,
             worker: name.into(),
@@ -117,6 +121,7 @@ impl PureCoordinator {
             backend: Backend::Flex,
             instruction_set: instruction_set.into(),
             peer_address: format!("{name}:1"),
+            labels: labels.parse().expect("labels"),
         };
         // Always the same process, with the same secret.
         let by = Identity { caller: "t".into(), secret: Digest::of(name.as_bytes()) };

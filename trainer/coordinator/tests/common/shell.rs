@@ -39,5 +39,6 @@ pub(crate) fn offer() -> Join {
         backend: Backend::Flex,
         instruction_set: "avx2".into(),
         peer_address: "a:1".into(),
+        labels: Default::default(),
     }
 }

@@ -35,6 +35,7 @@ fn join(name: &str) -> Ask {
         backend: Backend::Flex,
         instruction_set: "avx2".into(),
         peer_address: format!("{name}:1"),
+        labels: Default::default(),
     };
     let by = Identity { caller: "t".into(), secret: Digest::of(name.as_bytes()) };
     Ask::Event(Box::new(Event::Join { join, by }))

@@ -5,6 +5,7 @@
 mod common;
 
 mod batches;
+mod demand;
 mod gangs;
 mod history;
 mod liveness;

@@ -58,7 +58,7 @@ fn bearer(token: &str) -> String {
 /// The expected scopes of all routes. A change of a route's scopes must be repeated here, so that it cannot be
 /// accidental.
 fn expected(method: &str, path: &str) -> &'static [Scope] {
-    use Scope::{Admin, Promote, Read, Submit, Worker};
+    use Scope::{Admin, Launch, Promote, Read, Submit, Worker};
     match (method, path) {
         ("GET", "/v1/runs" | "/v1/runs/{run}" | "/v1/runs/{run}/logs" | "/v1/runs/{run}/metrics") => &[Read],
         ("GET", "/v1/runs/{run}/settings") => &[Read],
@@ -69,6 +69,7 @@ fn expected(method: &str, path: &str) -> &'static [Scope] {
         ("POST", "/v1/metrics" | "/v1/logs" | "/v1/checkpoints" | "/v1/outcomes") => &[Worker],
         ("GET", "/v1/blobs/{digest}") => &[Read, Worker],
         ("PUT", "/v1/blobs/{digest}") | ("GET", "/v1/blobs/{digest}/staged") => &[Worker],
+        ("GET", "/v1/demand") => &[Launch],
         ("POST", "/v1/registry") => &[Read, Promote, Admin],
         other => panic!("{other:?} is not in this table: say who may call it"),
     }

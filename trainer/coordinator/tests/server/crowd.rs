@@ -70,6 +70,7 @@ fn join(handle: &Handle) -> (Known, Joined) {
         backend: Backend::Flex,
         instruction_set: "avx2".into(),
         peer_address: "127.0.0.1:1".into(),
+        labels: Default::default(),
     };
     let joined = known.post("/v1/workers", &join);
     (known, joined)

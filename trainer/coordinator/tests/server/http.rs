@@ -159,6 +159,7 @@ async fn join(client: &Client, name: &str) -> TestResult<Joined> {
         backend: Backend::Flex,
         instruction_set: "avx2".into(),
         peer_address: "127.0.0.1:1".into(),
+        labels: Default::default(),
     };
     client.call("POST", "/v1/workers", join).await
 }
@@ -380,6 +381,7 @@ async fn p2_a_silent_worker_loses_its_task_and_its_writes_are_refused() -> TestR
         backend: Backend::Flex,
         instruction_set: "avx2".into(),
         peer_address: "127.0.0.1:1".into(),
+        labels: Default::default(),
     };
     let (status, error) = client.refused("/v1/workers", other).await?;
     assert_eq!((status, error.code.as_str()), (400, "invalid"));

@@ -9,6 +9,7 @@ mod shell;
 
 mod access;
 mod crowd;
+mod demand;
 mod errors;
 mod events;
 mod http;

@@ -34,6 +34,7 @@ pub(crate) fn quickstart(seed: u64, workers: WorkerRange, require: &[&str]) -> P
     ];
     let placement = Placement {
         workers,
+        requires: Default::default(),
         checkpoint: CheckpointPolicy { every: Steps(3), keep: Keep { best: 1, ..Keep::default() } },
     };
     let stages = stages.map(|(name, settings)| {

@@ -36,6 +36,7 @@ pub(crate) fn events(state: &State, ended: &[Run]) -> Vec<Event> {
             backend: Backend::Flex,
             instruction_set: "avx2".into(),
             peer_address,
+            labels: Default::default(),
         };
         for caller in ["t", "another"] {
             for secret in [format!("{worker} 1"), "another".to_owned()] {

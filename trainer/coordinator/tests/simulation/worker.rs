@@ -248,6 +248,7 @@ impl FakeWorker {
                 backend: Backend::Flex,
                 instruction_set: self.instruction_set(),
                 peer_address: format!("{}:{}", self.name, self.process),
+                labels: Default::default(),
             })];
         };
         let doing = self.assignment().map(|assignment| {

@@ -1,4 +1,4 @@
-//! Settings that cannot change a stage's value: number of workers and cadence of checkpoints.
+//! Settings that cannot change a stage's value: number and labels of workers, cadence of checkpoints.
 
 use std::collections::BTreeMap;
 
@@ -6,25 +6,39 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::{Mode, Problems};
-use crate::Steps;
+use crate::{Labels, Steps};
 
-/// Settings that cannot change a stage's value: number of workers and cadence of checkpoints.
+/// Settings that cannot change a stage's value: number and labels of workers, cadence of checkpoints.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema, Default)]
 #[serde(default)]
 pub struct Placement {
     /// Number of workers of a gang.
     pub workers: WorkerRange,
+    /// Labels that each of its workers must have, such as `gpu=h100`.
+    #[serde(skip_serializing_if = "Labels::is_empty")]
+    pub requires: Labels,
     /// Checkpoint cadence and retention.
     pub checkpoint: CheckpointPolicy,
 }
 
 impl Placement {
+    /// The default as JSON with every key, which a pipeline's reader and reference go by. As stored, a placement has no
+    /// empty `requires`, so that digests of pipelines stay.
+    pub fn example() -> serde_json::Value {
+        let mut example = serde_json::to_value(Self::default()).unwrap_or_default();
+        example["requires"] = serde_json::json!([]);
+        example
+    }
+
     pub fn check(&self, p: &mut Problems) {
         let w = self.workers;
         p.positive("workers.min", w.min);
         if w.max != 0 && w.max < w.min {
             let message = format!("`workers.max` is {}, which is less than `workers.min` ({})", w.max, w.min);
             p.add("workers.max", message, "0 sets no upper bound");
+        }
+        if let Err(error) = self.requires.check() {
+            p.add("requires", format!("`requires`: {error}"), "");
         }
         let keep = &self.checkpoint.keep;
         p.positive("checkpoint.keep.latest", keep.latest);

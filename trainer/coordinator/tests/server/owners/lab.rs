@@ -51,7 +51,7 @@ impl Project {
 
 /// All kinds of tokens. The expected permissions are listed here and compared with the server's behaviour.
 #[rustfmt::skip]
-pub(crate) const KINDS: [Kind; 10] = [
+pub(crate) const KINDS: [Kind; 11] = [
     Kind { name: "root",  scopes: "admin",          more: "",               sees: &[Motion, Speech], controls: &[Motion, Speech], moves_prod: &[Motion, Speech] },
     Kind { name: "alice", scopes: "submit,promote", more: "project=motion", sees: &[Motion],         controls: &[Motion],         moves_prod: &[] },
     Kind { name: "anna",  scopes: "submit",         more: "project=motion", sees: &[Motion],         controls: &[Motion],         moves_prod: &[] },
@@ -62,6 +62,7 @@ pub(crate) const KINDS: [Kind; 10] = [
     Kind { name: "paul",  scopes: "read,promote",   more: "",               sees: &[Motion, Speech], controls: &[],               moves_prod: &[Motion, Speech] },
     Kind { name: "mona",  scopes: "submit,promote", more: "",               sees: &[],               controls: &[],               moves_prod: &[] },
     Kind { name: "node",  scopes: "worker",         more: "",               sees: &[],               controls: &[],               moves_prod: &[] },
+    Kind { name: "lena",  scopes: "launch",         more: "",               sees: &[],               controls: &[],               moves_prod: &[] },
 ];
 
 impl Kind {
@@ -71,7 +72,7 @@ impl Kind {
 
     pub(crate) fn has(&self, scope: &str) -> bool {
         let implied = match scope {
-            "read" => self.scopes != "worker",
+            "read" => !matches!(self.scopes, "worker" | "launch"),
             _ => self.scopes == "admin",
         };
         implied || self.scopes.split(',').any(|word| word == scope)

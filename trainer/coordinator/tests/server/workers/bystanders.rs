@@ -105,6 +105,7 @@ pub(crate) fn join_of(name: &str) -> Join {
         backend: Backend::Flex,
         instruction_set: "avx2".into(),
         peer_address: "127.0.0.1:1".into(),
+        labels: Default::default(),
     }
 }
 
