@@ -54,6 +54,12 @@ pub const CURVE_BUCKETS: usize = 4_000;
 pub const CURVE_CELLS: usize = 200_000;
 /// Largest number of runs whose curves are in one answer.
 pub const CURVE_RUNS: usize = 50;
+/// Largest numbers of models and of sentences of one draw.
+pub const DRAW_MODELS: usize = 4;
+pub const DRAW_SENTENCES: usize = 8;
+/// Largest number of draws under way of one owner, and of all owners; a further one must retry.
+pub const DRAWS_WAITING_EACH: usize = 4;
+pub const DRAWS_WAITING: usize = 64;
 /// Seconds after which a caller should retry.
 pub const COME_AGAIN_S: u32 = 1;
 

@@ -26,6 +26,7 @@ use super::auth::{self, Gate};
 use super::bundles::BundleQuery;
 use super::curves::{Curves, CurvesAsked};
 use super::described::{Bytes, Described, EventStream, Nothing, OpenMetrics, Packed, described};
+use super::draws::{Draw, Drawing};
 use super::events::EventsQuery;
 use super::extract::Query;
 use super::failure::Failure;
@@ -35,7 +36,7 @@ use super::records::StageMetrics;
 use super::route::Route;
 use super::session_calls::Who;
 use super::settings::RunSettings;
-use super::{bundles, curves, events, page_files, polls, queries, scrape, session_calls, settings, uploads};
+use super::{bundles, curves, draws, events, page_files, polls, queries, scrape, session_calls, settings, uploads};
 use crate::view::WorkerView;
 
 /// Time limit of a call that waits only for the disk.
@@ -109,6 +110,8 @@ fn table() -> Vec<Entry> {
             described::<Nothing, Nothing, Bytes>("Downloads a blob, or its rest").with(DOWNLOAD)),
         entry("POST", "/v1/runs",                  &[Submit],       limits::SUBMISSION_BYTES, SHORT, queries::submit,
             described::<Nothing, Json<message::Submit>, Json<Submitted>>("Submits a pipeline").with(SUBMISSION)),
+        entry("POST", "/v1/draws",                 &[Submit],       CALL,                     SHORT, draws::draw,
+            described::<Nothing, Json<Draw>, Json<Drawing>>("Draws motions of models for sentences")),
         entry("GET",  "/metrics",                  &[Read],         CALL,                     SHORT, scrape::metrics,
             described::<Nothing, Nothing, OpenMetrics>("Shows the server's own numbers to Prometheus")),
         entry("GET",  "/v1/history",               &[Read],         CALL,                     SHORT, queries::history,

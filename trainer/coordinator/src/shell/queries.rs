@@ -163,7 +163,7 @@ pub(crate) async fn workers(
 }
 
 /// A permit for a client's call that waits for a decision.
-fn place(actor_handle: &ActorHandle) -> Result<SemaphorePermit<'_>, Failure> {
+pub(super) fn place(actor_handle: &ActorHandle) -> Result<SemaphorePermit<'_>, Failure> {
     let full = |_| Failure::busy(format!("{} calls of clients already wait for a decision", limits::CLIENTS_WAITING));
     actor_handle.clients.try_acquire().map_err(full)
 }

@@ -1,0 +1,112 @@
+//! The playground in a real browser. No worker computes here: results are stored beforehand.
+
+use std::collections::BTreeMap;
+
+use access::Server;
+use browser::Browser;
+use coordinator::Config;
+use coordinator::shell::Drawing;
+use protocol::artifact::FileEntry;
+use protocol::{ArtifactKind, Manifest, Owner};
+use registry::{Holder, Store, Write};
+use reqwest::Method;
+use serde_json::{Value, json};
+
+use super::clips::{artifact, compute, themes};
+use super::http::tokens;
+use super::in_browser::{DESK, HOSTILE, is_harmless};
+use crate::shell::TestResult;
+
+/// Two frames of two joints in the viewer's form.
+fn motions() -> Value {
+    let motion = json!({
+        "body": 0, "fps": 20, "frames": 41, "step": 1e-4, "origin": [0, 0, 0], "waypoints": [],
+        // 41 frames of two joints: nothing moves.
+        "joints": "AAAA".repeat(41 * 4),
+    });
+    json!({"bodies": [{"parents": [0, 0], "sides": "ml", "head": null}], "motions": [motion], "captions": [HOSTILE]})
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_browser_draws_with_several_models() -> TestResult {
+    let Some(program) = browser::program() else {
+        fixtures::skip(browser::MISSING);
+        return Ok(());
+    };
+    let dir = tempfile::tempdir()?;
+    let config = Config { tokens: tokens(), alone: false, park: false, ..Config::embedded() };
+    let store = Store::open(&dir.path().join("store"), Holder::this_process("a test")).await?;
+    let handle = coordinator::Coordinator::start(store.clone(), config).await?;
+    let server = Server::new(&handle.url(), Some(handle.token().clone()), None)?;
+    let meta = json!({"generator": "latent-diffusion", "format": "humanml3d", "parts": {}});
+    for (version, metric) in [(1, 2.0), (2, 1.0)] {
+        let mut manifest = Manifest::new(ArtifactKind::Model, meta.clone());
+        manifest.files.insert("x".into(), FileEntry { bytes: 1, digest: store.blobs().put(&[version])? });
+        let artifact = store.blobs().put(&manifest.to_bytes())?;
+        let own = Write::ModelOwner { model: "walks".into(), owner: Owner::local("root") };
+        let metrics = BTreeMap::from([("fid".to_owned(), metric)]);
+        let source = json!({"metric": "fid", "mode": "min"});
+        store.write(vec![own, Write::Version { model: "walks".into(), artifact, metrics, source }]).await?;
+    }
+    let promote = json!({"command": "promote", "reference": "walks:1", "to": "prod", "expect": null, "require": [], "reason": "first"});
+    server.request(Method::POST, "/v1/registry").json(&promote).send().await?.error_for_status()?;
+    let report = artifact(&store, ArtifactKind::Report, &[("motions.json", motions().to_string().into_bytes())])?;
+    for model in ["walks:1", "walks:2"] {
+        let asked = json!({"models": [model], "sentences": ["a person waves"], "seed": 3});
+        let answer = server.request(Method::POST, "/v1/draws").json(&asked).send().await?;
+        let Drawing { run, stages } = answer.error_for_status()?.json().await?;
+        compute(&server, &store, run.as_str(), stages[0].as_str(), ("report", report)).await?;
+    }
+    drop(store);
+
+    let mut browser = Browser::start(&program, dir.path());
+    let (url, link) = (handle.url(), handle.page_link());
+    tokio::task::spawn_blocking(move || -> TestResult {
+        browser.open(&link, DESK);
+        browser.until("document.querySelector('main h1')");
+
+        // From a model to its motion: two presses, as one who has the link has it at once.
+        browser.go(&format!("{url}/models/walks"));
+        browser.until("[...document.querySelectorAll('a.button')].some((a) => a.textContent === 'Draw')");
+        browser.evaluate("[...document.querySelectorAll('a.button')].find((a) => a.textContent === 'Draw').click()");
+        browser.until("document.querySelector('.playground textarea')");
+        browser.evaluate("document.querySelector('#sentence').focus(); document.querySelector('#sentence').select()");
+        browser.write("a person waves");
+        browser.go(&format!("{url}/draw?s=a+person+waves&model=walks:2&model=walks:1&seed=3"));
+        browser.until("document.querySelectorAll('canvas.figure').length === 2 && document.querySelectorAll('canvas.strip').length === 2");
+        browser.until("document.querySelector('main').textContent.includes('Drawn before')");
+        assert_eq!(browser.evaluate("document.querySelectorAll('.measures')[0].textContent"), json!("feet slide in 0.0 % of the steps"));
+        themes(&mut browser, "draw");
+
+        // By keyboard: stop, a frame on, a loop of a part, all of it, one motion over the other.
+        browser.evaluate("document.querySelector('.viewer-bar .play').focus(); if (document.querySelector('.viewer-bar .play').textContent === 'Stop') document.querySelector('.viewer-bar .play').click()");
+        browser.press("Home");
+        browser.until("document.querySelector('.clock').textContent.startsWith('0.00 of 2.00 s')");
+        for _ in 0..10 {
+            browser.press("ArrowRight");
+        }
+        browser.until("document.querySelector('.clock').textContent.endsWith('frame 10')");
+        assert_eq!(browser.evaluate("document.querySelector('.viewer-bar .all').hidden"), json!(true));
+        browser.press("i");
+        browser.until("!document.querySelector('.viewer-bar .all').hidden");
+        browser.press("End");
+        browser.press("ArrowLeft");
+        browser.press("o");
+        browser.evaluate("document.querySelector('.viewer-bar .play').click()");
+        let clock = "Number(document.querySelector('.clock').textContent.split(' ')[0])";
+        browser.until(&format!("{clock} >= 0.5 && {clock} < 1.9"));
+        browser.press("u");
+        browser.until("document.querySelector('.viewer-bar .all').hidden");
+        browser.evaluate("document.querySelector('.viewer-bar .over').click()");
+
+        // What no worker has drawn waits for one, and says how one joins.
+        browser.go(&format!("{url}/draw?s=a+new+sentence&model=walks:1"));
+        browser.until("document.querySelector('.want .command')?.textContent.includes('trainer worker join')");
+
+        is_harmless(&mut browser, &url);
+        Ok(())
+    })
+    .await??;
+    handle.shutdown().await;
+    Ok(())
+}
