@@ -54,11 +54,15 @@ pub const CURVE_BUCKETS: usize = 4_000;
 pub const CURVE_CELLS: usize = 200_000;
 /// Largest number of runs whose curves are in one answer.
 pub const CURVE_RUNS: usize = 50;
-/// Largest numbers of models and of sentences of one draw.
+/// Largest number of models of one draw.
 pub const DRAW_MODELS: usize = 4;
+/// Largest number of sentences of one draw.
 pub const DRAW_SENTENCES: usize = 8;
-/// Largest number of draws under way of one owner, and of all owners; a further one must retry.
+/// Largest number of motions of one sentence of a draw.
+pub const DRAW_COUNT: usize = 16;
+/// Largest number of unfinished draws of one owner; a further one must retry.
 pub const DRAWS_WAITING_EACH: usize = 4;
+/// Largest number of unfinished draws of all owners.
 pub const DRAWS_WAITING: usize = 64;
 /// Seconds after which a caller should retry.
 pub const COME_AGAIN_S: u32 = 1;

@@ -507,7 +507,26 @@ fn sentences_are_drawn_in_the_viewers_form_and_by_the_seed_alone() {
     let seed = DrawMotions { seed: Seed(5), ..settings.clone() };
     let seeded = bench.run("drawn", &seed.into(), &inputs).expect("the stage runs");
     assert_ne!(ran.output(), seeded.output());
-    let long = DrawMotions { seconds: 60.0, ..settings };
+    let long = DrawMotions { seconds: 60.0, ..settings.clone() };
     let refused = bench.run("drawn", &long.into(), &inputs).expect_err("too long").to_string();
-    assert!(refused.contains("`seconds` is 60; the model draws at most"), "{refused}");
+    assert!(refused.contains("`seconds` is 60; the model draws 0.05 to"), "{refused}");
+
+    // Several motions of one sentence have consecutive seeds and one length, which is the model's without `seconds`.
+    let several = DrawMotions { count: 2, seconds: 0.0, ..settings.clone() };
+    let ran = bench.run("drawn", &several.into(), &inputs).expect("the stage runs");
+    let several = bench.manifest(ran.output()).expect("stored");
+    let file = |manifest: &protocol::Manifest, name: &str| artifacts::file(&*bench.blobs(), manifest, name).expect("a file");
+    let motions: serde_json::Value = serde_json::from_slice(&file(&several, "motions.json")).expect("JSON");
+    assert_eq!(motions["captions"], serde_json::json!(["a person walks", "a person walks", "a person jumps", "a person jumps"]));
+    let drawn = motions["motions"].as_array().expect("a list");
+    let jerks: Vec<f64> = drawn.iter().filter_map(|motion| motion["measures"]["jerk"].as_f64()).collect();
+    assert!(jerks.len() == 4 && jerks.iter().all(|jerk| *jerk > 0.0), "{jerks:?}");
+    let second = DrawMotions { seed: Seed(5), seconds: 0.0, ..settings };
+    let ran = bench.run("drawn", &second.into(), &inputs).expect("the stage runs");
+    let second = bench.manifest(ran.output()).expect("stored");
+    assert_eq!(file(&several, "motion-01.npy"), file(&second, "motion-00.npy"));
+    assert_ne!(file(&several, "motion-00.npy"), file(&several, "motion-01.npy"));
+    assert!(file(&second, "motion-00.bvh").starts_with(b"HIERARCHY"));
+    assert!(file(&second, "motion-00.glb").starts_with(b"glTF"));
+    assert!(file(&second, "motions.html").starts_with(b"<!DOCTYPE html>"));
 }

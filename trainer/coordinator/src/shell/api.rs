@@ -111,7 +111,7 @@ fn table() -> Vec<Entry> {
         entry("POST", "/v1/runs",                  &[Submit],       limits::SUBMISSION_BYTES, SHORT, queries::submit,
             described::<Nothing, Json<message::Submit>, Json<Submitted>>("Submits a pipeline").with(SUBMISSION)),
         entry("POST", "/v1/draws",                 &[Submit],       CALL,                     SHORT, draws::draw,
-            described::<Nothing, Json<Draw>, Json<Drawing>>("Draws motions of models for sentences")),
+            described::<Nothing, Json<Draw>, Json<Drawing>>("Draws motions of models for sentences").with(SUBMISSION)),
         entry("GET",  "/metrics",                  &[Read],         CALL,                     SHORT, scrape::metrics,
             described::<Nothing, Nothing, OpenMetrics>("Shows the server's own numbers to Prometheus")),
         entry("GET",  "/v1/history",               &[Read],         CALL,                     SHORT, queries::history,

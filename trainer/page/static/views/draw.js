@@ -10,7 +10,17 @@ import { html, nothing } from "../vendor/lit-html.js";
 
 /** Limits of a draw, and the milliseconds between two questions how far it is. */
 const [MODELS, SENTENCES, ASK_MS] = [4, 8, 350];
+/** Forms of the files of one motion. */
+const FORMS = ["bvh", "glb", "npy"];
 const EXAMPLES = ["a person walks in a circle", "a person jumps forward twice", "someone waves with the right hand and sits down"];
+
+/** A name for files on any system. @param {string} model @param {string} sentence @param {number} seed */
+const fileName = (model, sentence, seed) => [model, sentence, String(seed)].map((word) => word.toLowerCase().replace(/[^a-z0-9]+/g, "-").replace(/^-|-$/g, "").slice(0, 40)).filter(Boolean).join("-");
+
+/** A word of a shell's command. Between single quotes nothing has a meaning of its own. @param {string} text */
+const quoted = (text) => `'${text.replaceAll("'", "'\\''")}'`;
+
+/** @typedef {{models: string[], sentences: string[], seed: number, seconds?: number, guidance?: number, steps?: number}} Asked */
 
 /** @param {Context} context @returns {View} */
 export function draw(context) {
@@ -22,8 +32,10 @@ export function draw(context) {
   /** @type {{name: string, note: string}[]} Versions to choose from, those with an alias first. */
   let choices = [];
   const figures = new Figures();
-  /** What is shown: which models and how far their run is. @type {{models: string[], sentences: string[], run: Run | null, notes: string[]} | null} */
+  /** The draw on the page, and its run. @type {(Asked & {run: Run | null, notes: string[]}) | null} */
   let shown = null;
+  /** Pages with all motions of a model. @type {import("../motions.js").Download[]} */
+  let pages = [];
   let [busy, wrong, hint, begun, drawn] = [false, "", "", false, false];
   let left = false;
 
@@ -37,7 +49,7 @@ export function draw(context) {
     choices = [...new Map(choices.map((choice) => [choice.name, { ...choice, note: choices.filter((other) => other.name === choice.name).map((other) => other.note).join(", ") }])).values()];
     for (const name of chosen) if (!choices.some((choice) => choice.name === name)) choices.push({ name, note: "" });
     if (chosen.length === 0 && choices[0]) chosen = [choices[0].name];
-    // A link to a draw shows it: what was drawn already is answered from the store.
+    // A link to a draw shows it. A known draw costs nothing; a new one waits in the bounded queue.
     if (!begun && query.has("s") && may("submit")) void start();
     begun = true;
   }
@@ -58,10 +70,11 @@ export function draw(context) {
     keep();
     context.draw();
     const number = (/** @type {string | undefined} */ text) => (text ? Number(text) : undefined);
+    /** @type {Asked} */
     const asked = { models: chosen, sentences: lines().slice(0, SENTENCES), seed: Math.abs(Math.trunc(Number(seed) || 0)), seconds: number(seconds), guidance: number(guidance), steps: number(steps) };
     try {
       const { run, stages } = await post("/v1/draws", asked);
-      shown = { models: asked.models, sentences: asked.sentences, run: null, notes: asked.models.map((name) => choices.find((choice) => choice.name === name)?.note ?? "") };
+      shown = { ...asked, run: null, notes: asked.models.map((name) => choices.find((choice) => choice.name === name)?.note ?? "") };
       for (;;) {
         const now = /** @type {Run} */ (await get(runPath(run)));
         if (left) return;
@@ -81,14 +94,27 @@ export function draw(context) {
 
   /** @param {Run} run @param {string[]} stages @param {NonNullable<typeof shown>} asked */
   async function fetchMotions(run, stages, asked) {
+    const json = async (/** @type {string} */ digest) => JSON.parse(new TextDecoder().decode(await blob(digest)));
     const all = await Promise.all(stages.map(async (name) => {
       const report = run.stages.find((stage) => stage.name === name)?.outputs.report ?? "";
-      const manifest = JSON.parse(new TextDecoder().decode(await blob(report)));
-      return JSON.parse(new TextDecoder().decode(await blob(manifest.files["motions.json"].digest)));
+      const { files } = /** @type {{files: Record<string, {digest: string}>}} */ (await json(report));
+      return { files, motions: /** @type {import("../viewer.js").Motions} */ (await json(files["motions.json"]?.digest ?? "")) };
     }));
     if (left) return;
-    const captions = asked.models.flatMap((model, at) => asked.sentences.map((sentence) => ({ title: asked.models.length > 1 ? model : sentence, note: asked.models.length > 1 ? sentence : [model, asked.notes[at]].filter(Boolean).join(" · ") })));
-    figures.show(together(all), captions);
+    const several = asked.models.length > 1;
+    const captions = asked.models.flatMap((model, of) => asked.sentences.map((sentence, at) => ({
+      title: several ? model : sentence,
+      note: `${several ? sentence : [model, asked.notes[of]].filter(Boolean).join(" · ")} ·`,
+      files: FORMS.flatMap((form) => {
+        const digest = all[of]?.files[`motion-${String(at).padStart(2, "0")}.${form}`]?.digest;
+        return digest ? [{ text: form, digest, name: `${fileName(model, sentence, asked.seed)}.${form}` }] : [];
+      }),
+    })));
+    pages = asked.models.flatMap((model, of) => {
+      const digest = all[of]?.files["motions.html"]?.digest;
+      return digest ? [{ text: model, digest, name: `${fileName(model, "motions", asked.seed)}.html` }] : [];
+    });
+    figures.show(together(all.map(({ motions }) => motions)), captions);
     drawn = true;
   }
 
@@ -130,15 +156,21 @@ export function draw(context) {
     if (run.state === "finished") {
       const cached = run.stages.every((stage) => stage.state === "cached");
       const took = run.stages.reduce((sum, stage) => sum + stage.wall_s, 0);
-      return html`<p class="dim" role="status">${cached ? "Drawn before: the same models, sentences and seed." : `Drawn in ${number(took)} s of work.`} ${run.stages.map((stage, at) => (stage.metrics.skating === undefined ? nothing : html`${at > 0 ? ", " : ""}${shown?.models[at]} slides in ${number(100 * stage.metrics.skating)} % of the steps`))}</p>`;
+      return html`<p class="dim" role="status">${cached ? "Drawn before: the same models, sentences and seed." : `Drawn in ${number(took)} s of work.`}</p>`;
     }
+    if (run.state !== "running") return html`<p class="wrong" role="alert">The draw is ${run.state}. <a href=${address("runs", run.run)}>${run.run}</a></p>`;
     const waits = run.stages.find((stage) => stage.wants_workers);
     if (waits) return html`<section class="card want warn"><p class="what"><b>It waits for an idle worker</b></p><p class="why">${prose(firstLine(waits.message))}</p>${command(joinCommand(1), context)}</section>`;
     return html`<p class="dim" role="status">${badge("running", "drawing")} ${count(run.stages.filter(isDone).length, "model")} of ${run.stages.length}</p>`;
   }
 
+  /** @param {Asked} asked */
+  function asCommand(asked) {
+    const options = [["seconds", asked.seconds], ["guidance", asked.guidance], ["steps", asked.steps]].flatMap(([name, value]) => (value === undefined ? [] : [`--${name} ${value}`]));
+    return plain([`trainer generate ${quoted(asked.sentences[0] ?? "")} --model ${quoted(asked.models[0] ?? "")} --seed ${asked.seed}`, ...options, "-o motion.bvh"].join(" "));
+  }
+
   function render() {
-    const again = drawn && shown && shown.models[0] ? `trainer generate ${JSON.stringify(shown.sentences[0] ?? "")} --model ${shown.models[0]} --seed ${seed}${seconds ? ` --seconds ${seconds}s` : ""} -o motion.bvh` : "";
     return html`<div class="row head"><h1 tabindex="-1">Draw</h1></div>
       ${choices.length === 0
         ? html`<p class="card dim">No model is registered yet. A stage of kind <code>register</code> makes a version of what a pipeline trained.</p>`
@@ -146,7 +178,9 @@ export function draw(context) {
           ? form()
           : html`<p class="card dim">Drawing needs a token with the scope <code>submit</code>. Here a command draws: <code>trainer generate</code>.</p>`}
       ${progress()}${drawn ? figures.element : nothing}
-      ${again ? html`<section aria-labelledby="take"><h2 id="take">Take it along</h2><p class="dim">As BVH for other programs; <code>.glb</code>, <code>.npy</code> and <code>.html</code> work as well. This page's address draws the same again.</p>${command(plain(again), context)}</section>` : nothing}`;
+      ${drawn ? html`<section aria-labelledby="take"><h2 id="take">Take it along</h2>
+        <p>Under each motion are its files. A page with all of them: ${pages.map(({ text, digest, name }, at) => html`${at > 0 ? ", " : ""}<a href=${`/v1/blobs/${encodeURIComponent(digest)}`} download=${name}>${text}</a>`)}.</p>
+        <p class="dim">The address of this page draws the same again, as does the command:</p>${shown ? command(asCommand(shown), context) : nothing}</section>` : nothing}`;
   }
 
   const close = () => {

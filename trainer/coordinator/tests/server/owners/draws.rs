@@ -40,7 +40,7 @@ async fn a_draw_is_a_run_of_its_caller_and_few_wait_at_a_time() -> TestResult {
     let mut none = asked.clone();
     none["models"] = json!(["never:1"]);
     let (_, unknown) = draw(&lab, "bob", &none).await?;
-    let without = |answer: &Value, name: &str| answer["message"].as_str().map(|text| text.replace(name, "MODEL"));
+    let without = |answer: &Value, name: &str| answer["detail"].as_str().map(|text| text.replace(name, "MODEL"));
     assert_eq!(without(&hidden, "drawn"), without(&unknown, "never"), "{hidden}");
     assert_eq!(draw(&lab, "rita", &asked).await?.0, StatusCode::FORBIDDEN);
 

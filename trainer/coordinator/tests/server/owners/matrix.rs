@@ -104,7 +104,7 @@ fn cases(lab: &Lab, kind: &Kind, method: &'static str, path: &'static str) -> Op
                 case(path.replace("{digest}", &lab.artifacts[&project].to_string()), Value::Null, Expected::Done);
             }
         }
-        // No cases here: `promotion` tests submissions and draws, and `registry` tests bundles.
+        // No cases here: `promotion` tests submissions, `draws` tests draws, and `registry` tests bundles.
         ("POST", "/v1/runs" | "/v1/draws" | "/v1/bundles") => {}
         ("POST", "/v1/registry") => {
             for project in Project::ALL {

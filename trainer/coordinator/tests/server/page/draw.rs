@@ -17,12 +17,11 @@ use super::http::tokens;
 use super::in_browser::{DESK, HOSTILE, is_harmless};
 use crate::shell::TestResult;
 
-/// Two frames of two joints in the viewer's form.
+/// Two joints that stand still for two seconds, in the viewer's form.
 fn motions() -> Value {
     let motion = json!({
         "body": 0, "fps": 20, "frames": 41, "step": 1e-4, "origin": [0, 0, 0], "waypoints": [],
-        // 41 frames of two joints: nothing moves.
-        "joints": "AAAA".repeat(41 * 4),
+        "joints": "AAAA".repeat(41 * 4), "measures": {"skating": 0.125, "jerk": 21.25},
     });
     json!({"bodies": [{"parents": [0, 0], "sides": "ml", "head": null}], "motions": [motion], "captions": [HOSTILE]})
 }
@@ -50,7 +49,11 @@ async fn a_browser_draws_with_several_models() -> TestResult {
     }
     let promote = json!({"command": "promote", "reference": "walks:1", "to": "prod", "expect": null, "require": [], "reason": "first"});
     server.request(Method::POST, "/v1/registry").json(&promote).send().await?.error_for_status()?;
-    let report = artifact(&store, ArtifactKind::Report, &[("motions.json", motions().to_string().into_bytes())])?;
+    let report = artifact(&store, ArtifactKind::Report, &[
+        ("motions.json", motions().to_string().into_bytes()),
+        ("motion-00.bvh", b"HIERARCHY".to_vec()),
+        ("motions.html", b"<!DOCTYPE html><script>window.hostile=1</script>".to_vec()),
+    ])?;
     for model in ["walks:1", "walks:2"] {
         let asked = json!({"models": [model], "sentences": ["a person waves"], "seed": 3});
         let answer = server.request(Method::POST, "/v1/draws").json(&asked).send().await?;
@@ -65,7 +68,7 @@ async fn a_browser_draws_with_several_models() -> TestResult {
         browser.open(&link, DESK);
         browser.until("document.querySelector('main h1')");
 
-        // From a model to its motion: two presses, as one who has the link has it at once.
+        // From a model to its motion in two presses; a link to a draw shows it at once.
         browser.go(&format!("{url}/models/walks"));
         browser.until("[...document.querySelectorAll('a.button')].some((a) => a.textContent === 'Draw')");
         browser.evaluate("[...document.querySelectorAll('a.button')].find((a) => a.textContent === 'Draw').click()");
@@ -75,7 +78,12 @@ async fn a_browser_draws_with_several_models() -> TestResult {
         browser.go(&format!("{url}/draw?s=a+person+waves&model=walks:2&model=walks:1&seed=3"));
         browser.until("document.querySelectorAll('canvas.figure').length === 2 && document.querySelectorAll('canvas.strip').length === 2");
         browser.until("document.querySelector('main').textContent.includes('Drawn before')");
-        assert_eq!(browser.evaluate("document.querySelectorAll('.measures')[0].textContent"), json!("feet slide in 0.0 % of the steps"));
+        assert_eq!(browser.evaluate("document.querySelectorAll('.measures')[0].textContent"), json!("feet slide in 12.5 % of the steps · jerk 21.3 m/s³"));
+        let links = "[...document.querySelectorAll('main a[download]')].map((link) => link.download)";
+        let named = ["walks-2-a-person-waves-3.bvh", "walks-1-a-person-waves-3.bvh", "walks-2-motions-3.html", "walks-1-motions-3.html"];
+        assert_eq!(browser.evaluate(links), json!(named));
+        let saved = "fetch(document.querySelector('.files a').href).then((answer) => answer.text())";
+        assert_eq!(browser.evaluate(saved), json!("HIERARCHY"));
         themes(&mut browser, "draw");
 
         // By keyboard: stop, a frame on, a loop of a part, all of it, one motion over the other.
@@ -99,7 +107,12 @@ async fn a_browser_draws_with_several_models() -> TestResult {
         browser.until("document.querySelector('.viewer-bar .all').hidden");
         browser.evaluate("document.querySelector('.viewer-bar .over').click()");
 
-        // What no worker has drawn waits for one, and says how one joins.
+        // The address is the draw, and a sentence of a link stays a word of the command.
+        assert_eq!(browser.evaluate("location.search"), json!("?s=a+person+waves&model=walks%3A2&model=walks%3A1&seed=3"));
+        let command = "document.querySelector('section[aria-labelledby=take] .command code').textContent";
+        assert_eq!(browser.evaluate(command), json!("trainer generate 'a person waves' --model 'walks:2' --seed 3 -o motion.bvh"));
+
+        // A draw without a worker waits for one, and the page says how one joins.
         browser.go(&format!("{url}/draw?s=a+new+sentence&model=walks:1"));
         browser.until("document.querySelector('.want .command')?.textContent.includes('trainer worker join')");
 
