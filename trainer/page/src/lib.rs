@@ -61,7 +61,7 @@ macro_rules! files {
 }
 
 /// Everything that lies in `static` but licences.
-static FILES: [(&str, &[u8]); 37] = files![
+static FILES: [(&str, &[u8]); 38] = files![
     "index.html",
     "icon.svg",
     "style.css",
@@ -78,6 +78,7 @@ static FILES: [(&str, &[u8]); 37] = files![
     "rates.js",
     "viewer.js",
     "motions.js",
+    "floor.js",
     "features.js",
     "viewer.css",
     "settings.js",

@@ -1,6 +1,7 @@
 //! The playground: one to four models draw the same sentences with the same seed, side by side.
 
 import { blob, CallError, get, post, registry, runPath } from "../api.js";
+import { floor, fromText, lengthOf, positions, toText } from "../floor.js";
 import { count, number, plain } from "../format.js";
 import { Figures, together } from "../motions.js";
 import { badge, command, failed, firstLine, isDone, isOver, joinCommand, prose } from "../parts.js";
@@ -20,7 +21,7 @@ const fileName = (model, sentence, seed) => [model, sentence, String(seed)].map(
 /** A word of a shell's command. Between single quotes nothing has a meaning of its own. @param {string} text */
 const quoted = (text) => `'${text.replaceAll("'", "'\\''")}'`;
 
-/** @typedef {{models: string[], sentences: string[], seed: number, seconds?: number, guidance?: number, steps?: number}} Asked */
+/** @typedef {{models: string[], sentences: string[], seed: number, seconds?: number, guidance?: number, steps?: number, path: [number, number, number, number][]}} Asked */
 
 /** @param {Context} context @returns {View} */
 export function draw(context) {
@@ -29,6 +30,8 @@ export function draw(context) {
   let chosen = query.getAll("model").slice(0, MODELS);
   let [seconds, seed, guidance, steps] = ["seconds", "seed", "guidance", "steps"].map((name) => query.get(name) ?? "");
   seed ||= "1";
+  let path = fromText(query.get("path") ?? "");
+  const startsWithPath = path.length > 0;
   /** @type {{name: string, note: string}[]} Versions to choose from, those with an alias first. */
   let choices = [];
   const figures = new Figures();
@@ -60,7 +63,7 @@ export function draw(context) {
     const query = new URLSearchParams();
     for (const line of lines()) query.append("s", line);
     for (const name of chosen) query.append("model", name);
-    for (const [name, value] of [["seed", seed], ["seconds", seconds], ["guidance", guidance], ["steps", steps]]) if (name && value) query.set(name, value);
+    for (const [name, value] of [["seed", seed], ["seconds", seconds], ["guidance", guidance], ["steps", steps], ["path", toText(path)]]) if (name && value) query.set(name, value);
     remember(query);
   }
 
@@ -71,7 +74,7 @@ export function draw(context) {
     context.draw();
     const number = (/** @type {string | undefined} */ text) => (text ? Number(text) : undefined);
     /** @type {Asked} */
-    const asked = { models: chosen, sentences: lines().slice(0, SENTENCES), seed: Math.abs(Math.trunc(Number(seed) || 0)), seconds: number(seconds), guidance: number(guidance), steps: number(steps) };
+    const asked = { models: chosen, sentences: lines().slice(0, SENTENCES), seed: Math.abs(Math.trunc(Number(seed) || 0)), seconds: number(seconds), guidance: number(guidance), steps: number(steps), path: positions(path, number(seconds)) };
     try {
       const { run, stages } = await post("/v1/draws", asked);
       shown = { ...asked, run: null, notes: asked.models.map((name) => choices.find((choice) => choice.name === name)?.note ?? "") };
@@ -130,6 +133,11 @@ export function draw(context) {
       chosen = on ? [...chosen, name].slice(0, MODELS) : chosen.filter((other) => other !== name);
       context.draw();
     };
+    /** @param {import("../floor.js").Place[]} places */
+    const walk = (places) => {
+      path = places;
+      context.draw();
+    };
     /** @param {(value: string) => void} set */
     const typed = (set) => (/** @type {Event} */ event) => set(/** @type {HTMLInputElement} */ (event.currentTarget).value);
     return html`<form class="card playground" @submit=${submit}>
@@ -145,6 +153,10 @@ export function draw(context) {
         <label>Guidance <input inputmode="decimal" placeholder="its own" pattern="[0-9.]*" .value=${guidance ?? ""} @input=${typed((value) => (guidance = value))}></label>
         <label>Steps <input inputmode="numeric" placeholder="its own" pattern="[0-9]*" .value=${steps ?? ""} @input=${typed((value) => (steps = value))}></label>
         <span class="grow"></span><button class="main" type="submit" ?disabled=${busy || chosen.length === 0}>${busy ? "Drawing…" : "Draw"}</button></div>
+      <details class="way" ?open=${startsWithPath}><summary>Path on the floor <span class="dim">${path.length > 0 ? `${number(lengthOf(path))} m` : "for models with a control part"}</span></summary>
+        ${floor(path, walk)}
+        <p class="row"><span class="dim grow">Draw it with mouse, finger or arrow keys. The figure starts at the dot and faces up; a cell is one metre.</span>
+          <button type="button" ?disabled=${path.length === 0} @click=${() => walk([])}>Clear path</button></p></details>
     </form>`;
   }
 
@@ -171,6 +183,8 @@ export function draw(context) {
   }
 
   function render() {
+    // A command reads a path from a file.
+    const byCommand = shown?.path.length === 0;
     return html`<div class="row head"><h1 tabindex="-1">Draw</h1></div>
       ${choices.length === 0
         ? html`<p class="card dim">No model is registered yet. A stage of kind <code>register</code> makes a version of what a pipeline trained.</p>`
@@ -180,7 +194,7 @@ export function draw(context) {
       ${progress()}${drawn ? figures.element : nothing}
       ${drawn ? html`<section aria-labelledby="take"><h2 id="take">Take it along</h2>
         <p>Under each motion are its files. A page with all of them: ${pages.map(({ text, digest, name }, at) => html`${at > 0 ? ", " : ""}<a href=${`/v1/blobs/${encodeURIComponent(digest)}`} download=${name}>${text}</a>`)}.</p>
-        <p class="dim">The address of this page draws the same again, as does the command:</p>${shown ? command(asCommand(shown), context) : nothing}</section>` : nothing}`;
+        <p class="dim">The address of this page draws the same again${byCommand ? ", as does the command:" : "."}</p>${byCommand && shown ? command(asCommand(shown), context) : nothing}</section>` : nothing}`;
   }
 
   const close = () => {
