@@ -2,7 +2,6 @@
 //!
 //! The floor is seen from above. The figure starts at the dot and faces up; x is to its left, z is ahead of it.
 
-import { number } from "./format.js";
 import { html, svg } from "./vendor/lit-html.js";
 
 /** Metres on the floor. @typedef {[number, number]} Place */
@@ -64,9 +63,13 @@ export const fromText = (text) => text.split(" ").slice(0, MOST).flatMap((word) 
 /** @param {Place} place @returns {Place} */
 const inside = ([x, z]) => [Math.min(SIDE, Math.max(-SIDE, x)), Math.min(AHEAD, Math.max(-BEHIND, z))];
 
-/** The floor with a path. @param {Place[]} path @param {(path: Place[]) => void} change */
-export function floor(path, change) {
-  const last = path[path.length - 1] ?? START;
+/** A change of the path as it is now, which may be newer than the one that is drawn. @typedef {(path: Place[]) => Place[]} Change */
+
+/** @param {Place[]} path */
+const endOf = (path) => path[path.length - 1] ?? START;
+
+/** The floor with a path. @param {Place[]} path @param {(change: Change) => void} walk */
+export function floor(path, walk) {
   /** @param {PointerEvent} event @returns {Place} */
   const under = (event) => {
     const box = /** @type {Element} */ (event.currentTarget).getBoundingClientRect();
@@ -76,31 +79,33 @@ export function floor(path, change) {
   /** @param {PointerEvent} event */
   const begin = (event) => {
     /** @type {Element} */ (event.currentTarget).setPointerCapture(event.pointerId);
-    change([under(event)]);
+    const place = under(event);
+    walk(() => [place]);
   };
   /** @param {PointerEvent} event */
   const move = (event) => {
     const held = /** @type {Element} */ (event.currentTarget).hasPointerCapture(event.pointerId);
     const place = under(event);
-    if (held && path.length < MOST && distance(last, place) >= APART) change([...path, place]);
+    if (held) walk((path) => (path.length < MOST && distance(endOf(path), place) >= APART ? [...path, place] : path));
   };
   /** @param {KeyboardEvent} event */
   const press = (event) => {
     /** @type {Record<string, Place>} */
     const arrows = { ArrowUp: [0, STEP], ArrowDown: [0, -STEP], ArrowLeft: [STEP, 0], ArrowRight: [-STEP, 0] };
     const arrow = arrows[event.key];
-    if (arrow && path.length < MOST) change([...path, inside([last[0] + arrow[0], last[1] + arrow[1]])]);
-    else if (event.key === "Backspace" || event.key === "Delete") change(path.slice(0, -1));
+    if (arrow) walk((path) => (path.length < MOST ? [...path, inside([endOf(path)[0] + arrow[0], endOf(path)[1] + arrow[1]])] : path));
+    else if (event.key === "Backspace" || event.key === "Delete") walk((path) => path.slice(0, -1));
     else return;
     event.preventDefault();
   };
   const lines = [];
   for (let v = -SIDE; v <= SIDE; v += 1) lines.push(svg`<line x1=${v} x2=${v} y1=${-AHEAD} y2=${BEHIND}></line>`);
   for (let v = -AHEAD; v <= BEHIND; v += 1) lines.push(svg`<line x1=${-SIDE} x2=${SIDE} y1=${v} y2=${v}></line>`);
+  const end = endOf(path);
   const drawn = [START, ...path].map(([x, z]) => `${-x},${-z}`).join(" ");
-  const says = path.length === 0 ? "no path" : `a path of ${number(lengthOf(path))} m`;
+  const says = path.length === 0 ? "no path" : `a path of ${lengthOf(path).toFixed(1)} m`;
   return html`<svg class="floor" viewBox=${`${-SIDE} ${-AHEAD} ${2 * SIDE} ${AHEAD + BEHIND}`} tabindex="0" role="img"
     aria-label=${`The floor from above with ${says}. Arrow keys lengthen the path by half a metre, Backspace shortens it.`}
     @pointerdown=${begin} @pointermove=${move} @keydown=${press}>
-    ${svg`<g class="cells">${lines}</g><polyline class="way" points=${drawn}></polyline><circle class="begins" r="0.12"></circle><path class="faces" d="M-.1-.2 0-.42 .1-.2Z"></path>${path.length > 0 ? svg`<circle class="ends" cx=${-last[0]} cy=${-last[1]} r="0.09"></circle>` : ""}`}</svg>`;
+    ${svg`<g class="cells">${lines}</g><polyline class="trace" points=${drawn}></polyline><circle class="begins" r="0.12"></circle><path class="faces" d="M-.1-.2 0-.42 .1-.2Z"></path>${path.length > 0 ? svg`<circle class="ends" cx=${-end[0]} cy=${-end[1]} r="0.09"></circle>` : ""}`}</svg>`;
 }

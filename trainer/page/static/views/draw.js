@@ -1,4 +1,6 @@
 //! The playground: one to four models draw the same sentences with the same seed, side by side.
+//!
+//! Its address has all of a draw. A link only fills the form, because a page of another host must not start work here.
 
 import { blob, CallError, get, post, registry, runPath } from "../api.js";
 import { floor, fromText, lengthOf, positions, toText } from "../floor.js";
@@ -39,7 +41,7 @@ export function draw(context) {
   let shown = null;
   /** Pages with all motions of a model. @type {import("../motions.js").Download[]} */
   let pages = [];
-  let [busy, wrong, hint, begun, drawn] = [false, "", "", false, false];
+  let [busy, wrong, hint, drawn] = [false, "", "", false];
   let left = false;
 
   /** @param {AbortSignal} signal */
@@ -52,9 +54,6 @@ export function draw(context) {
     choices = [...new Map(choices.map((choice) => [choice.name, { ...choice, note: choices.filter((other) => other.name === choice.name).map((other) => other.note).join(", ") }])).values()];
     for (const name of chosen) if (!choices.some((choice) => choice.name === name)) choices.push({ name, note: "" });
     if (chosen.length === 0 && choices[0]) chosen = [choices[0].name];
-    // A link to a draw shows it. A known draw costs nothing; a new one waits in the bounded queue.
-    if (!begun && query.has("s") && may("submit")) void start();
-    begun = true;
   }
 
   const lines = () => (sentences ?? "").split("\n").map((line) => line.trim()).filter((line) => line !== "");
@@ -133,9 +132,9 @@ export function draw(context) {
       chosen = on ? [...chosen, name].slice(0, MODELS) : chosen.filter((other) => other !== name);
       context.draw();
     };
-    /** @param {import("../floor.js").Place[]} places */
-    const walk = (places) => {
-      path = places;
+    /** @param {import("../floor.js").Change} change */
+    const walk = (change) => {
+      path = change(path);
       context.draw();
     };
     /** @param {(value: string) => void} set */
@@ -153,10 +152,10 @@ export function draw(context) {
         <label>Guidance <input inputmode="decimal" placeholder="its own" pattern="[0-9.]*" .value=${guidance ?? ""} @input=${typed((value) => (guidance = value))}></label>
         <label>Steps <input inputmode="numeric" placeholder="its own" pattern="[0-9]*" .value=${steps ?? ""} @input=${typed((value) => (steps = value))}></label>
         <span class="grow"></span><button class="main" type="submit" ?disabled=${busy || chosen.length === 0}>${busy ? "Drawing…" : "Draw"}</button></div>
-      <details class="way" ?open=${startsWithPath}><summary>Path on the floor <span class="dim">${path.length > 0 ? `${number(lengthOf(path))} m` : "for models with a control part"}</span></summary>
+      <details class="way" ?open=${startsWithPath}><summary>Path on the floor <span class="dim">${path.length > 0 ? `${lengthOf(path).toFixed(1)} m` : "for models with a control part"}</span></summary>
         ${floor(path, walk)}
         <p class="row"><span class="dim grow">Draw it with mouse, finger or arrow keys. The figure starts at the dot and faces up; a cell is one metre.</span>
-          <button type="button" ?disabled=${path.length === 0} @click=${() => walk([])}>Clear path</button></p></details>
+          <button type="button" ?disabled=${path.length === 0} @click=${() => walk(() => [])}>Clear path</button></p></details>
     </form>`;
   }
 
@@ -194,7 +193,7 @@ export function draw(context) {
       ${progress()}${drawn ? figures.element : nothing}
       ${drawn ? html`<section aria-labelledby="take"><h2 id="take">Take it along</h2>
         <p>Under each motion are its files. A page with all of them: ${pages.map(({ text, digest, name }, at) => html`${at > 0 ? ", " : ""}<a href=${`/v1/blobs/${encodeURIComponent(digest)}`} download=${name}>${text}</a>`)}.</p>
-        <p class="dim">The address of this page draws the same again${byCommand ? ", as does the command:" : "."}</p>${byCommand && shown ? command(asCommand(shown), context) : nothing}</section>` : nothing}`;
+        <p class="dim">A link to this page draws the same again${byCommand ? ", as does the command:" : "."}</p>${byCommand && shown ? command(asCommand(shown), context) : nothing}</section>` : nothing}`;
   }
 
   const close = () => {

@@ -14,7 +14,7 @@ use serde_json::{Value, json};
 
 use super::clips::{artifact, compute, themes};
 use super::http::tokens;
-use super::in_browser::{DESK, HOSTILE, is_harmless};
+use super::in_browser::{DESK, HOSTILE, is_harmless, keep};
 use crate::shell::TestResult;
 
 /// Two joints that stand still for two seconds, in the viewer's form.
@@ -68,14 +68,21 @@ async fn a_browser_draws_with_several_models() -> TestResult {
         browser.open(&link, DESK);
         browser.until("document.querySelector('main h1')");
 
-        // From a model to its motion in two presses; a link to a draw shows it at once.
+        // From a model to its motion in two presses.
         browser.go(&format!("{url}/models/walks"));
         browser.until("[...document.querySelectorAll('a.button')].some((a) => a.textContent === 'Draw')");
         browser.evaluate("[...document.querySelectorAll('a.button')].find((a) => a.textContent === 'Draw').click()");
         browser.until("document.querySelector('.playground textarea')");
         browser.evaluate("document.querySelector('#sentence').focus(); document.querySelector('#sentence').select()");
         browser.write("a person waves");
+        // A link fills the form; only a press draws.
         browser.go(&format!("{url}/draw?s=a+person+waves&model=walks:2&model=walks:1&seed=3"));
+        browser.until("document.querySelector('.playground button.main')");
+        assert_eq!(browser.evaluate("document.querySelector('#sentence').value"), json!("a person waves"));
+        assert_eq!(browser.evaluate("document.querySelector('.playground button.main').textContent"), json!("Draw"));
+        assert_eq!(browser.evaluate("document.querySelector('[role=status], canvas.figure, .want') === null"), json!(true));
+        browser.evaluate("document.querySelector('.playground button.main').focus()");
+        browser.press("Enter");
         browser.until("document.querySelectorAll('canvas.figure').length === 2 && document.querySelectorAll('canvas.strip').length === 2");
         browser.until("document.querySelector('main').textContent.includes('Drawn before')");
         assert_eq!(browser.evaluate("document.querySelectorAll('.measures')[0].textContent"), json!("feet slide in 12.5 % of the steps · jerk 21.3 m/s³"));
@@ -112,8 +119,35 @@ async fn a_browser_draws_with_several_models() -> TestResult {
         let command = "document.querySelector('section[aria-labelledby=take] .command code').textContent";
         assert_eq!(browser.evaluate(command), json!("trainer generate 'a person waves' --model 'walks:2' --seed 3 -o motion.bvh"));
 
+        // A path by keyboard, and another by mouse in its place. It is in the address of the draw.
+        browser.evaluate("document.querySelector('details.way').open = true; document.querySelector('.floor').focus()");
+        for key in ["ArrowUp", "ArrowUp", "ArrowLeft"] {
+            browser.press(key);
+        }
+        let says = |path: &str| format!("document.querySelector('.floor').getAttribute('aria-label').includes('{path}.')");
+        browser.until(&says("a path of 1.5 m"));
+        browser.press("Backspace");
+        browser.until(&says("a path of 1.0 m"));
+        themes(&mut browser, "path");
+        browser.evaluate("document.querySelector('.floor').scrollIntoView({block: 'center'})");
+        let [left, top, right, bottom] = browser.places(".floor")[0];
+        // From above: six metres wide, and the figure starts a metre above the lower edge.
+        let at = |x: f64, z: f64| [left + (3.0 - x) / 6.0 * (right - left), top + (5.0 - z) / 6.0 * (bottom - top)];
+        let events = [("mousePressed", at(0.0, 0.5)), ("mouseMoved", at(0.0, 1.0)), ("mouseMoved", at(-1.0, 1.0)), ("mouseReleased", at(-1.0, 1.0))];
+        for (kind, [x, y]) in events {
+            let event = json!({"type": kind, "x": x, "y": y, "button": "left", "buttons": 1, "clickCount": 1});
+            browser.call("Input.dispatchMouseEvent", &event);
+        }
+        browser.until(&says("a path of 2.0 m"));
+        keep(&mut browser, "path-drawn.png");
+        browser.evaluate("document.querySelector('.playground button.main').focus()");
+        browser.press("Enter");
+        browser.until("new URLSearchParams(location.search).get('path')?.split(' ').length === 3");
+
         // A draw without a worker waits for one, and the page says how one joins.
         browser.go(&format!("{url}/draw?s=a+new+sentence&model=walks:1"));
+        browser.until("document.querySelector('.playground button.main')");
+        browser.evaluate("document.querySelector('.playground button.main').click()");
         browser.until("document.querySelector('.want .command')?.textContent.includes('trainer worker join')");
 
         is_harmless(&mut browser, &url);
