@@ -26,8 +26,10 @@ fn blob(cluster: &Cluster, digest: &Value) -> Value {
 fn a_worker_draws_with_a_registered_model() {
     let mut cluster = Cluster::start(TRAINER);
     cluster.join("a");
-    let trained = cluster.submit(Path::new(&Bench::config("smoke.yaml")), &[]);
-    assert_eq!(cluster.wait_end(&trained)["state"], "finished");
+    let kept = ["--set", "stages.mld.checkpoint.keep={latest: 3, ended: 3}"];
+    let trained = cluster.submit(Path::new(&Bench::config("smoke.yaml")), &kept);
+    let ended = cluster.wait_end(&trained);
+    assert_eq!(ended["state"], "finished");
 
     let asked = json!({
         "models": ["smoke@staging", "smoke:1"], "sentences": ["a person walks", "a person <b>jumps</b>"], "count": 2,
@@ -60,6 +62,23 @@ fn a_worker_draws_with_a_registered_model() {
     seeded["seed"] = json!(8);
     let seeded = stage_of(&draw(&cluster, &seeded), "m-smoke-1");
     assert!(seeded["state"] == "ran" && seeded["outputs"]["report"] != names[1], "{seeded}");
+
+    // So do checkpoints. That of the last step gives the model of the training.
+    let kept = cluster.get(&format!("/v1/runs/{trained}/checkpoints")).expect("a list");
+    let kept = kept.as_array().expect("a list").iter().filter(|kept| kept["stage"] == "mld");
+    let steps: Vec<u64> = kept.filter_map(|kept| kept["step"].as_u64().filter(|_| kept["draws"] == true)).collect();
+    assert_eq!(steps, [10, 15, 16]);
+    let named = |step: &u64| json!({"run": trained, "stage": "mld", "step": step});
+    let checkpoints: Vec<Value> = steps[1..].iter().map(named).collect();
+    let by_step = json!({"checkpoints": checkpoints, "sentences": ["a person walks"], "steps": 2, "seconds": 2.0});
+    let run = draw(&cluster, &by_step);
+    assert_eq!(stage_of(&run, "c-mld-16")["outputs"]["model"], stage_of(&ended, "mld")["outputs"]["model"], "{run}");
+    let report = |step: u64| stage_of(&run, &format!("m-mld-{step}"))["outputs"]["report"].clone();
+    assert!(report(15).is_string() && report(15) != report(16), "{run}");
+    assert_eq!(stage_of(&draw(&cluster, &by_step), "m-mld-15")["state"], "cached");
+    let pruned = json!({"checkpoints": [named(&5)], "sentences": ["a person walks"]});
+    let reply = cluster.post("/v1/draws", &pruned).expect("an answer");
+    assert_eq!((reply.status, &reply.body["code"]), (404, &json!("not-found")), "{}", reply.body);
 
     // A refusal of the server, of the scope, and of the worker.
     let unknown = json!({"models": ["none@prod"], "sentences": ["a person walks"]});

@@ -34,6 +34,8 @@ fn a_run_and_the_next_one_are_seen_on_the_page() {
     let mut cluster = Cluster::start(TRAINER);
     ["a", "b"].into_iter().for_each(|name| cluster.join(name));
     let steps = ["--set", "stages.vae.steps=60", "--set", "stages.pcm.steps=40"];
+    let keeps = ["--set", "stages.mld.checkpoint.keep={latest: 4, ended: 4}"];
+    let steps = [&steps[..], &keeps].concat();
     let first = cluster.submit(Path::new(&config), &steps);
     cluster.wait_end(&first);
     let faster = [&steps[..], &["--set", "stages.pcm.lr=1e-3"]].concat();
@@ -92,6 +94,18 @@ fn a_run_and_the_next_one_are_seen_on_the_page() {
     keep(&mut browser, "draw.png", DESK);
     browser.resize(PHONE);
     keep(&mut browser, "draw-phone.png", PHONE);
+
+    // Each checkpoint that is kept draws the same sentence.
+    browser.resize(DESK);
+    browser.go(&format!("{url}/runs/{first}/mld"));
+    let press = "[...document.querySelectorAll('section[aria-labelledby=kept] button')].find((button) => button.textContent === 'Draw them')";
+    browser.until(press);
+    browser.evaluate(&format!("{press}.click()"));
+    browser.until("document.querySelectorAll('svg.still').length === 4");
+    browser.evaluate("document.querySelector('section[aria-labelledby=kept]').scrollIntoView()");
+    keep(&mut browser, "checkpoints.png", DESK);
+    browser.resize(PHONE);
+    keep(&mut browser, "checkpoints-phone.png", PHONE);
     let complaints = browser.complaints();
     assert_eq!(complaints.len(), before, "{complaints:#?}");
 }

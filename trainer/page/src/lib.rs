@@ -61,7 +61,7 @@ macro_rules! files {
 }
 
 /// Everything that lies in `static` but licences.
-static FILES: [(&str, &[u8]); 38] = files![
+static FILES: [(&str, &[u8]); 40] = files![
     "index.html",
     "icon.svg",
     "style.css",
@@ -79,6 +79,8 @@ static FILES: [(&str, &[u8]); 38] = files![
     "viewer.js",
     "motions.js",
     "floor.js",
+    "drawing.js",
+    "thumbnails.js",
     "features.js",
     "viewer.css",
     "settings.js",

@@ -24,6 +24,7 @@ use super::actor_handle::ActorHandle;
 use super::audit;
 use super::auth::{self, Gate};
 use super::bundles::BundleQuery;
+use super::checkpoints::KeptCheckpoint;
 use super::curves::{Curves, CurvesAsked};
 use super::described::{Bytes, Described, EventStream, Nothing, OpenMetrics, Packed, described};
 use super::draws::{Draw, Drawing};
@@ -36,7 +37,7 @@ use super::records::StageMetrics;
 use super::route::Route;
 use super::session_calls::Who;
 use super::settings::RunSettings;
-use super::{bundles, curves, draws, events, page_files, polls, queries, scrape, session_calls, settings, uploads};
+use super::{bundles, checkpoints, curves, draws, events, page_files, polls, queries, scrape, session_calls, settings, uploads};
 use crate::view::WorkerView;
 
 /// Time limit of a call that waits only for the disk.
@@ -126,6 +127,8 @@ fn table() -> Vec<Entry> {
             described::<Query<LogQuery>, Nothing, Json<Vec<LogRow>>>("Lists log lines of a run")),
         entry("GET",  "/v1/runs/{run}/metrics",    &[Read],         CALL,                     SHORT, queries::points,
             described::<Query<PointQuery>, Nothing, Packed<StageMetrics>>("Lists every value of a run")),
+        entry("GET",  "/v1/runs/{run}/checkpoints", &[Read],        CALL,                     SHORT, checkpoints::checkpoints,
+            described::<Nothing, Nothing, Json<Vec<KeptCheckpoint>>>("Lists the checkpoints of a run that are kept")),
         entry("GET",  "/v1/runs/{run}/settings",   &[Read],         CALL,                     SHORT, settings::settings,
             described::<Nothing, Nothing, Json<RunSettings>>("Shows the settings of a run's stages")),
         entry("POST", "/v1/runs/{run}/{action}",   &[Submit],       CALL,                     SHORT, queries::control,

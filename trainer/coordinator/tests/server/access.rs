@@ -61,7 +61,7 @@ fn expected(method: &str, path: &str) -> &'static [Scope] {
     use Scope::{Admin, Promote, Read, Submit, Worker};
     match (method, path) {
         ("GET", "/v1/runs" | "/v1/runs/{run}" | "/v1/runs/{run}/logs" | "/v1/runs/{run}/metrics") => &[Read],
-        ("GET", "/v1/runs/{run}/settings") => &[Read],
+        ("GET", "/v1/runs/{run}/settings" | "/v1/runs/{run}/checkpoints") => &[Read],
         ("GET", "/metrics" | "/v1/metrics" | "/v1/history" | "/v1/events" | "/v1/workers") => &[Read],
         ("GET" | "POST" | "DELETE", "/v1/session") => &[Read],
         ("POST", "/v1/runs" | "/v1/draws" | "/v1/runs/{run}/{action}" | "/v1/bundles") => &[Submit],

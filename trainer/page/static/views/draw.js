@@ -2,17 +2,18 @@
 //!
 //! Its address has all of a draw. A link only fills the form, because a page of another host must not start work here.
 
-import { blob, CallError, get, post, registry, runPath } from "../api.js";
+import { CallError, registry } from "../api.js";
+import { drawing } from "../drawing.js";
 import { floor, fromText, lengthOf, positions, toText } from "../floor.js";
 import { count, number, plain } from "../format.js";
 import { Figures, together } from "../motions.js";
-import { badge, command, failed, firstLine, isDone, isOver, joinCommand, prose } from "../parts.js";
+import { badge, command, failed, firstLine, isDone, joinCommand, prose } from "../parts.js";
 import { address, remember } from "../router.js";
 import { may } from "../session.js";
 import { html, nothing } from "../vendor/lit-html.js";
 
-/** Limits of a draw, and the milliseconds between two questions how far it is. */
-const [MODELS, SENTENCES, ASK_MS] = [4, 8, 350];
+/** Limits of a draw. */
+const [MODELS, SENTENCES] = [4, 8];
 /** Forms of the files of one motion. */
 const FORMS = ["bvh", "glb", "npy"];
 const EXAMPLES = ["a person walks in a circle", "a person jumps forward twice", "someone waves with the right hand and sits down"];
@@ -68,24 +69,21 @@ export function draw(context) {
 
   async function start() {
     if (busy || lines().length === 0 || chosen.length === 0) return;
-    [busy, wrong, hint] = [true, "", ""];
+    [busy, wrong, hint, drawn] = [true, "", "", false];
     keep();
     context.draw();
     const number = (/** @type {string | undefined} */ text) => (text ? Number(text) : undefined);
     /** @type {Asked} */
     const asked = { models: chosen, sentences: lines().slice(0, SENTENCES), seed: Math.abs(Math.trunc(Number(seed) || 0)), seconds: number(seconds), guidance: number(guidance), steps: number(steps), path: positions(path, number(seconds)) };
     try {
-      const { run, stages } = await post("/v1/draws", asked);
-      shown = { ...asked, run: null, notes: asked.models.map((name) => choices.find((choice) => choice.name === name)?.note ?? "") };
-      for (;;) {
-        const now = /** @type {Run} */ (await get(runPath(run)));
-        if (left) return;
-        shown.run = now;
+      const asks = { ...asked, run: null, notes: asked.models.map((name) => choices.find((choice) => choice.name === name)?.note ?? "") };
+      shown = asks;
+      const reports = await drawing(asked, (run) => {
+        shown = { ...asks, run };
         context.draw();
-        if (isOver(now) || now.state === "paused") break;
-        await new Promise((done) => setTimeout(done, ASK_MS));
-      }
-      if (shown.run?.state === "finished") await fetchMotions(shown.run, stages, shown);
+        return !left;
+      });
+      if (reports.length > 0 && !left) showMotions(reports, asks);
     } catch (error) {
       if (!(error instanceof CallError)) throw error;
       [wrong, hint] = [error.message, error.hint ?? ""];
@@ -94,15 +92,8 @@ export function draw(context) {
     context.draw();
   }
 
-  /** @param {Run} run @param {string[]} stages @param {NonNullable<typeof shown>} asked */
-  async function fetchMotions(run, stages, asked) {
-    const json = async (/** @type {string} */ digest) => JSON.parse(new TextDecoder().decode(await blob(digest)));
-    const all = await Promise.all(stages.map(async (name) => {
-      const report = run.stages.find((stage) => stage.name === name)?.outputs.report ?? "";
-      const { files } = /** @type {{files: Record<string, {digest: string}>}} */ (await json(report));
-      return { files, motions: /** @type {import("../viewer.js").Motions} */ (await json(files["motions.json"]?.digest ?? "")) };
-    }));
-    if (left) return;
+  /** @param {import("../drawing.js").Report[]} all @param {NonNullable<typeof shown>} asked */
+  function showMotions(all, asked) {
     const several = asked.models.length > 1;
     const captions = asked.models.flatMap((model, of) => asked.sentences.map((sentence, at) => ({
       title: several ? model : sentence,

@@ -66,7 +66,14 @@ fn cases(lab: &Lab, kind: &Kind, method: &'static str, path: &'static str) -> Op
         // A session's calls change only the caller's own session; a token has none.
         ("GET" | "POST" | "DELETE", "/v1/session") => case(path.to_owned(), Value::Null, filtered),
         ("GET", "/metrics" | "/v1/runs" | "/v1/workers") => case(path.to_owned(), Value::Null, filtered),
-        ("GET", "/v1/runs/{run}" | "/v1/runs/{run}/logs" | "/v1/runs/{run}/metrics" | "/v1/runs/{run}/settings") => {
+        (
+            "GET",
+            "/v1/runs/{run}"
+            | "/v1/runs/{run}/logs"
+            | "/v1/runs/{run}/metrics"
+            | "/v1/runs/{run}/settings"
+            | "/v1/runs/{run}/checkpoints",
+        ) => {
             for project in Project::ALL {
                 case(path.replace("{run}", lab.runs[&project].as_str()), Value::Null, reads(kind, project));
             }
