@@ -84,11 +84,15 @@ fn a_run_and_the_next_one_are_seen_on_the_page() {
     browser.until("document.querySelector('.playground button.main')");
     browser.evaluate("document.querySelector('.playground button.main').focus()");
     browser.press("Enter");
-    browser.until("document.querySelector('canvas.figure') && document.querySelector('.measures').textContent.includes('jerk')");
+    browser.until(
+        "document.querySelector('canvas.figure') && document.querySelector('.measures').textContent.includes('jerk')",
+    );
     browser.go(&format!("{url}/draw?s=a+person+walks+in+a+circle&model=smoke:1&model=smoke:2&seed=4&seconds=4"));
     browser.until("document.querySelector('.playground button.main')");
     browser.evaluate("document.querySelector('.playground button.main').click()");
-    browser.until("document.querySelectorAll('canvas.figure').length === 2 && document.querySelectorAll('.files a').length === 6");
+    browser.until(
+        "document.querySelectorAll('canvas.figure').length === 2 && document.querySelectorAll('.files a').length === 6",
+    );
     let saved = "fetch(document.querySelector('.files a[download$=glb]').href).then((answer) => answer.text()).then((text) => text.slice(0, 4))";
     assert_eq!(browser.evaluate(saved), json!("glTF"));
     keep(&mut browser, "draw.png", DESK);

@@ -8,9 +8,9 @@ use motion::Skeleton;
 use protocol::artifact::Role;
 use protocol::stage::{
     Batch, ControlDistance, ControlFeedback, ControlHints, ControlLoss, ControlMean, ControlSetting, DataFormat,
-    DataSynthetic, Decay, DistillLcm, DistillPcm, Distillation, DrawMotions, EncodeLatents, EvaluateControl, EvaluatorNetwork,
-    LatentShape, MovementPhase, Network, Optimizer, Sampler, StageSettings, TextEmbed, TrainControl, TrainEvaluator,
-    TrainMld, TrainVae, Training,
+    DataSynthetic, Decay, DistillLcm, DistillPcm, Distillation, DrawMotions, EncodeLatents, EvaluateControl,
+    EvaluatorNetwork, LatentShape, MovementPhase, Network, Optimizer, Sampler, StageSettings, TextEmbed, TrainControl,
+    TrainEvaluator, TrainMld, TrainVae, Training,
 };
 use protocol::{Digest, Manifest, Seed, Steps};
 use stage_lab::{Bench, Script};
@@ -276,7 +276,11 @@ fn a_control_part_learns_and_is_heeded() {
         let motions = artifacts::file(&*bench.blobs(), &drawn, "motions.json").expect("motions");
         let motions: serde_json::Value = serde_json::from_slice(&motions).expect("JSON");
         let motion = &motions["motions"][0];
-        assert_eq!((&motion["frames"], motion["waypoints"].as_array().map(Vec::len)), (&60.into(), Some(2)), "{motion}");
+        assert_eq!(
+            (&motion["frames"], motion["waypoints"].as_array().map(Vec::len)),
+            (&60.into(), Some(2)),
+            "{motion}"
+        );
         let short = DrawMotions { seconds: 2.0, ..drawing.clone() };
         let refused = bench.run("drawn", &short.into(), &[("model", ran.output())]).expect_err("too short").to_string();
         assert!(refused.contains("`path`: it takes 3.00 s; expected at most 2.00"), "{refused}");

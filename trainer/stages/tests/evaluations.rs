@@ -515,9 +515,13 @@ fn sentences_are_drawn_in_the_viewers_form_and_by_the_seed_alone() {
     let several = DrawMotions { count: 2, seconds: 0.0, ..settings.clone() };
     let ran = bench.run("drawn", &several.into(), &inputs).expect("the stage runs");
     let several = bench.manifest(ran.output()).expect("stored");
-    let file = |manifest: &protocol::Manifest, name: &str| artifacts::file(&*bench.blobs(), manifest, name).expect("a file");
+    let file =
+        |manifest: &protocol::Manifest, name: &str| artifacts::file(&*bench.blobs(), manifest, name).expect("a file");
     let motions: serde_json::Value = serde_json::from_slice(&file(&several, "motions.json")).expect("JSON");
-    assert_eq!(motions["captions"], serde_json::json!(["a person walks", "a person walks", "a person jumps", "a person jumps"]));
+    assert_eq!(
+        motions["captions"],
+        serde_json::json!(["a person walks", "a person walks", "a person jumps", "a person jumps"])
+    );
     let drawn = motions["motions"].as_array().expect("a list");
     let jerks: Vec<f64> = drawn.iter().filter_map(|motion| motion["measures"]["jerk"].as_f64()).collect();
     assert!(jerks.len() == 4 && jerks.iter().all(|jerk| *jerk > 0.0), "{jerks:?}");

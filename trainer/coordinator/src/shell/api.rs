@@ -37,7 +37,9 @@ use super::records::StageMetrics;
 use super::route::Route;
 use super::session_calls::Who;
 use super::settings::RunSettings;
-use super::{bundles, checkpoints, curves, draws, events, page_files, polls, queries, scrape, session_calls, settings, uploads};
+use super::{
+    bundles, checkpoints, curves, draws, events, page_files, polls, queries, scrape, session_calls, settings, uploads,
+};
 use crate::view::WorkerView;
 
 /// Time limit of a call that waits only for the disk.

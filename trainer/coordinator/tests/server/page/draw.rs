@@ -49,11 +49,15 @@ async fn a_browser_draws_with_several_models() -> TestResult {
     }
     let promote = json!({"command": "promote", "reference": "walks:1", "to": "prod", "expect": null, "require": [], "reason": "first"});
     server.request(Method::POST, "/v1/registry").json(&promote).send().await?.error_for_status()?;
-    let report = artifact(&store, ArtifactKind::Report, &[
-        ("motions.json", motions().to_string().into_bytes()),
-        ("motion-00.bvh", b"HIERARCHY".to_vec()),
-        ("motions.html", b"<!DOCTYPE html><script>window.hostile=1</script>".to_vec()),
-    ])?;
+    let report = artifact(
+        &store,
+        ArtifactKind::Report,
+        &[
+            ("motions.json", motions().to_string().into_bytes()),
+            ("motion-00.bvh", b"HIERARCHY".to_vec()),
+            ("motions.html", b"<!DOCTYPE html><script>window.hostile=1</script>".to_vec()),
+        ],
+    )?;
     for model in ["walks:1", "walks:2"] {
         let asked = json!({"models": [model], "sentences": ["a person waves"], "seed": 3});
         let answer = server.request(Method::POST, "/v1/draws").json(&asked).send().await?;
@@ -80,7 +84,7 @@ async fn a_browser_draws_with_several_models() -> TestResult {
         browser.until("document.querySelector('.playground button.main')");
         assert_eq!(browser.evaluate("document.querySelector('#sentence').value"), json!("a person waves"));
         assert_eq!(browser.evaluate("document.querySelector('.playground button.main').textContent"), json!("Draw"));
-        assert_eq!(browser.evaluate("document.querySelector('[role=status], canvas.figure, .want') === null"), json!(true));
+        assert_eq!(browser.evaluate("document.querySelector('main p[role=status], main canvas.figure, main .want') === null"), json!(true));
         browser.evaluate("document.querySelector('.playground button.main').focus()");
         browser.press("Enter");
         browser.until("document.querySelectorAll('canvas.figure').length === 2 && document.querySelectorAll('canvas.strip').length === 2");
