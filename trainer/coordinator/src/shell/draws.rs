@@ -2,7 +2,7 @@
 //!
 //! A draw is a run of the pipeline [`PIPELINE`] with a stage `draw.motions` for each model. So an idle worker claims it
 //! like other work, and its result has a key: the same draw is answered from the store. The motions are in the stage's
-//! artifact, in the viewer's form. A checkpoint has a stage more, which makes a model of it.
+//! artifact, in the viewer's form. A checkpoint has one more stage, which makes a model of it.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
