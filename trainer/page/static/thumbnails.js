@@ -28,14 +28,16 @@ export function still(motions, says) {
   const poses = Array.from({ length: POSES }, (_, pose) => {
     const frame = Math.round((pose / (POSES - 1)) * (motion.frames - 1));
     const value = (/** @type {number} */ joint, /** @type {number} */ axis) => joints[3 * (frame * count + joint) + axis] ?? 0;
-    const place = (/** @type {number} */ joint) => {
+    /** @param {number} joint @returns {[string, string]} */
+    const place = (joint) => {
       const right = (value(joint, 0) - value(0, 0)) * cos - (value(joint, 2) - value(0, 2)) * sin;
       return [(WIDE * (pose + 0.5) + right).toFixed(2), (HIGH - value(joint, 1)).toFixed(2)];
     };
     return body.parents.map((parent, joint) => {
       if (parent === joint) return nothing;
       const [[x1, y1], [x2, y2]] = [place(parent), place(joint)];
-      return svg`<line class=${body.sides[joint] ?? "m"} x1=${x1 ?? 0} y1=${y1 ?? 0} x2=${x2 ?? 0} y2=${y2 ?? 0}></line>`;
+      const head = joint === body.head ? svg`<circle cx=${x2} cy=${y2} r="0.11"></circle>` : nothing;
+      return svg`<line class=${body.sides[joint] ?? "m"} x1=${x1} y1=${y1} x2=${x2} y2=${y2}></line>${head}`;
     });
   });
   return html`<svg class="still" viewBox=${`0 0 ${POSES * WIDE} ${HIGH + 0.1}`} role="img" aria-label=${says}>${svg`<line class="ground" x1="0" x2=${POSES * WIDE} y1=${HIGH} y2=${HIGH}></line>${poses}`}</svg>`;
