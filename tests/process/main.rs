@@ -14,6 +14,7 @@ mod cluster;
 mod damage;
 mod determinism;
 mod documented;
+mod draws;
 mod failpoints;
 mod files;
 mod hub;

@@ -34,6 +34,8 @@ fn a_run_and_the_next_one_are_seen_on_the_page() {
     let mut cluster = Cluster::start(TRAINER);
     ["a", "b"].into_iter().for_each(|name| cluster.join(name));
     let steps = ["--set", "stages.vae.steps=60", "--set", "stages.pcm.steps=40"];
+    let keeps = ["--set", "stages.mld.checkpoint.keep={latest: 4, ended: 4}"];
+    let steps = [&steps[..], &keeps].concat();
     let first = cluster.submit(Path::new(&config), &steps);
     cluster.wait_end(&first);
     let faster = [&steps[..], &["--set", "stages.pcm.lr=1e-3"]].concat();
@@ -72,6 +74,42 @@ fn a_run_and_the_next_one_are_seen_on_the_page() {
     browser.go(&format!("{url}/models/smoke"));
     browser.until("document.querySelector('main')?.textContent.includes('staging')");
     keep(&mut browser, "model-phone.png", PHONE);
+
+    // From the model to a motion in two presses; then both versions beside each other by a link.
+    browser.resize(DESK);
+    browser.go(&format!("{url}/models/smoke"));
+    let drawing = "[...document.querySelectorAll('a.button')].find((link) => link.textContent === 'Draw')";
+    browser.until(drawing);
+    browser.evaluate(&format!("{drawing}.click()"));
+    browser.until("document.querySelector('.playground button.main')");
+    browser.evaluate("document.querySelector('.playground button.main').focus()");
+    browser.press("Enter");
+    browser.until(
+        "document.querySelector('canvas.figure') && document.querySelector('.measures').textContent.includes('jerk')",
+    );
+    browser.go(&format!("{url}/draw?s=a+person+walks+in+a+circle&model=smoke:1&model=smoke:2&seed=4&seconds=4"));
+    browser.until("document.querySelector('.playground button.main')");
+    browser.evaluate("document.querySelector('.playground button.main').click()");
+    browser.until(
+        "document.querySelectorAll('canvas.figure').length === 2 && document.querySelectorAll('.files a').length === 6",
+    );
+    let saved = "fetch(document.querySelector('.files a[download$=glb]').href).then((answer) => answer.text()).then((text) => text.slice(0, 4))";
+    assert_eq!(browser.evaluate(saved), json!("glTF"));
+    keep(&mut browser, "draw.png", DESK);
+    browser.resize(PHONE);
+    keep(&mut browser, "draw-phone.png", PHONE);
+
+    // Each checkpoint that is kept draws the same sentence.
+    browser.resize(DESK);
+    browser.go(&format!("{url}/runs/{first}/mld"));
+    let press = "[...document.querySelectorAll('section[aria-labelledby=kept] button')].find((button) => button.textContent === 'Draw them')";
+    browser.until(press);
+    browser.evaluate(&format!("{press}.click()"));
+    browser.until("document.querySelectorAll('svg.still').length === 4");
+    browser.evaluate("document.querySelector('section[aria-labelledby=kept]').scrollIntoView()");
+    keep(&mut browser, "checkpoints.png", DESK);
+    browser.resize(PHONE);
+    keep(&mut browser, "checkpoints-phone.png", PHONE);
     let complaints = browser.complaints();
     assert_eq!(complaints.len(), before, "{complaints:#?}");
 }

@@ -14,6 +14,19 @@ from .conftest import TRAINER
 
 HERE = Path(__file__).parents[1]
 
+MODEL = """\
+  latents: {kind: encode.latents, vae: vae}
+  mld:
+    kind: train.mld
+    network: {width: 16, layers: 3, heads: 2, feed_forward: 32}
+    steps: 4
+    batch: {global: 4, slices: 1}
+    lr: 1e-3
+    warmup: 2
+  fid: {kind: evaluate.latent_fid, model: mld, sampler: {steps: 2, guidance: 3}, repeats: 1, components: 4}
+  release: {kind: register, model: tiny, from: [mld], promote: {to: prod}}
+"""
+
 
 @pytest.fixture(scope="session")
 def finished(server: stride.Server, pipeline: Path) -> stride.Run:
@@ -100,3 +113,22 @@ def test_tensorboard_reads_what_is_exported(finished: stride.Run, server: stride
     assert [scalar.step for scalar in scalars] == loss.steps
     assert [scalar.value for scalar in scalars] == pytest.approx(loss.values, rel=1e-6)
     assert all(abs(scalar.wall_time - time.time()) < 3600 for scalar in scalars)
+
+
+def test_a_version_draws_motions(server: stride.Server, pipeline: Path) -> None:
+    numpy = pytest.importorskip("numpy")
+    text = pipeline.read_text()
+    model = pipeline.with_name("model.yaml")
+    model.write_text(text + MODEL)
+    assert server.submit(model).wait().state == "finished"
+    version = server.model("tiny@prod")
+    motions = version.generate("a person walks", n=4, seconds=2.0, seed=3)
+    assert (motions.dtype, motions.shape) == (numpy.float32, (4, 40, 22, 3))
+    assert numpy.isfinite(motions).all()
+    assert numpy.array_equal(version.generate("a person walks", seconds=2.0, seed=5), motions[2:3])
+    with pytest.raises(stride.StrideError, match="60") as error:
+        version.generate("a person walks", seconds=61.0)
+    assert error.value.code == "invalid"
+    with pytest.raises(stride.StrideError, match="seconds") as error:
+        version.generate("a person walks", seconds=59.0)
+    assert error.value.code == "failed"

@@ -40,11 +40,12 @@ pub const VIEWER: &str = include_str!("../static/viewer.js");
 pub const VIEWER_STYLE: &str = include_str!("../static/viewer.css");
 
 /// The addresses at which the page itself is shown: each is a view. What stands behind the last slash is the page's to read.
-pub const VIEWS: [&str; 10] = [
+pub const VIEWS: [&str; 11] = [
     "/",
     "/runs",
     "/runs/{*rest}",
     "/compare",
+    "/draw",
     "/data",
     "/data/{*rest}",
     "/models",
@@ -60,7 +61,7 @@ macro_rules! files {
 }
 
 /// Everything that lies in `static` but licences.
-static FILES: [(&str, &[u8]); 36] = files![
+static FILES: [(&str, &[u8]); 40] = files![
     "index.html",
     "icon.svg",
     "style.css",
@@ -77,6 +78,9 @@ static FILES: [(&str, &[u8]); 36] = files![
     "rates.js",
     "viewer.js",
     "motions.js",
+    "floor.js",
+    "drawing.js",
+    "thumbnails.js",
     "features.js",
     "viewer.css",
     "settings.js",
@@ -89,6 +93,7 @@ static FILES: [(&str, &[u8]); 36] = files![
     "views/run.js",
     "views/stage.js",
     "views/compare.js",
+    "views/draw.js",
     "views/data.js",
     "views/models.js",
     "views/workers.js",

@@ -35,13 +35,13 @@ async function send(method, path, more = {}) {
     throw new CallError(0, "away", "The server does not answer.", null);
   }
   if (answer.ok) return answer;
-  let said = /** @type {{code?: string, message?: string, hint?: string | null}} */ ({});
+  let said = /** @type {{code?: string, detail?: string, hint?: string | null}} */ ({});
   try {
     said = await answer.json();
   } catch {
     // An answer of something in between, such as a proxy.
   }
-  throw new CallError(answer.status, said.code ?? "unknown", said.message ?? `The server answered ${answer.status}.`, said.hint ?? null);
+  throw new CallError(answer.status, said.code ?? "unknown", said.detail ?? `The server answered ${answer.status}.`, said.hint ?? null);
 }
 
 /** @param {string} path @param {AbortSignal} [signal] @returns {Promise<any>} */

@@ -7,6 +7,7 @@ import { currentWho, setWho } from "./session.js";
 import { html, nothing, render } from "./vendor/lit-html.js";
 import { compare } from "./views/compare.js";
 import { dataset, datasets } from "./views/data.js";
+import { draw as playground } from "./views/draw.js";
 import { login } from "./views/login.js";
 import { model, models } from "./views/models.js";
 import { now } from "./views/now.js";
@@ -44,6 +45,7 @@ function viewAt(at, context) {
   if (first === "runs" && second !== undefined) return run(context, second);
   if (first === "data" && second !== undefined) return dataset(context, second);
   if (first === "data") return datasets(context);
+  if (first === "draw") return playground(context);
   if (first === "compare") return compare(context);
   if (first === "models" && second === undefined) return models(context);
   if (first === "models" && second !== undefined) return model(context, second);
@@ -57,6 +59,7 @@ const PLACES = [
   ["/", "Now", "now"],
   ["/runs", "Runs", "runs"],
   ["/models", "Models", "models"],
+  ["/draw", "Draw", "draw"],
   ["/data", "Data", "data"],
   ["/workers", "Workers", "workers"],
   ["/store", "Store", "store"],

@@ -3,7 +3,8 @@
 import { number, plain } from "./format.js";
 import { mount } from "./viewer.js";
 
-/** @typedef {{title: string, note: string}} Caption */
+/** A blob under a name of its own. @typedef {{text: string, digest: string, name: string}} Download */
+/** @typedef {{title: string, note: string, files?: Download[]}} Caption */
 
 export class Figures {
   constructor() {
@@ -38,6 +39,8 @@ export class Figures {
       canvas.setAttribute("role", "img");
       canvas.setAttribute("aria-label", `${title.textContent}: ${note.textContent}. Arrow keys turn the view.`);
       figure.append(text, canvas);
+      const files = captions[at]?.files ?? [];
+      if (files.length > 0) figure.append(downloads(files, title.textContent));
       row.append(figure);
     });
     const bar = document.createElement("div");
@@ -48,6 +51,21 @@ export class Figures {
     this.shown = mount(this.element, motions);
     this.shown.play(!matchMedia("(prefers-reduced-motion: reduce)").matches);
   }
+}
+
+/** Links that save blobs. @param {Download[]} files @param {string} of */
+function downloads(files, of) {
+  const list = document.createElement("p");
+  list.className = "files";
+  for (const { text, digest, name } of files) {
+    const link = document.createElement("a");
+    link.href = `/v1/blobs/${encodeURIComponent(digest)}`;
+    link.download = name;
+    link.textContent = text;
+    link.setAttribute("aria-label", `Save ${of} as ${text}`);
+    list.append(link);
+  }
+  return list;
 }
 
 /** Several answers as one, so that they share a time line. @param {import("./viewer.js").Motions[]} all @returns {import("./viewer.js").Motions} */

@@ -7,7 +7,8 @@
 
 /** @typedef {{parents: number[], sides: string, head: number | null}} Body */
 /** A waypoint is its frame, its joint and its place in metres. @typedef {[number, number, number, number, number]} Waypoint */
-/** @typedef {{body: number, fps: number, frames: number, step: number, origin: number[], joints: string, waypoints: Waypoint[]}} Motion */
+/** Measures of the exact motion: the share of steps in which a foot slides, and the mean jerk in m/s³. @typedef {{skating: number, jerk: number}} Measures */
+/** @typedef {{body: number, fps: number, frames: number, step: number, origin: number[], joints: string, waypoints: Waypoint[], measures?: Measures}} Motion */
 /** @typedef {{bodies: Body[], motions: Motion[]}} Motions */
 /** @typedef {[number, number, number]} Point */
 /** @typedef {{x: number, y: number, scale: number, depth: number}} Dot */
@@ -110,9 +111,10 @@ function prepare(motion, body, canvas) {
   strip.setAttribute("aria-hidden", "true");
   const measures = document.createElement("p");
   measures.className = "measures";
-  const sliding = slides.length === 0 ? 0 : slides.filter(Boolean).length / slides.length;
+  const sliding = motion.measures?.skating ?? (slides.length === 0 ? 0 : slides.filter(Boolean).length / slides.length);
+  const jerk = motion.measures ? ` · jerk ${motion.measures.jerk.toFixed(1)} m/s³` : "";
   const missed = misses.length === 0 ? "" : ` · waypoints missed by ${(100 * misses.reduce((sum, one) => sum + one, 0) / misses.length).toFixed(1)} cm in the mean`;
-  if (feet.length > 0) measures.textContent = `feet slide in ${(100 * sliding).toFixed(1)} % of the steps${missed}`;
+  if (feet.length > 0) measures.textContent = `feet slide in ${(100 * sliding).toFixed(1)} % of the steps${jerk}${missed}`;
   canvas.after(strip, measures);
   return {
     canvas, strip, measures, body, joints, count, width, course, feet, sliding, misses, fps, frames, waypoints,

@@ -109,7 +109,7 @@ impl Pipeline {
     }
 
     /// Records the code versions of its kinds, including the kinds that evaluate trials.
-    pub(crate) fn note_code_versions(&mut self) {
+    pub fn note_code_versions(&mut self) {
         let evaluations = self.stages.iter().filter_map(|stage| stage.sweep.as_ref()).map(|sweep| &*sweep.evaluate);
         let kinds = self.stages.iter().map(|stage| &stage.settings).chain(evaluations);
         let beyond = kinds.filter(|settings| settings.code_version() > FIRST_VERSION);

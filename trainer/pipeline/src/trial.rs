@@ -1,8 +1,10 @@
 //! Effects of a sweep on the pipeline: its inputs, its readers, and the stages of a trial.
 
+use std::collections::BTreeMap;
+
 use protocol::stage::{Placement, Shape, StageSettings, Target, WorkerRange};
 use protocol::sweep::{Derived, STATE_OUTPUT, Values, evaluated_field, rung_name};
-use protocol::{ArtifactKind, StageName, Steps};
+use protocol::{ArtifactKind, Digest, StageName, Steps};
 
 use crate::definition::{IN_EVALUATION, PipelineStage, StageInput};
 use crate::graph;
@@ -92,6 +94,27 @@ impl PipelineStage {
         let train =
             Self { name, settings, placement, inputs, external, sweep: None, derived: derived(self.name.clone()) };
         Ok([train, eval])
+    }
+
+    /// The training as it was after step `stop`: a stage that takes over `state`, a checkpoint of that step, and outputs
+    /// its model without another step. `inputs` are the digests of the training's inputs, by field.
+    ///
+    /// # Errors
+    /// If the stage does not train.
+    pub fn at_checkpoint(
+        &self,
+        name: StageName,
+        stop: Steps,
+        state: Digest,
+        inputs: BTreeMap<String, Digest>,
+    ) -> Result<Self, String> {
+        let mut settings = self.settings.clone();
+        settings.training_mut().ok_or("the stage does not train")?.stop = Some(stop);
+        let mut external = inputs;
+        external.extend(self.external_of(false));
+        external.insert(STATE_OUTPUT.to_owned(), state);
+        let placement = Placement { workers: WorkerRange { min: 1, max: 1 }, ..Placement::default() };
+        Ok(Self { name, settings, placement, inputs: Vec::new(), external, sweep: None, derived: None })
     }
 }
 

@@ -60,6 +60,16 @@ pub const LABELS: usize = 16;
 pub const DEMAND_WAIT_S: u32 = 30;
 /// Largest number of launchers of one server.
 pub const LAUNCHERS: usize = 256;
+/// Largest number of models of one draw.
+pub const DRAW_MODELS: usize = 4;
+/// Largest number of sentences of one draw.
+pub const DRAW_SENTENCES: usize = 8;
+/// Largest number of motions of one sentence of a draw.
+pub const DRAW_COUNT: usize = 16;
+/// Largest number of unfinished draws of one owner; a further one must retry.
+pub const DRAWS_WAITING_EACH: usize = 4;
+/// Largest number of unfinished draws of all owners.
+pub const DRAWS_WAITING: usize = 64;
 /// Seconds after which a caller should retry.
 pub const COME_AGAIN_S: u32 = 1;
 

@@ -8,12 +8,13 @@ use motion::Skeleton;
 use protocol::artifact::Role;
 use protocol::stage::{
     Batch, ControlDistance, ControlFeedback, ControlHints, ControlLoss, ControlMean, ControlSetting, DataFormat,
-    DataSynthetic, Decay, DistillLcm, DistillPcm, Distillation, EncodeLatents, EvaluateControl, EvaluatorNetwork,
-    LatentShape, MovementPhase, Network, Optimizer, Sampler, StageSettings, TextEmbed, TrainControl, TrainEvaluator,
-    TrainMld, TrainVae, Training,
+    DataSynthetic, Decay, DistillLcm, DistillPcm, Distillation, DrawMotions, EncodeLatents, EvaluateControl,
+    EvaluatorNetwork, LatentShape, MovementPhase, Network, Optimizer, Sampler, StageSettings, TextEmbed, TrainControl,
+    TrainEvaluator, TrainMld, TrainVae, Training,
 };
 use protocol::{Digest, Manifest, Seed, Steps};
 use stage_lab::{Bench, Script};
+use stages::artifacts;
 use stages::context::Outcome;
 use stages::generate::Generator;
 use stages::parts::control::ControlOptions;
@@ -266,6 +267,25 @@ fn a_control_part_learns_and_is_heeded() {
         let refused =
             free.generate_controlled("a person walks", Some(&sampler), Seed(3), told).unwrap_err().to_string();
         assert!(refused.contains("no control part"), "{refused}");
+
+        // `draw.motions` follows a path, and ends with it.
+        let path = vec![[0.0, 0.0, 0.9, 0.0], [2.95, 0.0, 0.9, 2.0]];
+        let drawing = DrawMotions { path, steps: sampler.steps, guidance: 2.0, ..DrawMotions::default() };
+        let drawn = bench.run("drawn", &drawing.clone().into(), &[("model", ran.output())]).expect("the stage runs");
+        let drawn = bench.manifest(drawn.output()).expect("stored");
+        let motions = artifacts::file(&*bench.blobs(), &drawn, "motions.json").expect("motions");
+        let motions: serde_json::Value = serde_json::from_slice(&motions).expect("JSON");
+        let motion = &motions["motions"][0];
+        assert_eq!(
+            (&motion["frames"], motion["waypoints"].as_array().map(Vec::len)),
+            (&60.into(), Some(2)),
+            "{motion}"
+        );
+        let short = DrawMotions { seconds: 2.0, ..drawing.clone() };
+        let refused = bench.run("drawn", &short.into(), &[("model", ran.output())]).expect_err("too short").to_string();
+        assert!(refused.contains("`path`: it takes 3.00 s; expected at most 2.00"), "{refused}");
+        let refused = bench.run("drawn", &drawing.into(), &[("model", outputs[base])]).expect_err("free").to_string();
+        assert!(refused.contains("`path`: the model has no control part"), "{refused}");
     }
 }
 

@@ -10,7 +10,7 @@ use models::networks::{Denoiser, Init, Vae};
 use protocol::artifact::{FileEntry, Role};
 use protocol::stage::Diffusion;
 use protocol::stage::{
-    Activity, Batch, CheckpointPolicy, DataFormat, DataSynthetic, EncodeLatents, EvaluateLatentFid,
+    Activity, Batch, CheckpointPolicy, DataFormat, DataSynthetic, DrawMotions, EncodeLatents, EvaluateLatentFid,
     EvaluateRecognition, EvaluateReconstruction, EvaluateSpectrum, Family, Keep, LatentShape, Network, Positions,
     Sampler, Split, StageSettings, TextEmbed, TrainLength, TrainVae, Training,
 };
@@ -474,4 +474,63 @@ fn real_clips_are_recognised_and_those_of_an_untrained_model_are_not() {
     other.activities.push(activity("fly", &["flies"]));
     let refused = bench.run("recognised", &other.into(), &inputs).expect_err("nobody flies").to_string();
     assert!(refused.contains("no clip of the split `train` shows `fly`"), "{refused}");
+}
+
+#[test]
+fn sentences_are_drawn_in_the_viewers_form_and_by_the_seed_alone() {
+    let mut bench = bench();
+    let vae = untrained_vae(&bench);
+    let model = untrained(&bench, vae, Family::Mld);
+    let settings = DrawMotions {
+        sentences: vec!["a person walks".into(), "a person jumps".into()],
+        seconds: 2.5,
+        seed: Seed(4),
+        steps: 2,
+        ..DrawMotions::default()
+    };
+    let inputs = [("model", model)];
+    let ran = bench.run("drawn", &settings.clone().into(), &inputs).expect("the stage runs");
+    assert!((0.0..=1.0).contains(&ran.metrics()["skating"]), "{:?}", ran.metrics());
+    let manifest = bench.manifest(ran.output()).expect("stored");
+    let motions = artifacts::file(&*bench.blobs(), &manifest, "motions.json").expect("motions");
+    let motions: serde_json::Value = serde_json::from_slice(&motions).expect("JSON");
+    assert_eq!(motions["captions"], serde_json::json!(settings.sentences));
+    assert_eq!(motions["bodies"].as_array().map(Vec::len), Some(1));
+    let drawn = motions["motions"].as_array().expect("a list");
+    assert_eq!(drawn.iter().map(|motion| motion["frames"].as_u64()).collect::<Vec<_>>(), [Some(50), Some(50)]);
+    // Neither the stage's name nor the pipeline's seed changes what is drawn.
+    let mut again = Bench::new(burn::tensor::Device::flex(), 12, 1);
+    let vae = untrained_vae(&again);
+    let same = untrained(&again, vae, Family::Mld);
+    let other = again.run("other", &settings.clone().into(), &[("model", same)]).expect("the stage runs");
+    assert_eq!(ran.output(), other.output());
+    let seed = DrawMotions { seed: Seed(5), ..settings.clone() };
+    let seeded = bench.run("drawn", &seed.into(), &inputs).expect("the stage runs");
+    assert_ne!(ran.output(), seeded.output());
+    let long = DrawMotions { seconds: 60.0, ..settings.clone() };
+    let refused = bench.run("drawn", &long.into(), &inputs).expect_err("too long").to_string();
+    assert!(refused.contains("`seconds` is 60; the model draws 0.05 to"), "{refused}");
+
+    // Several motions of one sentence have consecutive seeds and one length, which is the model's without `seconds`.
+    let several = DrawMotions { count: 2, seconds: 0.0, ..settings.clone() };
+    let ran = bench.run("drawn", &several.into(), &inputs).expect("the stage runs");
+    let several = bench.manifest(ran.output()).expect("stored");
+    let file =
+        |manifest: &protocol::Manifest, name: &str| artifacts::file(&*bench.blobs(), manifest, name).expect("a file");
+    let motions: serde_json::Value = serde_json::from_slice(&file(&several, "motions.json")).expect("JSON");
+    assert_eq!(
+        motions["captions"],
+        serde_json::json!(["a person walks", "a person walks", "a person jumps", "a person jumps"])
+    );
+    let drawn = motions["motions"].as_array().expect("a list");
+    let jerks: Vec<f64> = drawn.iter().filter_map(|motion| motion["measures"]["jerk"].as_f64()).collect();
+    assert!(jerks.len() == 4 && jerks.iter().all(|jerk| *jerk > 0.0), "{jerks:?}");
+    let second = DrawMotions { seed: Seed(5), seconds: 0.0, ..settings };
+    let ran = bench.run("drawn", &second.into(), &inputs).expect("the stage runs");
+    let second = bench.manifest(ran.output()).expect("stored");
+    assert_eq!(file(&several, "motion-01.npy"), file(&second, "motion-00.npy"));
+    assert_ne!(file(&several, "motion-00.npy"), file(&several, "motion-01.npy"));
+    assert!(file(&second, "motion-00.bvh").starts_with(b"HIERARCHY"));
+    assert!(file(&second, "motion-00.glb").starts_with(b"glTF"));
+    assert!(file(&second, "motions.html").starts_with(b"<!DOCTYPE html>"));
 }

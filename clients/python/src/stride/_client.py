@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import shutil
@@ -9,7 +10,7 @@ import struct
 import subprocess
 import time
 import uuid
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -18,10 +19,12 @@ from typing import TYPE_CHECKING, Any, cast
 import httpx
 
 from ._errors import StrideError
-from ._models import HistoryRow, LogRow, Promotion, RunSummary, RunView, Version
+from ._models import Drawing, HistoryRow, LogRow, Promotion, RunSummary, RunView, Version
 
 if TYPE_CHECKING:
+    import numpy
     import pandas
+    from numpy.typing import NDArray
 
 PACKED = "application/octet-stream"
 """The form of values that keeps each bit of them."""
@@ -195,8 +198,11 @@ class Server:
         return [Model(self, str(model["model"])) for model in self._registry({"command": "list"})["models"]]
 
     def model(self, reference: str) -> Model:
-        """A model by its name, such as ``m``."""
+        """A model by its name, such as ``m``, or one of its versions: ``m@prod``, ``m@best`` or ``m:3``."""
         return Model(self, reference)
+
+    def _blob(self, digest: str) -> bytes:
+        return self._call("GET", f"/v1/blobs/{digest}").content
 
 
 def _resolved(path: Path, trainer: str | None) -> object:
@@ -368,6 +374,48 @@ class Model:
 
     def __repr__(self) -> str:
         return f"Model({self.name!r})"
+
+    def generate(
+        self,
+        sentence: str,
+        *,
+        n: int = 1,
+        seed: int = 0,
+        seconds: float | None = None,
+        guidance: float | None = None,
+        steps: int | None = None,
+        path: Sequence[tuple[float, float, float, float]] = (),
+    ) -> NDArray[numpy.float32]:
+        """Draws motions with this version: joint positions in metres, ``[n, frames, joints, 3]``. Needs numpy.
+
+        A worker of the server draws them, and the call waits for it. Motions that were drawn before come from the store.
+
+        Args:
+            sentence: Text of the motion.
+            n: Number of motions, with consecutive seeds; at most 16.
+            seed: Seed of the first motion.
+            seconds: Length; by default the model's choice.
+            guidance: Guidance scale; by default that of the model's evaluation.
+            steps: Number of network evaluations; by default that of the model's evaluation.
+            path: Positions that the pelvis passes, as seconds and x, y, z in metres, for a model with a control part.
+
+        Raises:
+            StrideError: The server refuses the draw, or it failed.
+        """
+        import numpy
+
+        asked = {"seconds": seconds, "guidance": guidance, "steps": steps}
+        body: dict[str, object] = {"models": [self.name], "sentences": [sentence], "count": n, "seed": seed, "path": list(path)}
+        body.update({name: value for name, value in asked.items() if value is not None})
+        headers = {"idempotency-key": str(uuid.uuid4())}
+        drawing = Drawing.model_validate(self._server._json("POST", "/v1/draws", body=body, headers=headers))
+        run = self._server.run(drawing.run).wait()
+        stage = next(stage for stage in run.stages if stage.name == drawing.stages[0])
+        if run.state != "finished":
+            raise StrideError("failed", stage.message or f"the draw was {run.state}", f"see run `{drawing.run}`")
+        files = json.loads(self._server._blob(stage.outputs["report"]))["files"]
+        motions = [self._server._blob(files[f"motion-{number:02}.npy"]["digest"]) for number in range(n)]
+        return numpy.stack([numpy.load(io.BytesIO(motion)) for motion in motions])
 
     def versions(self) -> list[Version]:
         """All versions, the oldest first."""

@@ -13,6 +13,15 @@ class Answer(BaseModel):
     model_config = ConfigDict(extra="allow", frozen=True)
 
 
+class Drawing(Answer):
+    """The answer to [`Draw`]."""
+
+    run: str
+    """The run that draws. It has ended when all motions are stored."""
+    stages: list[str]
+    """Its drawing stages, in the order of the models or checkpoints. The artifact `report` of each has the file `motions.json`, and for motion `NN` the files `motion-NN.npy`, `motion-NN.bvh` and `motion-NN.glb`."""
+
+
 class GateResult(Answer):
     """Result of a gate."""
 

@@ -8,7 +8,7 @@ use futures::FutureExt as _;
 use pipeline::Pipeline;
 use protocol::message::{Poll, RunView, StorageProblem, Submit};
 use protocol::stage::Register;
-use protocol::{Alias, Digest, Group, ModelName, Owner, RunId, WorkerId, canonical, limits};
+use protocol::{Alias, Digest, Group, ModelName, Owner, RunId, StageName, WorkerId, canonical, limits};
 use registry::{Proof, QueryError, ReadStore, RunRow, Store, WriteError};
 use tokio::sync::{Semaphore, mpsc, oneshot, watch};
 use tokio::task::JoinHandle;
@@ -38,6 +38,38 @@ const QUEUE: usize = 1024;
 
 /// The sender for the answer to a request.
 pub(super) type Reply = oneshot::Sender<Result<Vec<Effect>, Refused>>;
+
+/// A submission by its idempotency key.
+struct Sent {
+    /// The key as the client wrote it, for messages.
+    shown: String,
+    /// The key among those of its owner; without one, each submission is a run.
+    key: Option<String>,
+    /// Digest of the submission.
+    digest: Option<Digest>,
+}
+
+impl Sent {
+    /// Takes the key out of `submit`.
+    fn of(submit: &mut Submit, owner: &Owner) -> Self {
+        let shown = submit.idempotency_key.take();
+        let key = shown.as_ref().map(|key| owner.group().key(key));
+        let digest = key.is_some().then(|| canonical::digest(&*submit));
+        Self { shown: shown.unwrap_or_default(), key, digest }
+    }
+
+    /// Refuses a run with this key of another submission.
+    fn check(&self, row: &RunRow) -> Result<(), Refused> {
+        match (&row.submission, &self.digest) {
+            (Some(stored), Some(sent)) if *stored != sent.to_string() => {
+                let key = &self.shown;
+                let message = format!("idempotency key `{key}` belongs to another submission, run `{}`", row.run);
+                Err(Refused::from(Rejected::Conflict(message)))
+            }
+            _ => Ok(()),
+        }
+    }
+}
 
 /// State shared between the actor and its callers.
 #[derive(Debug)]
@@ -180,16 +212,7 @@ impl ActorHandle {
 
     /// Submits a pipeline of `owner`, who sees the models of group `sees`, or all models if it is `None`.
     pub(crate) async fn submit(&self, mut submit: Submit, owner: Owner, sees: Option<Group>) -> Result<RunId, Refused> {
-        let shown = submit.idempotency_key.take();
-        let key = shown.as_ref().map(|key| owner.group().key(key));
-        let sent = key.is_some().then(|| canonical::digest(&submit));
-        let check = |row: &RunRow| match (&row.submission, &sent, &shown) {
-            (Some(stored), Some(sent), Some(key)) if *stored != sent.to_string() => {
-                let message = format!("idempotency key `{key}` belongs to another submission, run `{}`", row.run);
-                Err(Refused::from(Rejected::Conflict(message)))
-            }
-            _ => Ok(()),
-        };
+        let sent = Sent::of(&mut submit, &owner);
         // A large pipeline takes a while, so it is parsed outside the threads that answer heartbeats.
         let read = blocking(move || {
             let pipeline: Pipeline = serde_json::from_value(submit.pipeline)
@@ -199,11 +222,8 @@ impl ActorHandle {
         });
         let mut pipeline = read.await.map_err(Rejected::Invalid)?;
         // A run submitted earlier already has its versions.
-        if let Some(key) = &key
-            && let Some(row) = self.store.run_by_key(key).await.map_err(WriteError::from)?
-        {
-            check(&row)?;
-            return Ok(row.run);
+        if let Some(run) = self.sent_before(&sent).await? {
+            return Ok(run);
         }
         self.check_registrations(&pipeline, &owner).await?;
         let seen = self.seen_store(sees.as_ref());
@@ -211,27 +231,54 @@ impl ActorHandle {
             QueryError::NotFound(why) | QueryError::Invalid(why) => Refused::from(Rejected::Invalid(why)),
             error => Refused::from(WriteError::from(error)),
         })?;
+        self.enter(pipeline, (submit.source, submit.until), owner, sent).await
+    }
+
+    /// Submits a pipeline that the server made and that reads no versions.
+    pub(crate) async fn submit_own(
+        &self,
+        pipeline: Pipeline,
+        mut submit: Submit,
+        owner: Owner,
+    ) -> Result<RunId, Refused> {
+        let sent = Sent::of(&mut submit, &owner);
+        self.enter(pipeline, (submit.source, submit.until), owner, sent).await
+    }
+
+    /// The run of an earlier submission with the same idempotency key.
+    async fn sent_before(&self, sent: &Sent) -> Result<Option<RunId>, Refused> {
+        let Some(key) = &sent.key else { return Ok(None) };
+        let Some(row) = self.store.run_by_key(key).await.map_err(WriteError::from)? else { return Ok(None) };
+        sent.check(&row)?;
+        Ok(Some(row.run))
+    }
+
+    /// Decides a submission, once for each idempotency key.
+    async fn enter(
+        &self,
+        pipeline: Pipeline,
+        (source, until): (String, Option<StageName>),
+        owner: Owner,
+        sent: Sent,
+    ) -> Result<RunId, Refused> {
         let event = Event::Submit {
             pipeline: Box::new(pipeline),
-            source: submit.source,
-            idempotency_key: key.clone(),
-            submission: sent,
-            until: submit.until,
+            source,
+            idempotency_key: sent.key.clone(),
+            submission: sent.digest,
+            until,
             owner,
         };
         let mut tries = 0;
         loop {
             // An ended run is only in the tables.
-            if let Some(key) = &key
-                && let Some(row) = self.store.run_by_key(key).await.map_err(WriteError::from)?
-            {
-                check(&row)?;
-                return Ok(row.run);
+            if let Some(run) = self.sent_before(&sent).await? {
+                return Ok(run);
             }
             tries += 1;
             match self.decide(event.clone()).await {
                 // Another run with this key was submitted after the lookup and has already ended.
-                Err(Refused::Write(WriteError::Conflict(_))) if key.is_some() && tries < 3 => {}
+                Err(Refused::Write(WriteError::Conflict(_))) if sent.key.is_some() && tries < 3 => {}
                 decided => {
                     let run = decided?.into_iter().find_map(|effect| match effect {
                         Effect::Submitted(run) => Some(run),
@@ -239,10 +286,10 @@ impl ActorHandle {
                     });
                     let run = run.expect("a submission gives a run");
                     // Another submission with this key may have been decided just before.
-                    if key.is_some()
+                    if sent.key.is_some()
                         && let Some(row) = self.store.run(&run).await.map_err(WriteError::from)?
                     {
-                        check(&row)?;
+                        sent.check(&row)?;
                     }
                     return Ok(run);
                 }

@@ -25,9 +25,11 @@ use super::actor_handle::ActorHandle;
 use super::audit;
 use super::auth::{self, Gate};
 use super::bundles::BundleQuery;
+use super::checkpoints::KeptCheckpoint;
 use super::curves::{Curves, CurvesAsked};
 use super::demand::{self, DemandQuery};
 use super::described::{Bytes, Described, EventStream, Nothing, OpenMetrics, Packed, described};
+use super::draws::{Draw, Drawing};
 use super::events::EventsQuery;
 use super::extract::Query;
 use super::failure::Failure;
@@ -37,7 +39,9 @@ use super::records::StageMetrics;
 use super::route::Route;
 use super::session_calls::Who;
 use super::settings::RunSettings;
-use super::{bundles, curves, events, page_files, polls, queries, scrape, session_calls, settings, uploads};
+use super::{
+    bundles, checkpoints, curves, draws, events, page_files, polls, queries, scrape, session_calls, settings, uploads,
+};
 use crate::view::WorkerView;
 
 /// Time limit of a call that waits only for the disk.
@@ -113,6 +117,8 @@ fn table() -> Vec<Entry> {
             described::<Query<DemandQuery>, Nothing, Json<Demand>>("Shows the demand for workers, or waits for a change of it")),
         entry("POST", "/v1/runs",                  &[Submit],       limits::SUBMISSION_BYTES, SHORT, queries::submit,
             described::<Nothing, Json<message::Submit>, Json<Submitted>>("Submits a pipeline").with(SUBMISSION)),
+        entry("POST", "/v1/draws",                 &[Submit],       CALL,                     SHORT, draws::draw,
+            described::<Nothing, Json<Draw>, Json<Drawing>>("Draws motions of models for sentences").with(SUBMISSION)),
         entry("GET",  "/metrics",                  &[Read],         CALL,                     SHORT, scrape::metrics,
             described::<Nothing, Nothing, OpenMetrics>("Shows the server's own numbers to Prometheus")),
         entry("GET",  "/v1/history",               &[Read],         CALL,                     SHORT, queries::history,
@@ -127,6 +133,8 @@ fn table() -> Vec<Entry> {
             described::<Query<LogQuery>, Nothing, Json<Vec<LogRow>>>("Lists log lines of a run")),
         entry("GET",  "/v1/runs/{run}/metrics",    &[Read],         CALL,                     SHORT, queries::points,
             described::<Query<PointQuery>, Nothing, Packed<StageMetrics>>("Lists every value of a run")),
+        entry("GET",  "/v1/runs/{run}/checkpoints", &[Read],        CALL,                     SHORT, checkpoints::checkpoints,
+            described::<Nothing, Nothing, Json<Vec<KeptCheckpoint>>>("Lists the checkpoints of a run that are kept")),
         entry("GET",  "/v1/runs/{run}/settings",   &[Read],         CALL,                     SHORT, settings::settings,
             described::<Nothing, Nothing, Json<RunSettings>>("Shows the settings of a run's stages")),
         entry("POST", "/v1/runs/{run}/{action}",   &[Submit],       CALL,                     SHORT, queries::control,

@@ -163,9 +163,18 @@ pub(crate) async fn workers(
 }
 
 /// A permit for a client's call that waits for a decision.
-fn place(actor_handle: &ActorHandle) -> Result<SemaphorePermit<'_>, Failure> {
+pub(super) fn place(actor_handle: &ActorHandle) -> Result<SemaphorePermit<'_>, Failure> {
     let full = |_| Failure::busy(format!("{} calls of clients already wait for a decision", limits::CLIENTS_WAITING));
     actor_handle.clients.try_acquire().map_err(full)
+}
+
+/// The key of a call's header, if it has one.
+pub(super) fn idempotency_key(headers: &HeaderMap) -> Result<Option<String>, Failure> {
+    let Some(key) = headers.get(IDEMPOTENCY_KEY) else { return Ok(None) };
+    let most = limits::TEXT_BYTES;
+    let key = key.to_str().ok().filter(|key| !key.is_empty() && key.len() <= most);
+    let wrong = || Failure::invalid(format!("`{IDEMPOTENCY_KEY}` has 1 to {most} characters of ASCII"));
+    Ok(Some(key.ok_or_else(wrong)?.to_owned()))
 }
 
 pub(crate) async fn submit(
@@ -174,16 +183,12 @@ pub(crate) async fn submit(
     headers: HeaderMap,
     Message(mut submit, _): Message<Submit>,
 ) -> Result<(Extension<Object>, Json<Submitted>), Failure> {
-    if let Some(key) = headers.get(IDEMPOTENCY_KEY) {
-        let most = limits::TEXT_BYTES;
-        let key = key.to_str().ok().filter(|key| !key.is_empty() && key.len() <= most);
-        let key =
-            key.ok_or_else(|| Failure::invalid(format!("`{IDEMPOTENCY_KEY}` has 1 to {most} characters of ASCII")))?;
-        if submit.idempotency_key.as_deref().is_some_and(|other| other != key) {
+    if let Some(key) = idempotency_key(&headers)? {
+        if submit.idempotency_key.as_ref().is_some_and(|other| *other != key) {
             let message = format!("`{IDEMPOTENCY_KEY}` and the body's `idempotency_key` differ; expected one of them");
             return Err(Failure::invalid(message));
         }
-        submit.idempotency_key = Some(key.to_owned());
+        submit.idempotency_key = Some(key);
     }
     let _place = place(&actor_handle)?;
     let run = actor_handle.submit(submit, caller.owner(), caller.sees()).await?;

@@ -61,10 +61,10 @@ fn expected(method: &str, path: &str) -> &'static [Scope] {
     use Scope::{Admin, Launch, Promote, Read, Submit, Worker};
     match (method, path) {
         ("GET", "/v1/runs" | "/v1/runs/{run}" | "/v1/runs/{run}/logs" | "/v1/runs/{run}/metrics") => &[Read],
-        ("GET", "/v1/runs/{run}/settings") => &[Read],
+        ("GET", "/v1/runs/{run}/settings" | "/v1/runs/{run}/checkpoints") => &[Read],
         ("GET", "/metrics" | "/v1/metrics" | "/v1/history" | "/v1/events" | "/v1/workers") => &[Read],
         ("GET" | "POST" | "DELETE", "/v1/session") => &[Read],
-        ("POST", "/v1/runs" | "/v1/runs/{run}/{action}" | "/v1/bundles") => &[Submit],
+        ("POST", "/v1/runs" | "/v1/draws" | "/v1/runs/{run}/{action}" | "/v1/bundles") => &[Submit],
         ("POST", "/v1/workers" | "/v1/workers/{worker}/poll" | "/v1/workers/{worker}/gone") => &[Worker],
         ("POST", "/v1/metrics" | "/v1/logs" | "/v1/checkpoints" | "/v1/outcomes") => &[Worker],
         ("GET", "/v1/blobs/{digest}") => &[Read, Worker],

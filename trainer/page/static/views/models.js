@@ -187,7 +187,7 @@ export function model(context, name) {
       ${keys.map((key, at) => html`<td class=${at > 0 ? "num wide" : "num"}>${key in version.metrics ? number(version.metrics[key]) : ""}</td>`)}
       <td class="wide">${run ? html`<a href=${address("runs", run)}>${run}</a>` : nothing}</td>
       <td class="wide dim" title=${date(version.created_ms)}>${ago(version.created_ms, serverNow())}</td>
-      <td class="actions"><button type="button" aria-expanded=${lineage?.version === version.version ? "true" : "false"} @click=${() => trace(version)}>Lineage</button>
+      <td class="actions">${may("submit") ? html`<a class="button" href=${`/draw?model=${encodeURIComponent(`${name}:${version.version}`)}`}>Draw</a>` : nothing}<button type="button" aria-expanded=${lineage?.version === version.version ? "true" : "false"} @click=${() => trace(version)}>Lineage</button>
         ${may("promote") ? html`<button type="button" class=${version.version === model.best && !version.aliases.includes("prod") ? "main" : ""} @click=${() => ask(version, version.aliases.includes("staging") ? "prod" : "staging", false)}>Promote</button>` : nothing}</td>
     </tr>${lineage?.version === version.version ? html`<tr><td colspan=${keys.length + 5}>${ancestry(lineage.nodes)}</td></tr>` : nothing}`;
   }

@@ -10,6 +10,7 @@ import { badge, bar, command, fact, firstLine, isOver, joinCommand, left, pace, 
 import { Rates } from "../rates.js";
 import { address } from "../router.js";
 import { inWords as whyInWords, reasons, settingsOf } from "../settings.js";
+import { Thumbnails } from "../thumbnails.js";
 import { html, nothing } from "../vendor/lit-html.js";
 
 const CURVES_EVERY = 4;
@@ -29,6 +30,7 @@ export function stage(context, name, stageName) {
   let keys = new Map();
   /** @type {Map<string, Chart>} */
   const charts = new Map();
+  const thumbnails = new Thumbnails(name, stageName, context.draw);
   let [logScale, smooth, all, words] = [false, true, false, ""];
   let finalSeen = false;
   /** @type {History | null} */
@@ -51,6 +53,7 @@ export function stage(context, name, stageName) {
     if (it && !history) await explain(run, it, signal);
     else if (live && beats % CURVES_EVERY === 0) await history?.load(signal);
     if (it && (live || beats === 0 || !isOver(run))) await log.load(signal);
+    if (it?.key && beats % CURVES_EVERY === 0 && (live || beats === 0)) await thumbnails.load(signal);
     beats += 1;
   }
 
@@ -135,10 +138,11 @@ export function stage(context, name, stageName) {
           ${Object.entries(it.outputs).map(([output, digest]) => fact(`Gives ${output}`, html`<code title=${digest}>${short(digest)}</code>`))}
           ${fact("State", it.state !== "failed" && !it.wants_workers ? firstLine(it.message) : "")}
         </dl></div>
-      ${curvesOf()}${numbers(it)}${log.render()}`;
+      ${curvesOf()}${thumbnails.render()}${numbers(it)}${log.render()}`;
   }
 
   const close = () => {
+    thumbnails.close();
     for (const shown of charts.values()) shown.close();
   };
   return { title: `${stageName} of ${name}`, every: 1000, load, render, close };

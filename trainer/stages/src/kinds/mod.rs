@@ -23,6 +23,7 @@ macro_rules! runners {
 
 mod data;
 mod distill;
+mod draw;
 mod encode;
 mod evaluate;
 mod import;
@@ -34,7 +35,7 @@ mod train;
 use shape::Stage;
 
 /// The families of kinds.
-const FAMILIES: [fn(&StageSettings) -> Option<Stage<'_>>; 8] = [
+const FAMILIES: [fn(&StageSettings) -> Option<Stage<'_>>; 9] = [
     data::runner,
     text::runner,
     import::runner,
@@ -43,6 +44,7 @@ const FAMILIES: [fn(&StageSettings) -> Option<Stage<'_>>; 8] = [
     distill::runner,
     model::runner,
     evaluate::runner,
+    draw::runner,
 ];
 
 /// The runner of a stage with these settings; `None` for kinds that the coordinator runs itself.

@@ -67,13 +67,17 @@ fn cases(lab: &Lab, kind: &Kind, method: &'static str, path: &'static str) -> Op
         ("GET" | "POST" | "DELETE", "/v1/session") => case(path.to_owned(), Value::Null, filtered),
         ("GET", "/metrics" | "/v1/runs" | "/v1/workers") => case(path.to_owned(), Value::Null, filtered),
         ("GET", "/v1/demand") => {
-            case(
-                path.to_owned(),
-                Value::Null,
-                if kind.has("launch") { Expected::Filtered } else { Expected::Forbidden },
-            );
+            let expected = if kind.has("launch") { Expected::Filtered } else { Expected::Forbidden };
+            case(path.to_owned(), Value::Null, expected);
         }
-        ("GET", "/v1/runs/{run}" | "/v1/runs/{run}/logs" | "/v1/runs/{run}/metrics" | "/v1/runs/{run}/settings") => {
+        (
+            "GET",
+            "/v1/runs/{run}"
+            | "/v1/runs/{run}/logs"
+            | "/v1/runs/{run}/metrics"
+            | "/v1/runs/{run}/settings"
+            | "/v1/runs/{run}/checkpoints",
+        ) => {
             for project in Project::ALL {
                 case(path.replace("{run}", lab.runs[&project].as_str()), Value::Null, reads(kind, project));
             }
@@ -111,8 +115,8 @@ fn cases(lab: &Lab, kind: &Kind, method: &'static str, path: &'static str) -> Op
                 case(path.replace("{digest}", &lab.artifacts[&project].to_string()), Value::Null, Expected::Done);
             }
         }
-        // No cases here: `promotion` tests submissions, and `registry` tests bundles.
-        ("POST", "/v1/runs" | "/v1/bundles") => {}
+        // No cases here: `promotion` tests submissions, `draws` tests draws, and `registry` tests bundles.
+        ("POST", "/v1/runs" | "/v1/draws" | "/v1/bundles") => {}
         ("POST", "/v1/registry") => {
             for project in Project::ALL {
                 let model = project.model();

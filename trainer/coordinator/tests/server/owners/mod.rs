@@ -2,6 +2,7 @@
 //! log.
 
 mod audit;
+mod draws;
 mod fuzz;
 mod lab;
 mod matrix;

@@ -15,6 +15,7 @@ async fn the_page_is_shown_without_a_token_and_may_load_nothing_from_elsewhere()
         "/models",
         "/models/m",
         "/compare",
+        "/draw",
         "/data",
         "/data/d",
         "/workers",

@@ -248,12 +248,12 @@ async fn a_browser_shows_hostile_texts_as_texts_and_every_view_on_a_phone() -> T
         browser.evaluate("document.querySelector('#token').value = ''");
         browser.write(&token(Scope::Read));
         browser.press("Enter");
-        for (path, text) in [("/", "waiting"), ("/models/walks", "fewer"), (&format!("/runs/{failed}"), "Pipeline"), ("/store", "scope")] {
+        for (path, text) in [("/", "waiting"), ("/models/walks", "fewer"), (&format!("/runs/{failed}"), "Pipeline"), ("/draw", "needs a token"), ("/store", "scope")] {
             browser.until("document.querySelector('main h1')");
             browser.evaluate(&format!("history.pushState(null, '', '{path}'); dispatchEvent(new PopStateEvent('popstate'))"));
             browser.until(&format!("document.querySelector('main')?.textContent.includes('{text}')"));
             let pressed = "[...document.querySelectorAll('main button')].map((e) => e.textContent.trim()).filter((text) => \
-                           /Resume|Pause|Cancel|Promote|Roll|Check|can go/.test(text)).join()";
+                           /Resume|Pause|Cancel|Promote|Roll|Check|can go|Draw/.test(text)).join()";
             assert_eq!(browser.evaluate(pressed), json!(""), "{path}");
         }
 

@@ -2,6 +2,7 @@
 
 mod beside;
 mod clips;
+mod draw;
 mod files;
 pub(crate) mod http;
 mod in_browser;

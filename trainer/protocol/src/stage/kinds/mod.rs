@@ -7,6 +7,7 @@ mod data_synthetic;
 mod distill_discord;
 mod distill_lcm;
 mod distill_pcm;
+mod draw_motions;
 mod encode_latents;
 mod encode_tokens;
 mod evaluate_control;
@@ -59,6 +60,7 @@ super::spec::stage_kinds! {
     evaluate_control: EvaluateControl,
     evaluate_spectrum: EvaluateSpectrum,
     evaluate_recognition: EvaluateRecognition,
+    draw_motions: DrawMotions,
     import_evaluator: ImportEvaluator,
     import_model: ImportModel,
     evaluate_t2m: EvaluateT2m,

@@ -1,0 +1,7 @@
+//! The kinds `draw.*`: motions to be looked at.
+
+mod motions;
+
+runners! {
+    Plain: DrawMotions;
+}
