@@ -29,7 +29,7 @@ pub fn server(certificate: &Path, key: &Path) -> Result<Arc<ServerConfig>, FileE
     let mut config = config.map_err(|error| {
         FileError::new(certificate, format!("does not match the key in `{}`: {error}", key.display()))
     })?;
-    config.alpn_protocols = vec![b"http/1.1".to_vec()];
+    config.alpn_protocols = vec![b"h2".to_vec(), b"http/1.1".to_vec()];
     Ok(Arc::new(config))
 }
 

@@ -7,20 +7,28 @@
 //!
 //! Callers other than workers also share a limited part, with a further limit per token, so that readers cannot block
 //! workers.
+//!
+//! With TLS, a client may choose HTTP/2. One connection then carries several calls, each of which counts like a
+//! connection of its token.
 
 use std::collections::{BTreeMap, HashMap};
 use std::convert::Infallible;
 use std::net::{IpAddr, SocketAddr};
+use std::pin::{Pin, pin};
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
+use std::task::{Context, Poll};
 use std::time::{Duration, Instant};
 
 use access::{Caller, Scope};
-use axum::body::Body;
+use axum::body::{Body, Bytes, HttpBody};
 use axum::extract::Request;
-use axum::http::StatusCode;
+use axum::http::uri::{PathAndQuery, Uri};
+use axum::http::{HeaderValue, StatusCode, header};
+use http_body::{Frame, SizeHint};
 use hyper::body::Incoming;
-use hyper::server::conn::http1;
+use hyper::rt::Executor;
+use hyper::server::conn::{http1, http2};
 use hyper::service::service_fn;
 use hyper_util::rt::{TokioIo, TokioTimer};
 use nix::sys::resource::{Resource, getrlimit, setrlimit};
@@ -43,6 +51,11 @@ const PAUSE: Duration = Duration::from_millis(20);
 /// Minimum time for an anonymous connection to show a token, however many others arrive. New connections wait
 /// meanwhile.
 const GRACE: Duration = Duration::from_millis(50);
+
+/// Number of calls that one connection of HTTP/2 carries at a time; further ones wait for their turn.
+const STREAMS: u32 = 64;
+/// Number of bytes of an answer that wait for a slow reader of HTTP/2.
+const UNSENT: usize = 256 << 10;
 
 /// Limits of connections.
 #[derive(Debug, Clone)]
@@ -103,7 +116,7 @@ struct Anonymous {
     leave: Arc<Notify>,
 }
 
-/// A connection as its requests see it.
+/// A connection as its requests see it, or a call of a connection of HTTP/2.
 #[derive(Debug)]
 pub(crate) struct Peer {
     id: u64,
@@ -113,6 +126,8 @@ pub(crate) struct Peer {
     leave: Arc<Notify>,
     /// The token name whose limit it counts against. Workers have no such limit.
     client: OnceLock<String>,
+    /// The connection that carries this call, if it carries several.
+    connection: Option<Arc<Self>>,
 }
 
 impl OpenConnections {
@@ -131,7 +146,8 @@ impl OpenConnections {
         let (id, leave) = (self.next.fetch_add(1, Ordering::Relaxed), Arc::new(Notify::new()));
         anonymous.insert(id, Anonymous { since: Instant::now(), leave: Arc::clone(&leave) });
         let open_connections = Arc::clone(self);
-        Some(Arc::new(Peer { id, from, encrypted, open_connections, leave, client: OnceLock::new() }))
+        let client = OnceLock::new();
+        Some(Arc::new(Peer { id, from, encrypted, open_connections, leave, client, connection: None }))
     }
 
     /// Closes the oldest anonymous connection.
@@ -161,12 +177,23 @@ impl Peer {
         self.encrypted
     }
 
+    /// A call of this connection.
+    fn call(self: &Arc<Self>) -> Arc<Self> {
+        let (open_connections, leave) = (Arc::clone(&self.open_connections), Arc::clone(&self.leave));
+        let connection = Some(Arc::clone(self));
+        let Self { id, from, encrypted, .. } = **self;
+        Arc::new(Self { id, from, encrypted, open_connections, leave, client: OnceLock::new(), connection })
+    }
+
     /// Marks the connection as authenticated.
     ///
     /// # Errors
     /// The limit of connections for callers other than workers, or for this token, is reached.
     pub(crate) fn authenticate(&self, caller: &Caller) -> Result<(), Failure> {
-        self.mark_authenticated();
+        match &self.connection {
+            Some(connection) => connection.authenticate(caller)?,
+            None => self.mark_authenticated(),
+        }
         if caller.scopes.allow(Scope::Worker) || self.client.get().is_some() {
             return Ok(());
         }
@@ -196,8 +223,10 @@ impl Peer {
 
 impl Drop for Peer {
     fn drop(&mut self) {
-        self.mark_authenticated();
-        self.open_connections.open.fetch_sub(1, Ordering::Relaxed);
+        if self.connection.is_none() {
+            self.mark_authenticated();
+            self.open_connections.open.fetch_sub(1, Ordering::Relaxed);
+        }
         let Some(token) = self.client.take() else { return };
         let mut clients = self.open_connections.clients.lock().unwrap_or_else(PoisonError::into_inner);
         clients.all -= 1;
@@ -302,6 +331,9 @@ async fn handshake_and_serve(
         Ok(None)
     };
     match tokio::time::timeout(HANDSHAKE, handshake).await {
+        Ok(Ok(Some(stream))) if stream.get_ref().1.alpn_protocol() == Some(b"h2") => {
+            serve_streams(stream, router, peer, idle).await;
+        }
         Ok(Ok(Some(stream))) => serve_connection(stream, router, peer, idle).await,
         Ok(Ok(None)) => {}
         Ok(Err(error)) => tracing::debug!(%error, "no TLS"),
@@ -322,6 +354,102 @@ where
     http.timer(TokioTimer::new()).header_read_timeout(idle).max_buf_size(HEAD_BYTES);
     if let Err(error) = http.serve_connection(TokioIo::new(stream), service).with_upgrades().await {
         tracing::debug!(%error, "a connection ended");
+    }
+}
+
+/// Serves HTTP/2. A connection without a call for `idle` is closed.
+async fn serve_streams<S>(stream: S, router: axum::Router, peer: Arc<Peer>, idle: Duration)
+where
+    S: AsyncRead + AsyncWrite + Unpin + Send + 'static,
+{
+    let (calls, connection) = (Arc::new(AtomicU64::new(0)), Arc::clone(&peer));
+    let begun = Arc::clone(&calls);
+    let service = service_fn(move |mut request: Request<Incoming>| {
+        begun.fetch_add(1, Ordering::Relaxed);
+        let call = connection.call();
+        as_http1(&mut request);
+        request.extensions_mut().insert(Arc::clone(&call));
+        let mut router = router.clone();
+        async move {
+            let answer = router.call(request.map(Body::new)).await.unwrap_or_else(|never| match never {});
+            Ok::<_, Infallible>(answer.map(|body| Body::new(Counted { body, _call: call })))
+        }
+    });
+    let mut http = http2::Builder::new(Calls::default());
+    http.timer(TokioTimer::new()).keep_alive_interval(idle).keep_alive_timeout(HANDSHAKE);
+    http.max_concurrent_streams(STREAMS).max_send_buf_size(UNSENT);
+    http.max_header_list_size(u32::try_from(HEAD_BYTES).unwrap_or(u32::MAX));
+    let mut serving = pin!(http.serve_connection(TokioIo::new(stream), service));
+    // This function and the service hold the connection when no call does.
+    let at_rest = Arc::strong_count(&peer);
+    let (mut seen, mut leaving) = (0, false);
+    loop {
+        tokio::select! {
+            ended = serving.as_mut() => {
+                if let Err(error) = ended {
+                    tracing::debug!(%error, "a connection ended");
+                }
+                return;
+            }
+            () = tokio::time::sleep(idle) => {
+                let begun = calls.load(Ordering::Relaxed);
+                let is_idle = begun == seen && Arc::strong_count(&peer) == at_rest;
+                seen = begun;
+                if is_idle && leaving {
+                    // The client was told, and keeps the connection open.
+                    return;
+                }
+                if is_idle {
+                    serving.as_mut().graceful_shutdown();
+                    leaving = true;
+                }
+            }
+        }
+    }
+}
+
+/// The tasks of a connection's calls, which end with it.
+#[derive(Debug, Clone, Default)]
+struct Calls(Arc<Mutex<JoinSet<()>>>);
+
+impl<F: Future<Output = ()> + Send + 'static> Executor<F> for Calls {
+    fn execute(&self, call: F) {
+        let mut calls = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        while calls.try_join_next().is_some() {}
+        calls.spawn(call);
+    }
+}
+
+/// Gives a request of HTTP/2 the form of HTTP/1.1: the host in a header, and a target without it.
+fn as_http1(request: &mut Request<Incoming>) {
+    let uri = request.uri().clone();
+    if let Some(host) = uri.authority().and_then(|host| HeaderValue::from_str(host.as_str()).ok()) {
+        request.headers_mut().insert(header::HOST, host);
+    }
+    let target = uri.path_and_query().cloned().unwrap_or_else(|| PathAndQuery::from_static("/"));
+    *request.uri_mut() = Uri::from(target);
+}
+
+/// The body of an answer over HTTP/2. Its call counts until the body is sent.
+struct Counted {
+    body: Body,
+    _call: Arc<Peer>,
+}
+
+impl HttpBody for Counted {
+    type Data = Bytes;
+    type Error = axum::Error;
+
+    fn poll_frame(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Option<Result<Frame<Bytes>, axum::Error>>> {
+        Pin::new(&mut self.body).poll_frame(cx)
+    }
+
+    fn is_end_stream(&self) -> bool {
+        self.body.is_end_stream()
+    }
+
+    fn size_hint(&self) -> SizeHint {
+        self.body.size_hint()
     }
 }
 

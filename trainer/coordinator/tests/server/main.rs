@@ -13,6 +13,7 @@ mod demand;
 mod errors;
 mod events;
 mod http;
+mod http2;
 mod limits;
 mod openapi;
 mod owners;

@@ -11,14 +11,14 @@ use rcgen::{BasicConstraints, CertificateParams, IsCa, Issuer, KeyPair};
 use registry::{Holder, Store};
 use reqwest::Method;
 
-struct Files {
-    ca: PathBuf,
+pub(crate) struct Files {
+    pub(crate) ca: PathBuf,
     certificate: PathBuf,
     key: PathBuf,
 }
 
 /// Creates an authority and its certificate for `localhost`.
-fn authority(dir: &Path, name: &str) -> Files {
+pub(crate) fn authority(dir: &Path, name: &str) -> Files {
     let files = Files {
         ca: dir.join(format!("{name}.ca.pem")),
         certificate: dir.join(format!("{name}.pem")),
@@ -39,11 +39,16 @@ fn authority(dir: &Path, name: &str) -> Files {
 }
 
 async fn start(dir: &Path, files: &Files, token: &Token) -> Handle {
+    start_with(dir, files, token, |_| {}).await
+}
+
+pub(crate) async fn start_with(dir: &Path, files: &Files, token: &Token, change: impl FnOnce(&mut Config)) -> Handle {
     let store = Store::open(dir, Holder::this_process("a test")).await.unwrap();
     let mut tokens = Tokens::default();
     tokens.add("me", Scopes::all(), token);
     let tls = Some(tls::server(&files.certificate, &files.key).unwrap());
-    let config = Config { tls, ..Config::server(SocketAddr::from((Ipv4Addr::LOCALHOST, 0)), tokens) };
+    let mut config = Config { tls, ..Config::server(SocketAddr::from((Ipv4Addr::LOCALHOST, 0)), tokens) };
+    change(&mut config);
     Coordinator::start(store, config).await.unwrap()
 }
 
