@@ -515,8 +515,8 @@ fn sentences_are_drawn_in_the_viewers_form_and_by_the_seed_alone() {
     let several = DrawMotions { count: 2, seconds: 0.0, ..settings.clone() };
     let ran = bench.run("drawn", &several.into(), &inputs).expect("the stage runs");
     let several = bench.manifest(ran.output()).expect("stored");
-    let file =
-        |manifest: &protocol::Manifest, name: &str| artifacts::file(&*bench.blobs(), manifest, name).expect("a file");
+    let blobs = bench.blobs();
+    let file = |manifest: &protocol::Manifest, name: &str| artifacts::file(&*blobs, manifest, name).expect("a file");
     let motions: serde_json::Value = serde_json::from_slice(&file(&several, "motions.json")).expect("JSON");
     assert_eq!(
         motions["captions"],
