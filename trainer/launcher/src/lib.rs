@@ -2,7 +2,7 @@
 //!
 //! A launcher is a stateless client of `GET /v1/demand`. The coordinator's lease is the truth: a worker that polls is
 //! alive, even if the engine reports its job as lost. The engine's list is a hint, and only shows jobs on their way. A restarted
-//! launcher finds its jobs by the beginning of their names. [`fleet`] decides, and [`follow`] performs it.
+//! launcher finds its jobs by the beginning of their names. [`fleet`] decides, and [`mod@follow`] performs it.
 //!
 //! The coordinator places tasks on workers. No engine restarts a job: the launcher submits a new one.
 
