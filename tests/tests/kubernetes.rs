@@ -67,8 +67,7 @@ fn the_manifests_of_kubernetes_are_valid_and_a_misspelt_key_is_not() {
         }
     }
     let folder = tempfile::tempdir().expect("a folder");
-    let misspelt =
-        [("worker.yaml", "podFailurePolicy"), ("server.yaml", "readOnlyRootFilesystem"), ("launcher.yaml", "roleRef")];
+    let misspelt = [("worker.yaml", "podFailurePolicy"), ("server.yaml", "readOnlyRootFilesystem")];
     for (name, key) in misspelt {
         let text = fs::read_to_string(base().join(name)).expect("a manifest");
         let wrong = text.replacen(key, &key.replacen('o', "0", 1), 1);

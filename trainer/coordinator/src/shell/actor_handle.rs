@@ -16,7 +16,7 @@ use tokio::task::JoinHandle;
 use super::allowances::Allowances;
 use super::blocking::blocking;
 use super::clock::{Clock, wall_clock, wall_ms};
-use super::demand::Launchers;
+use super::launchers::Launchers;
 use super::meters::Meters;
 use super::records::{Records, read};
 use super::secrets::Secrets;

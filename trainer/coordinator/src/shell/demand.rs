@@ -1,10 +1,6 @@
-//! The call of launchers: demand, and which launcher follows it.
-//!
-//! Of several launchers with the same labels, one leads and starts workers. It leads for as long as it calls, and for
-//! one lease after that. The table is in memory only: after a restart of the server, the first to call leads.
+//! The call of launchers: the demand, or a wait for a change of it.
 
-use std::collections::BTreeMap;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 use std::time::Duration;
 
 use axum::Json;
@@ -19,7 +15,6 @@ use tokio::time::{Instant, sleep_until, timeout_at};
 use super::actor_handle::ActorHandle;
 use super::extract::Query;
 use super::failure::Failure;
-use crate::time::Millis;
 
 /// Shortest time between two computations for one call.
 const PAUSE: Duration = Duration::from_millis(500);
@@ -41,27 +36,6 @@ pub(crate) struct DemandQuery {
     /// Seconds to wait for another version.
     #[serde(default)]
     wait: u32,
-}
-
-/// The leading launcher of each kind of worker, and the time until which it leads.
-#[derive(Debug, Default)]
-pub(crate) struct Launchers(Mutex<BTreeMap<(Backend, Labels), (String, Millis)>>);
-
-impl Launchers {
-    /// Lets `launcher` lead until `until`, unless another one leads at `now`. Returns true if it leads.
-    fn lead(&self, kind: &(Backend, Labels), launcher: &str, now: Millis, until: Millis) -> Result<bool, Failure> {
-        let mut leaders = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        leaders.retain(|_, (_, until)| *until > now);
-        match leaders.get(kind) {
-            Some((leader, _)) if leader != launcher => return Ok(false),
-            None if leaders.len() >= limits::LAUNCHERS => {
-                return Err(Failure::busy(format!("{} launchers already call", limits::LAUNCHERS)));
-            }
-            Some(_) | None => {}
-        }
-        leaders.insert(kind.clone(), (launcher.to_owned(), until));
-        Ok(true)
-    }
 }
 
 pub(crate) async fn demand(

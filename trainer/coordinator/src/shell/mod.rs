@@ -22,6 +22,7 @@ mod effects;
 mod events;
 mod extract;
 mod failure;
+mod launchers;
 mod listener;
 mod meters;
 mod openapi;

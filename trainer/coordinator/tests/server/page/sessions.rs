@@ -97,7 +97,7 @@ async fn a_session_ends_with_its_token_or_when_it_is_signed_out_and_not_with_the
     let status = |cookie: &str| call(address, "GET", "/v1/session", &[("cookie", cookie)]).status;
     assert_eq!([status(&read), status(&submit), status(&own)], [200; 3], "after a restart");
     let who = call(address, "GET", "/v1/session", &[("cookie", &own)]).json();
-    assert_eq!(who["scopes"].as_array().map(Vec::len), Some(5), "{who}");
+    assert_eq!(who["scopes"].as_array().map(Vec::len), Some(Scope::ALL.len()), "{who}");
 
     let page = format!("http://{address}");
     let out = call(address, "DELETE", "/v1/session", &[("cookie", &read), ("origin", &page), ("x-stride-page", "1")]);
@@ -127,7 +127,7 @@ async fn a_printed_link_signs_its_user_in_once_and_does_nothing_else() {
     }
     assert_eq!(call(address, "GET", "/v1/runs", &[("authorization", &format!("Bearer {key}"))]).status, 401);
     let bought = buy(address, &word);
-    assert_eq!(bought.json()["scopes"].as_array().map(Vec::len), Some(5));
+    assert_eq!(bought.json()["scopes"].as_array().map(Vec::len), Some(Scope::ALL.len()));
     assert_eq!(call(address, "GET", "/v1/runs", &[("cookie", &bought.cookie())]).status, 200);
     assert_eq!(buy(address, &word).status, 401, "once");
     handle.shutdown().await;
