@@ -51,6 +51,9 @@ pub(crate) enum CallError {
     /// The run has reached its limit of this resource.
     #[error("{0}")]
     UsedUp(String),
+    /// Another member leads the gang by the newest orders, so the call was not made.
+    #[error("{0}")]
+    Succeeded(String),
     /// The call is invalid; the same call never succeeds.
     #[error("{0}")]
     Refused(String),

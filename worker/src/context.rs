@@ -390,15 +390,30 @@ impl GangContext for HttpContext {
         let receipts = self.receipts(digest);
         failpoints::hit("checkpoint::before_commit");
         retry::until_put_off(&self.held, &format!("committing the checkpoint of step {step}"), |credential| {
+            if self.is_regrouped() && !self.held.leads() {
+                return Err(CallError::Succeeded("another member leads the gang now".to_owned()));
+            }
             let (grant, metrics) = (credential.grant.clone(), metrics.clone());
             let commit = CommitCheckpoint { grant, step, manifest: digest, metrics };
             let vouched = Vouched { what: commit, receipts: receipts.clone() };
             self.client.wait(self.client.tell("/v1/checkpoints", credential, &vouched))
         })
-        .map_err(given_up)?;
+        .map_err(|gave_up| match gave_up {
+            // The next leader has saved a later step.
+            GaveUp::Answer(CallError::Refused(why)) if self.is_regrouped() => ContextError::Succeeded(why),
+            gave_up => given_up(gave_up),
+        })?;
         failpoints::hit("checkpoint::after_commit");
         self.held.committed(digest);
         Ok(())
+    }
+}
+
+impl HttpContext {
+    /// Returns true if the gang has a newer generation than the one that this stage has met.
+    fn is_regrouped(&self) -> bool {
+        let met = self.mesh.as_ref().map(|mesh| mesh.config.generation);
+        met.is_some_and(|met| matches!(self.held.halt(met), Some(Halt::Regroup)))
     }
 }
 
@@ -412,6 +427,7 @@ fn given_up(gave_up: GaveUp) -> ContextError {
     match gave_up {
         GaveUp::Ended(reason) | GaveUp::Answer(CallError::Stale(reason)) => ContextError::GrantEnded(reason),
         GaveUp::Answer(CallError::Storage(message)) => ContextError::Storage(message),
+        GaveUp::Answer(CallError::Succeeded(message)) => ContextError::Succeeded(message),
         GaveUp::Answer(CallError::Refused(message)) => ContextError::Refused(message),
         GaveUp::Answer(error) => ContextError::Unavailable(error.to_string()),
     }

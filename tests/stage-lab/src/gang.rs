@@ -17,13 +17,16 @@ use stages::context::{Adopted, AttemptContext, ContextError, Exchange, GangConte
 use stages::external::DataAccess;
 use stages::train::tree_sum;
 
-/// Losses and joins of a gang's members. Members are numbered from 0; the lowest alive member leads.
+/// Losses and joins of a gang's members. Members are numbered from 0; the lowest alive member
+/// leads, unless it was demoted.
 #[derive(Debug, Clone, Default)]
 pub struct Script {
     /// Member and step: the member is lost when it would contribute to that step.
     pub lost: Vec<(usize, u64)>,
     /// Member and step: the member is lost when it commits the checkpoint of that step.
     pub lost_saving: Vec<(usize, u64)>,
+    /// Member and step: another member leads when this one commits the checkpoint of that step.
+    pub demoted_saving: Vec<(usize, u64)>,
     /// Members that only initialised themselves: the peer whose state they adopt is lost during the transfer, once.
     pub lost_donating: Vec<usize>,
     /// Member and step: the member starts once that step is summed. Its number is above those of the first members.
@@ -36,6 +39,8 @@ pub struct Script {
 struct State {
     generation: u64,
     members: Vec<usize>,
+    /// The member that leads only if it is alone.
+    demoted: Option<usize>,
     arrived: BTreeMap<usize, Option<u64>>,
     donated: Option<Vec<u8>>,
     step: u64,
@@ -50,7 +55,8 @@ impl State {
     fn regroup(&mut self, change: impl FnOnce(&mut Vec<usize>)) {
         self.generation += 1;
         change(&mut self.members);
-        self.members.sort_unstable();
+        let demoted = self.demoted;
+        self.members.sort_unstable_by_key(|member| (Some(*member) == demoted, *member));
         self.arrived.clear();
         self.donated = None;
         self.slices.clear();
@@ -74,6 +80,7 @@ struct Member {
     has_own: bool,
     lost_at: Option<u64>,
     lost_saving: Option<u64>,
+    demoted_saving: Option<u64>,
     loses_donor: bool,
     drain: Option<u64>,
 }
@@ -117,6 +124,7 @@ pub(super) fn run(
         has_own: false,
         lost_at: script.lost.iter().find(|(who, _)| *who == me).map(|(_, step)| *step),
         lost_saving: script.lost_saving.iter().find(|(who, _)| *who == me).map(|(_, step)| *step),
+        demoted_saving: script.demoted_saving.iter().find(|(who, _)| *who == me).map(|(_, step)| *step),
         loses_donor: script.lost_donating.contains(&me),
         drain: script.drain,
     };
@@ -370,6 +378,14 @@ impl GangContext for Member {
             lock(&self.gang.state).regroup(|members| members.retain(|m| *m != me));
             self.gang.changed.notify_all();
             return Err(ContextError::GrantEnded(format!("member {me} was lost while it saved step {step}")));
+        }
+        if self.demoted_saving == Some(step) {
+            self.demoted_saving = None;
+            let mut state = lock(&self.gang.state);
+            state.demoted = Some(self.me);
+            state.regroup(|_| {});
+            self.gang.changed.notify_all();
+            return Err(ContextError::Succeeded(format!("member {} does not lead at step {step}", self.me)));
         }
         self.put_manifest(manifest)?;
         lock(&self.gang.state).checkpoints.push((step, manifest.clone()));

@@ -18,6 +18,9 @@ pub enum ContextError {
     /// This attempt has ended: another holds the grant, or the run was cancelled. Nothing more may be written.
     #[error("the grant of this attempt has ended: {0}")]
     GrantEnded(String),
+    /// Another member leads the gang now, and saves in place of this one.
+    #[error("{0}")]
+    Succeeded(String),
     /// The store or the network failed after retries.
     #[error("{0}")]
     Unavailable(String),
@@ -84,7 +87,8 @@ impl StageError {
             Self::Context(ContextError::Corrupt(_)) => FailureClass::Storage,
             Self::Context(ContextError::Damaged(_)) => FailureClass::Damaged,
             Self::Fault(_) | Self::Context(ContextError::Fault(_)) => FailureClass::Fault,
-            Self::Interrupted | Self::Context(ContextError::GrantEnded(_) | ContextError::Unavailable(_)) => {
+            Self::Interrupted
+            | Self::Context(ContextError::GrantEnded(_) | ContextError::Succeeded(_) | ContextError::Unavailable(_)) => {
                 FailureClass::Infrastructure
             }
         }

@@ -134,6 +134,22 @@ fn p4_a_leader_that_is_lost_in_its_last_save_costs_nothing() {
     }
 }
 
+/// Sampled: the VAE with two and three members. The leader learns in a save that another member leads now, in the middle
+/// and at the end. The next leader saves, and nothing is computed again.
+#[test]
+fn p4_a_leader_that_is_succeeded_during_a_save_costs_nothing() {
+    let mut case = case("vae", [20; 4]);
+    for (members, step, saved) in [(2, 20, &[20][..]), (3, 20, &[20]), (2, 10, &[11, 20]), (3, 10, &[11, 20])] {
+        case.bench.forget("vae");
+        case.bench.checkpoint.every = Steps(if step == 10 { 10 } else { 0 });
+        case.bench.members = members;
+        case.bench.script = Script { demoted_saving: vec![(0, step)], ..Script::default() };
+        let ran = case.bench.run("vae", &case.settings, &case.inputs).unwrap_or_else(|e| panic!("{members}: {e}"));
+        assert_eq!(ran.output(), case.expected, "{members} members");
+        assert_eq!(case.bench.checkpoints("vae"), saved, "{members} members");
+    }
+}
+
 /// A student and a discriminator that take turns, with members lost and gained.
 #[test]
 fn p6_alternating_updates_change_no_byte() {

@@ -4,8 +4,8 @@
 //! |---|---|---|---|
 //! | checkpoint | committed | refused | refused: stale fence |
 //! | resolved | done, for a task that resolves | refused | as for finished |
-//! | finished | done | refused | refused, unless it repeats the accepted report |
-//! | yielded | waits | refused | as above |
+//! | finished | done | done | refused, unless it repeats the accepted report |
+//! | yielded | waits | the member leaves the gang | as above |
 //! | failed: infrastructure, fault, damaged; another member holds the state | the member leaves the gang | the same | as above |
 //! | failed: infrastructure | tried again | the member leaves the gang | as above |
 //! | failed: fault | tried again | tried again | as above |
@@ -22,7 +22,7 @@ use std::sync::Arc;
 use protocol::message::{CommitCheckpoint, FailureClass, Grant, LossCause, ReportOutcome, TaskOutcome};
 use protocol::stage::StageSettings;
 use protocol::sweep::STATE_OUTPUT;
-use protocol::{Digest, WorkerId, canonical};
+use protocol::{Digest, canonical};
 use registry::{Write, WriteError};
 
 use crate::decide::attempts::Loss;
@@ -40,7 +40,10 @@ impl Deciding<'_> {
         let CommitCheckpoint { grant, step, manifest, metrics } = commit;
         let (execution, task) = self.state.task(&grant.task)?;
         if task.check(&grant)? != 0 {
-            return Err(only_rank_0(&grant.worker, "commits checkpoints"));
+            let worker = &grant.worker;
+            return Err(Rejected::Conflict(format!(
+                "worker `{worker}` is not rank 0 of its gang; only rank 0 commits checkpoints"
+            )));
         }
         match task.newest() {
             Some(newest) if newest.step == step && newest.manifest == manifest => return Ok(false),
@@ -85,16 +88,15 @@ impl Deciding<'_> {
                 let task = &grant.task;
                 return Err(Rejected::Conflict(format!("task `{task}` digests files; it has no artifact")));
             }
+            // Whoever led the gang when it published the value: all members compute the same one.
             TaskOutcome::Finished { output, metrics } => {
-                if rank != 0 {
-                    return Err(only_rank_0(&worker, "reports the end"));
-                }
                 self.finished(&report, key, i, *output, metrics.clone())?;
             }
+            // It led the gang when it saved and stopped. The others go on with their own state.
+            TaskOutcome::Yielded { .. } if rank != 0 => {
+                self.take_from(key, i, std::slice::from_ref(&worker), Loss::Lost);
+            }
             TaskOutcome::Yielded { .. } => {
-                if rank != 0 {
-                    return Err(only_rank_0(&worker, "reports the end"));
-                }
                 let now = self.now();
                 let soon = now.after(self.state.policy.backoff_ms);
                 self.change(key, i, |task| {
@@ -220,10 +222,6 @@ fn left_state(settings: &StageSettings, task: &Task) -> Result<Option<Digest>, R
             other.map(|saved| saved.step)
         ))),
     }
-}
-
-fn only_rank_0(worker: &WorkerId, what: &str) -> Rejected {
-    Rejected::Conflict(format!("worker `{worker}` is not rank 0 of its gang; only rank 0 {what}"))
 }
 
 /// The event that replaces one that the store refuses permanently.

@@ -54,25 +54,40 @@ fn p3_the_task_of_a_dead_worker_is_another_s_within_16_seconds() {
 }
 
 #[test]
-fn only_the_first_member_of_a_gang_commits_and_reports_the_end() {
+fn only_the_first_member_of_a_gang_commits() {
     let mut coordinator = PureCoordinator::new(Policy::default());
-    let (run, _) = gang_of_three(&mut coordinator);
+    gang_of_three(&mut coordinator);
     let [first, second] = ["a", "b"].map(|name| coordinator.assignment(name).expect("it trains").grant);
-    let events = |grant: &Grant| {
-        let (manifest, output) = (Digest::of(b"step 1"), Digest::of(b"vae"));
-        let commit = CommitCheckpoint { grant: grant.clone(), step: 1, manifest, metrics: Default::default() };
-        let finished = TaskOutcome::Finished { output, metrics: Default::default() };
-        let report = |outcome| Event::Outcome { report: ReportOutcome { grant: grant.clone(), outcome } };
-        [Event::Checkpoint { commit }, report(TaskOutcome::Yielded { at: 1 }), report(finished)]
+    let commit = |grant: &Grant| {
+        let (grant, manifest) = (grant.clone(), Digest::of(b"step 1"));
+        Event::Checkpoint { commit: CommitCheckpoint { grant, step: 1, manifest, metrics: Default::default() } }
     };
-    for event in events(&second) {
-        let refused = coordinator.happen(event.clone());
-        assert!(matches!(refused, Err(Rejected::Conflict(_))), "{event:?}: {refused:?}");
+    let refused = coordinator.happen(commit(&second));
+    assert!(matches!(refused, Err(Rejected::Conflict(_))), "{refused:?}");
+    coordinator.happen(commit(&first)).expect("saved");
+}
+
+/// A member that led the gang may learn only from its report that another one leads now.
+#[test]
+fn a_report_of_the_end_counts_whoever_leads_the_gang_meanwhile() {
+    for (name, is_alone) in [("a", true), ("b", false)] {
+        let mut coordinator = PureCoordinator::new(Policy::default());
+        let (run, _) = gang_of_three(&mut coordinator);
+        let grant = coordinator.assignment(name).expect("it trains").grant;
+        let report = |outcome| Event::Outcome { report: ReportOutcome { grant: grant.clone(), outcome } };
+        let attempt = grant.attempt;
+        coordinator.happen(report(TaskOutcome::Yielded { at: 1 })).expect("heard");
+        let (_, task) = coordinator.state.task(&grant.task).expect("known");
+        assert_eq!(task.attempt == attempt && !task.holders().is_empty(), !is_alone, "{name}: {task:?}");
+
+        let mut coordinator = PureCoordinator::new(Policy::default());
+        let (again, _) = gang_of_three(&mut coordinator);
+        assert_eq!(again, run);
+        let grant = coordinator.assignment(name).expect("it trains").grant;
+        let outcome = TaskOutcome::Finished { output: Digest::of(b"vae"), metrics: Default::default() };
+        coordinator.happen(Event::Outcome { report: ReportOutcome { grant, outcome } }).expect("done");
+        assert_eq!(coordinator.run_state(&run), RunState::Finished, "{name}");
     }
-    let [commit, _, finished] = events(&first);
-    coordinator.happen(commit).expect("saved");
-    coordinator.happen(finished).expect("done");
-    assert_eq!(coordinator.run_state(&run), RunState::Finished);
 }
 
 /// Sampled: one gang of three. Its first member is silent beyond its lease and then polls with its old grant, with

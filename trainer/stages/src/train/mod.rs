@@ -176,7 +176,18 @@ pub fn train(
             if cx.leads() {
                 if saved_at != Some(state.step) {
                     // Publishing may fail or be interrupted; the last step should not have to be recomputed.
-                    save(&mut state, config, &recent, cx)?;
+                    match save(&mut state, config, &recent, cx) {
+                        Err(StageError::Context(ContextError::Succeeded(_))) => {
+                            // The next leader makes the last save from its own copy of the state.
+                            let applied = Some(state.step);
+                            if meet(&mut state, applied, cx)? == Met::Adopted {
+                                keep(&mut state, accelerator.as_ref());
+                                objective.load(&state);
+                            }
+                            continue;
+                        }
+                        saved => saved?,
+                    }
                 }
                 state.fetch();
                 return Ok(if state.step < steps {
@@ -245,6 +256,8 @@ pub fn train(
                 Err(StageError::Context(ContextError::Unavailable(why))) if !cx.can_save() => {
                     cx.log(&format!("the checkpoint after step {} is delayed: {why}", state.step));
                 }
+                // The next exchange meets the others, and the next leader saves.
+                Err(StageError::Context(ContextError::Succeeded(_))) => {}
                 Err(error) => return Err(error),
             }
         }
