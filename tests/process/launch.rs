@@ -170,7 +170,6 @@ impl Site {
         };
         for line in &lines {
             ran += 1;
-            println!("$ {line}");
             if line.contains("--workers") {
                 let mut launcher = Running::logged(&mut bash(&dir, &self.preamble, &format!("exec {line}")), &log);
                 self.said(&run(1));

@@ -111,7 +111,8 @@ impl World {
             job.age += 1;
             job.polls |= starts_in.is_some_and(|seconds| job.age >= seconds);
             let crashes = starts_in.is_none() && !job.polls;
-            !(job.leaves && !job.works) && !crashes
+            let has_left = job.leaves && !job.works;
+            !has_left && !crashes
         });
         let mut left = self.slots;
         for job in self.jobs.values_mut().filter(|job| job.polls) {
