@@ -192,6 +192,8 @@ const ALSO_IN: [(&str, &[&str]); 5] = [
         ],
     ),
     ("ImportModel", &["pipeline/src/reference.rs"]),
+    // `POST /v1/draws` is a run of it.
+    ("DrawMotions", &["shell/draws.rs"]),
 ];
 
 /// A new kind is two files, and its lines in the lists of their folders.
