@@ -229,7 +229,7 @@ mod tests {
         Draw {
             models: vec!["walks@prod".into(), "walks:3".into()],
             checkpoints: Vec::new(),
-            sentences: vec!["a person \"walks\"\n: {oddly}".into()],
+            sentences: vec!["a person \"walks\": {oddly}".into()],
             count: 2,
             seconds: Some(2.5),
             path: vec![[1.0, 0.0, 0.9, 0.5]],
