@@ -168,7 +168,7 @@ fn no_folders_import_each_other_in_a_loop() {
 
 /// Settings types that are also data for other code: datasets, encoders by their folders, parts of an import. Each with
 /// the places that read them.
-const ALSO_IN: [(&str, &[&str]); 5] = [
+const ALSO_IN: [(&str, &[&str]); 6] = [
     (
         "DataSynthetic",
         &[
@@ -194,6 +194,8 @@ const ALSO_IN: [(&str, &[&str]); 5] = [
         ],
     ),
     ("ImportModel", &["pipeline/src/reference.rs"]),
+    // `POST /v1/draws` is a run of it.
+    ("DrawMotions", &["shell/draws.rs"]),
 ];
 
 /// A new kind is two files, and its lines in the lists of their folders.
