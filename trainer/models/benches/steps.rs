@@ -1,5 +1,5 @@
 //! Times training steps of the VAE, the denoiser and PCM with Burn's operations and with the fused kernels. The two
-//! alternate in one run and medians are printed, so that a busy moment of the machine counts little.
+//! alternate in one run. The least processor time of each is printed, so that other work on the machine counts little.
 //!
 //! Run it with `RAYON_NUM_THREADS=1 cargo bench -p models` for one thread. A number after `--` sets the timed steps of
 //! each. Words after `--` choose the cases that contain one of them; `fused` runs no stock steps, for a profiler.
@@ -162,9 +162,18 @@ fn pcm_step(state: &mut Distilled, batch: usize, device: &Device) {
     state.heads.step(|heads| losses::hinge_discriminator(heads.forward(real), heads.forward(seen)) / batch as f32);
 }
 
-fn median(mut times: Vec<Duration>) -> f64 {
-    times.sort_unstable();
-    times[times.len() / 2].as_secs_f64()
+/// Processor time of all threads of this process; the time since `begun` where Linux does not tell it.
+fn time(begun: Instant) -> Duration {
+    let Ok(threads) = std::fs::read_dir("/proc/self/task") else { return begun.elapsed() };
+    let spent = threads.flatten().filter_map(|thread| {
+        let text = std::fs::read_to_string(thread.path().join("schedstat")).ok()?;
+        text.split(' ').next()?.parse::<u64>().ok()
+    });
+    Duration::from_nanos(spent.sum())
+}
+
+fn least(times: Vec<Duration>) -> f64 {
+    times.into_iter().min().unwrap_or_default().as_secs_f64()
 }
 
 /// What to run, from the command line.
@@ -189,21 +198,21 @@ impl Plan {
         }
         let (mut fused, mut stock) = (make(), make());
         let (mut fast, mut slow) = (Vec::new(), Vec::new());
+        let begun = Instant::now();
         for turn in 0..self.count + 2 {
-            let start = Instant::now();
+            let start = time(begun);
             step(&mut fused);
-            let taken = start.elapsed();
-            let start = Instant::now();
+            let middle = time(begun);
             if !self.alone {
                 kernels::stock(|| step(&mut stock));
             }
             // The first two turns warm up caches and the allocator.
             if turn >= 2 {
-                fast.push(taken);
-                slow.push(start.elapsed());
+                fast.push(middle - start);
+                slow.push(time(begun) - middle);
             }
         }
-        let (fast, slow) = (median(fast), median(slow));
+        let (fast, slow) = (least(fast), least(slow));
         let rate = |seconds: f64| samples as f64 / seconds;
         if self.alone {
             println!("{name:<44} fused {:7.1} ms {:6.0}/s", fast * 1e3, rate(fast));

@@ -14,7 +14,10 @@ use burn::tensor::{Device, Tensor, TensorData};
 use motion::skeleton::Skeleton;
 use protocol::stage::VaeLoss;
 
+use crate::kernels;
 use crate::networks::Posterior;
+
+pub use crate::kernels::Pointwise;
 
 /// Mean squared error of each example, summed. [B, N, d].
 pub fn mse(found: Tensor<3>, expected: Tensor<3>) -> Tensor<1> {
@@ -59,31 +62,6 @@ fn per_example(elements: Tensor<3>) -> Tensor<1> {
     elements.sum() / ((tokens * width) as f32)
 }
 
-/// Distance of two numbers with difference `d`.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Pointwise {
-    /// `d^2 / 2` up to 1, `|d| - 1/2` beyond.
-    SmoothL1,
-    /// Absolute error, `|d|`.
-    L1,
-    /// Squared error, `d^2`.
-    L2,
-}
-
-impl Pointwise {
-    pub(crate) fn of(self, difference: Tensor<3>) -> Tensor<3> {
-        match self {
-            Self::SmoothL1 => {
-                let d = difference.abs();
-                let m = d.clone().clamp_max(1.0);
-                m.clone() * (d - m * 0.5)
-            }
-            Self::L1 => difference.abs(),
-            Self::L2 => difference.square(),
-        }
-    }
-}
-
 /// Weight of each frame of a padded batch.
 #[derive(Debug, Clone)]
 pub struct FrameWeights {
@@ -110,7 +88,7 @@ impl FrameWeights {
     /// Mean over the width, weighted mean over the frames, sum over the examples. [B, T, width].
     pub fn compare(&self, distance: Pointwise, found: Tensor<3>, expected: Tensor<3>) -> Tensor<1> {
         let width = found.dims()[2] as f32;
-        (distance.of(found - expected) * self.weights.clone()).sum() / width
+        kernels::weighted_distance(distance, found, expected, self.weights.clone()) / width
     }
 }
 
@@ -135,9 +113,19 @@ impl Body {
         Self { skeleton, metres_per_unit: skeleton.metres_per_unit, mean: row(mean), std: row(std) }
     }
 
-    /// Joints [B, T, J, 3] of normalised features [B, T, D], in the data's unit.
+    /// Joints [B, T, J, 3] of normalised features [B, T, D], in the data's unit. Gradients flow through the running sums
+    /// of turns and steps. The differentiable equivalent of `motion::features::recover_joints`.
     pub fn joints(&self, features: Tensor<3>) -> Tensor<4> {
-        joints(features * self.std.clone() + self.mean.clone(), self.skeleton)
+        self.scaled(features, 1.0)
+    }
+
+    /// [`joints`](Self::joints) in the unit of the joint term.
+    fn metres(&self, features: Tensor<3>) -> Tensor<4> {
+        self.scaled(features, self.metres_per_unit)
+    }
+
+    fn scaled(&self, features: Tensor<3>, scale: f64) -> Tensor<4> {
+        kernels::joints(features, self.mean.clone(), self.std.clone(), scale, self.skeleton)
     }
 }
 
@@ -277,8 +265,7 @@ pub fn vae(
     let local = |x: &Tensor<3>| x.clone().slice([0..batch, 0..frames, positions.clone()]);
     // Recovering the joints takes many operations, so both terms on joints share the result.
     let weighs = weights.joint != 0.0 || weights.feet != 0.0;
-    let metres = |x: &Tensor<3>| body.joints(x.clone()) * (body.metres_per_unit as f32);
-    let joints = weighs.then(|| [metres(&decoded), metres(&features)]);
+    let joints = weighs.then(|| [body.metres(decoded.clone()), body.metres(features.clone())]);
     let compared = |x: &Tensor<4>| x.clone().reshape([batch, frames, 3 * body.skeleton.joints]);
     VaeTerms {
         feature: term(weights.feature, &|| frame_weights.compare(recipe.feature, decoded.clone(), features.clone())),
@@ -298,47 +285,8 @@ pub fn vae(
 
 /// Velocities [B, T - 1, 4 x 3] of ankles and feet, per second. `joints` [B, T, J, 3].
 fn foot_velocities(joints: &Tensor<4>, skeleton: &Skeleton) -> Tensor<3> {
-    let [batch, frames, _, _] = joints.dims();
-    let feet = skeleton.left_foot.iter().chain(&skeleton.right_foot);
-    let feet = feet.map(|j| joints.clone().slice([0..batch, 0..frames, *j..j + 1, 0..3])).collect();
-    let feet = Tensor::cat(feet, 2).reshape([batch, frames, 12]);
-    let at = |t: std::ops::Range<usize>| feet.clone().slice([0..batch, t, 0..12]);
-    (at(1..frames) - at(0..frames - 1)) * (skeleton.fps as f32)
-}
-
-/// Global joints [B, T, J, 3] of features [B, T, D] that are not normalised; gradients flow through the running sums.
-///
-/// The differentiable equivalent of `motion::features::recover_joints`. The turn feature is half the yaw increment. So
-/// its running sum `a_t` (over rows before t) is the angle of the heading's quaternion, and `2 a_t` is the yaw. Turn
-/// and velocity of the last row are not used.
-pub fn joints(features: Tensor<3>, skeleton: &Skeleton) -> Tensor<4> {
-    let [batch, frames, _] = features.dims();
-    let (device, others) = (features.device(), skeleton.joints - 1);
-    let columns = |range: std::ops::Range<usize>| features.clone().slice([0..batch, 0..frames, range]);
-    // Row t holds the increment that leads *to* frame t; the first row is zero.
-    let before = |x: Tensor<3>| {
-        let width = x.dims()[2];
-        let first = Tensor::zeros([batch, 1, width], &device);
-        if frames == 1 {
-            return first;
-        }
-        Tensor::cat(vec![first, x.slice([0..batch, 0..frames - 1, 0..width])], 1)
-    };
-    let yaw = before(columns(0..1)).cumsum(1) * 2.0;
-    let (sin, cos) = (yaw.clone().sin(), yaw.cos());
-
-    let (step_x, step_z) = (before(columns(1..2)), before(columns(2..3)));
-    let root_x = (cos.clone() * step_x.clone() - sin.clone() * step_z.clone()).cumsum(1);
-    let root_z = (sin.clone() * step_x + cos.clone() * step_z).cumsum(1);
-    let root = Tensor::cat(vec![root_x.clone(), columns(3..4), root_z.clone()], 2).reshape([batch, frames, 1, 3]);
-
-    let local = columns(skeleton.layout().positions).reshape([batch, frames, others, 3]);
-    let axis = |k: usize| local.clone().slice([0..batch, 0..frames, 0..others, k..k + 1]);
-    let wide = |x: Tensor<3>| x.reshape([batch, frames, 1, 1]);
-    let (x, z, sin, cos) = (axis(0), axis(2), wide(sin), wide(cos));
-    let turned_x = cos.clone() * x.clone() - sin.clone() * z.clone() + wide(root_x);
-    let turned_z = sin * x + cos * z + wide(root_z);
-    Tensor::cat(vec![root, Tensor::cat(vec![turned_x, axis(1), turned_z], 3)], 2)
+    let feet: Vec<usize> = skeleton.left_foot.iter().chain(&skeleton.right_foot).copied().collect();
+    kernels::joint_velocities(joints.clone(), &feet, skeleton.fps)
 }
 
 #[cfg(test)]
@@ -354,6 +302,11 @@ mod tests {
         (0..frames).flat_map(|t| (0..skeleton.features).map(move |k| scale(k) * value(t, k))).collect()
     }
 
+    /// A body whose features are not normalised.
+    fn plain(skeleton: &'static Skeleton) -> Body {
+        Body::new(skeleton, &vec![0.0; skeleton.features], &vec![1.0; skeleton.features], &Device::flex())
+    }
+
     #[test]
     fn joints_are_those_of_the_data_code() {
         for format in [DataFormat::Humanml3d, DataFormat::Kit] {
@@ -361,7 +314,7 @@ mod tests {
                 let skeleton = Skeleton::of(format);
                 let clips: Vec<Vec<f32>> = (0..3).map(|seed| rows(skeleton, frames, seed)).collect();
                 let data = TensorData::new(clips.concat(), [3, frames, skeleton.features]);
-                let found = joints(Tensor::from_data(data, &Device::flex()), skeleton);
+                let found = plain(skeleton).joints(Tensor::from_data(data, &Device::flex()));
                 assert_eq!(found.dims(), [3, frames, skeleton.joints, 3]);
                 let expected: Vec<f32> = clips.iter().flat_map(|c| recover_joints(c, skeleton)).collect();
                 let data = found.into_data();
@@ -378,7 +331,7 @@ mod tests {
         let (frames, device) = (6, Device::flex());
         let base = rows(skeleton, frames, 1);
         let loss = |x: Tensor<3>| {
-            let found = joints(x, skeleton);
+            let found = plain(skeleton).joints(x);
             let n = found.shape().num_elements();
             let weights: Vec<f32> = (0..n).map(|i| (i as f32 * 0.71).cos()).collect();
             let weights = Tensor::<4>::from_data(TensorData::new(weights, found.dims()), &found.device());

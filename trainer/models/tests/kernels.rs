@@ -3,6 +3,8 @@
 
 use burn::tensor::{Device, Tensor, TensorData};
 use models::kernels::{self, Dropout, KeyMask, stock};
+use motion::skeleton::Skeleton;
+use protocol::stage::DataFormat;
 
 /// Smooth, distinct values of either sign.
 fn wave(count: usize, seed: usize) -> Vec<f32> {
@@ -401,4 +403,42 @@ fn gru_is_the_stock_gru() {
     let gradient = values(a.grad(&weighted(y).backward()).unwrap());
     slopes("gru", &wave(72, 1), &gradient, run);
     assert!(gradient[(3 + 2) * 12..].iter().all(|g| *g == 0.0), "what is behind the end has no part");
+}
+
+#[test]
+fn distances_are_the_stock_distances() {
+    for distance in [kernels::Pointwise::SmoothL1, kernels::Pointwise::L1, kernels::Pointwise::L2] {
+        agree(&format!("{distance:?}"), 2e-6, || {
+            let (found, expected) = (leaf([3, 5, 37], 1), leaf([3, 5, 37], 2));
+            let weights = tensor([3, 5, 1], 3, &Device::flex());
+            let out = kernels::weighted_distance(distance, found.clone(), expected.clone(), weights);
+            let gradients = weighted(out.clone()).backward();
+            vec![values(out), values(found.grad(&gradients).unwrap()), values(expected.grad(&gradients).unwrap())]
+        });
+    }
+}
+
+#[test]
+fn joints_and_velocities_are_the_stock_ones() {
+    for format in [DataFormat::Humanml3d, DataFormat::Kit] {
+        let skeleton = Skeleton::of(format);
+        for frames in [1, 2, 33] {
+            agree(&format!("joints of {frames} frames"), 5e-6, || {
+                let width = skeleton.features;
+                let x = leaf([3, frames, width], 1);
+                let (mean, std) =
+                    (tensor([1, 1, width], 2, &Device::flex()), tensor([1, 1, width], 3, &Device::flex()));
+                let joints = kernels::joints(x.clone(), mean * 0.1, std * 0.1, 1.7, skeleton);
+                let mut all = vec![values(joints.clone())];
+                let mut loss = weighted(joints.clone());
+                if frames > 1 {
+                    let moves = kernels::joint_velocities(joints, &[7, 0, 10], 20.0);
+                    all.push(values(moves.clone()));
+                    loss = loss + weighted(moves);
+                }
+                all.push(values(x.grad(&loss.backward()).unwrap()));
+                all
+            });
+        }
+    }
 }

@@ -10,11 +10,13 @@
 //! Not its job: parameters, and the shapes of networks.
 
 mod attention;
+mod distance;
 mod dropout;
 #[cfg(feature = "flex")]
 mod fused;
 mod gelu;
 mod gru;
+mod joints;
 mod linear;
 mod mish;
 mod norm;
@@ -25,9 +27,11 @@ pub(crate) mod simd;
 mod tile;
 
 pub use attention::{KeyMask, cross_attention, self_attention};
+pub use distance::{Pointwise, weighted_distance};
 pub use dropout::{Dropout, dropout};
 pub use gelu::gelu;
 pub use gru::gru;
+pub use joints::{joint_velocities, joints};
 pub use linear::linear;
 pub use mish::mish;
 pub use norm::{add_layer_norm, layer_norm, leaky_layer_norm};

@@ -68,7 +68,7 @@ mod kernel {
     use burn::backend::flex::FlexTensor;
 
     use crate::kernels::fused::{Fused, make, overwrite, shape, slice};
-    use crate::kernels::simd::multiversion;
+    use crate::kernels::simd::{lanes, multiversion};
 
     /// The norm of a tensor, and the slope of what follows below 0; 1 is no ReLU.
     #[derive(Debug, Clone)]
@@ -94,26 +94,6 @@ mod kernel {
         scales: Vec<f32>,
         gamma: FlexTensor,
         beta: FlexTensor,
-    }
-
-    /// Sums in 16 lanes, then adds the lanes in order. It vectorises and has one order for all widths.
-    #[inline(always)]
-    fn lanes(mut items: impl FnMut(usize) -> f32, width: usize) -> f32 {
-        let mut lane = [0.0_f32; 16];
-        let whole = width / 16 * 16;
-        let mut i = 0;
-        while i < whole {
-            for (l, slot) in lane.iter_mut().enumerate() {
-                *slot += items(i + l);
-            }
-            i += 16;
-        }
-        let mut rest = 0.0;
-        while i < width {
-            rest += items(i);
-            i += 1;
-        }
-        lane.iter().sum::<f32>() + rest
     }
 
     /// Operands of a forward pass; those that a norm does not have are empty.
