@@ -153,7 +153,7 @@ pub(crate) enum End {
 /// Joins the coordinator. Retries until it accepts this process; otherwise returns the end of the worker.
 async fn join(client: &Client, join: &Join, shared: &Shared) -> Result<Joined, End> {
     let mut pause = Duration::from_millis(50);
-    let begun = Instant::now();
+    let mut begun = Instant::now();
     let mut said: Option<Instant> = None;
     loop {
         match client.join(join).await {
@@ -168,6 +168,8 @@ async fn join(client: &Client, join: &Join, shared: &Shared) -> Result<Joined, E
                 }
             }
             Err(error) if error.may_pass() => {
+                // A coordinator that starts again renews the lease of the name's holder.
+                begun = Instant::now();
                 if said.is_none_or(|said| said.elapsed() > REMIND) {
                     said = Some(Instant::now());
                     let help = match error {

@@ -5,7 +5,7 @@
 //! `UPDATE_COUNTS="reason" cargo test -p stages --test instructions`.
 //!
 //! Counts are of the dev profile, one thread and the AVX2 kernels, because valgrind hides AVX-512. They depend on the
-//! compiler, so the table names it. Not its job: speed, which `cargo bench -p models` measures.
+//! compiler and on the sizes of caches, so the table names them. Not its job: speed, which `cargo bench -p models` measures.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -130,6 +130,13 @@ fn says(program: &str, argument: &str) -> Option<String> {
     Some(String::from_utf8_lossy(&output.stdout).trim().to_owned())
 }
 
+/// Sizes of the caches, by which matrix products are cut into blocks.
+fn caches() -> String {
+    let size = |index| std::fs::read_to_string(format!("/sys/devices/system/cpu/cpu0/cache/index{index}/size"));
+    let sizes: Vec<String> = (0..4).map(|index| size(index).unwrap_or_default().trim().to_owned()).collect();
+    sizes.join(" ")
+}
+
 #[test]
 fn a_step_takes_no_more_instructions_than_the_table_says() {
     let Some(valgrind) = says("valgrind", "--version") else {
@@ -139,7 +146,8 @@ fn a_step_takes_no_more_instructions_than_the_table_says() {
     if models::instruction_set() != "avx512" && models::instruction_set() != "avx2" {
         return fixtures::skip("the table is for processors with AVX2");
     }
-    let tools = format!("{}, {valgrind}", says("rustc", "--version").expect("the compiler that built this test"));
+    let rustc = says("rustc", "--version").expect("the compiler that built this test");
+    let tools = format!("{rustc}, {valgrind}, caches of {}", caches());
     let table = std::fs::read_to_string(TABLE).unwrap_or_default();
     let reason = std::env::var("UPDATE_COUNTS").ok();
     assert!(reason.as_deref() != Some(""), "UPDATE_COUNTS is the reason of the change");

@@ -8,7 +8,7 @@
 //! Callers other than workers also share a limited part, with a further limit per token, so that readers cannot block
 //! workers.
 //!
-//! With TLS, a client may choose HTTP/2. One connection then carries several calls, each of which counts like a
+//! With TLS, a client may choose HTTP/2. One connection then carries several calls. Each call counts like a
 //! connection of its token.
 
 use std::collections::{BTreeMap, HashMap};

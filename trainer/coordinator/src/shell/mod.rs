@@ -110,7 +110,7 @@ pub struct Config {
     pub connections: Connections,
     /// Limits of runs and tokens.
     pub allowances: Allowances,
-    /// Addresses that are told of what happens.
+    /// Addresses that get messages about runs and models.
     pub hooks: Hooks,
     /// Time before the first repetition of a message to a hook; each further one takes six times as long.
     pub hook_retry: Duration,
