@@ -35,6 +35,7 @@ pub struct DrawMotions {
     /// Only a model with a control part follows them.
     pub path: Vec<[f64; 4]>,
     /// Seed of the first motion's noise, in the place of the pipeline's seed.
+    #[schemars(range(min = 0, max = 9_007_199_254_740_991_u64))]
     pub seed: Seed,
     /// Number of network evaluations. 0 takes the sampler of the model's own evaluation.
     #[schemars(range(min = 0, max = 1_000), extend("x-unit" = "steps"))]
