@@ -53,7 +53,7 @@ pub(crate) enum CallError {
     UsedUp(String),
     /// Another member leads the gang by the newest orders, so the call was not made.
     #[error("{0}")]
-    Succeeded(String),
+    NoLongerLeads(String),
     /// The call is invalid; the same call never succeeds.
     #[error("{0}")]
     Refused(String),

@@ -391,7 +391,7 @@ impl GangContext for HttpContext {
         failpoints::hit("checkpoint::before_commit");
         retry::until_put_off(&self.held, &format!("committing the checkpoint of step {step}"), |credential| {
             if self.is_regrouped() && !self.held.leads() {
-                return Err(CallError::Succeeded("another member leads the gang now".to_owned()));
+                return Err(CallError::NoLongerLeads("another member leads the gang now".to_owned()));
             }
             let (grant, metrics) = (credential.grant.clone(), metrics.clone());
             let commit = CommitCheckpoint { grant, step, manifest: digest, metrics };
@@ -400,7 +400,7 @@ impl GangContext for HttpContext {
         })
         .map_err(|gave_up| match gave_up {
             // The next leader has saved a later step.
-            GaveUp::Answer(CallError::Refused(why)) if self.is_regrouped() => ContextError::Succeeded(why),
+            GaveUp::Answer(CallError::Refused(why)) if self.is_regrouped() => ContextError::NoLongerLeads(why),
             gave_up => given_up(gave_up),
         })?;
         failpoints::hit("checkpoint::after_commit");
@@ -427,7 +427,7 @@ fn given_up(gave_up: GaveUp) -> ContextError {
     match gave_up {
         GaveUp::Ended(reason) | GaveUp::Answer(CallError::Stale(reason)) => ContextError::GrantEnded(reason),
         GaveUp::Answer(CallError::Storage(message)) => ContextError::Storage(message),
-        GaveUp::Answer(CallError::Succeeded(message)) => ContextError::Succeeded(message),
+        GaveUp::Answer(CallError::NoLongerLeads(message)) => ContextError::NoLongerLeads(message),
         GaveUp::Answer(CallError::Refused(message)) => ContextError::Refused(message),
         GaveUp::Answer(error) => ContextError::Unavailable(error.to_string()),
     }

@@ -385,7 +385,7 @@ impl GangContext for Member {
             state.demoted = Some(self.me);
             state.regroup(|_| {});
             self.gang.changed.notify_all();
-            return Err(ContextError::Succeeded(format!("member {} does not lead at step {step}", self.me)));
+            return Err(ContextError::NoLongerLeads(format!("member {} does not lead at step {step}", self.me)));
         }
         self.put_manifest(manifest)?;
         lock(&self.gang.state).checkpoints.push((step, manifest.clone()));

@@ -1,4 +1,4 @@
-//! What is fetched from public hosts: text encoders of the Hugging Face hub, and published sets of motion ([`dataset`]).
+//! Downloads from public hosts: text encoders of the Hugging Face hub, and published sets of motion ([`dataset`]).
 //!
 //! [`Hub::folder`] returns a folder with the files of a repository that an encoder needs, from the cache or fetched
 //! into it. The cache is that of `huggingface_hub`, which all programs share: `models--ORG--NAME/snapshots/COMMIT/FILE`

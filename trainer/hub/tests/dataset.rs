@@ -21,7 +21,7 @@ enum Answer {
     Whole,
     /// So many bytes of that, then a closed connection.
     Cut(usize),
-    /// The whole archive, whatever part was asked for, cut after so many bytes.
+    /// The whole archive for every range, cut after so many bytes.
     WithoutRanges(usize),
     Status(u16),
 }

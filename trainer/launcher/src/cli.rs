@@ -20,7 +20,7 @@ use crate::worker_command::WorkerCommand;
 /// Longest name of a launcher, so that names of its workers have at most 63 characters.
 const NAME: usize = 40;
 
-/// An engine.
+/// The engine that runs the workers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum Engine {
     Slurm,

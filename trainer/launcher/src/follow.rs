@@ -186,7 +186,7 @@ async fn perform(
     last
 }
 
-/// Asks all jobs of a launcher to end. Returns those that were asked.
+/// Asks all jobs of a launcher to end. Returns these jobs.
 ///
 /// # Errors
 /// The list or one of the calls fails.

@@ -113,10 +113,10 @@ impl Launcher for Hosts {
                 }
             }
         }
-        let nobody_answers = counts.is_empty();
+        let none_answers = counts.is_empty();
         *self.counts() = counts;
         match last_error {
-            Some(error) if nobody_answers => Err(error),
+            Some(error) if none_answers => Err(error),
             _ => Ok(jobs),
         }
     }

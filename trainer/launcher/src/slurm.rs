@@ -57,7 +57,7 @@ fn jobs(text: &str) -> Vec<Job> {
 
 fn ending(job: &Job) -> Option<EngineCommand> {
     match job.state {
-        // Without effect if the job has started meanwhile; it then gets the signal the next time.
+        // This has no effect if the job has started meanwhile. It then gets the signal at the next call.
         JobState::Pending => Some(EngineCommand::new("scancel", ["--state=PENDING", &job.id])),
         JobState::Running => Some(EngineCommand::new("scancel", ["--batch", "--signal=TERM", &job.id])),
         JobState::Ending => None,

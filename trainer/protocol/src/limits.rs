@@ -54,7 +54,7 @@ pub const CURVE_BUCKETS: usize = 4_000;
 pub const CURVE_CELLS: usize = 200_000;
 /// Largest number of runs whose curves are in one answer.
 pub const CURVE_RUNS: usize = 50;
-/// Largest number of labels of a worker, and of those that a stage requires.
+/// Largest number of labels of a worker, and of required labels of a stage.
 pub const LABELS: usize = 16;
 /// Largest number of seconds that a call for demand waits for a change.
 pub const DEMAND_WAIT_S: u32 = 30;

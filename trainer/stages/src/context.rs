@@ -20,7 +20,7 @@ pub enum ContextError {
     GrantEnded(String),
     /// Another member leads the gang now, and saves in place of this one.
     #[error("{0}")]
-    Succeeded(String),
+    NoLongerLeads(String),
     /// The store or the network failed after retries.
     #[error("{0}")]
     Unavailable(String),
@@ -88,9 +88,9 @@ impl StageError {
             Self::Context(ContextError::Damaged(_)) => FailureClass::Damaged,
             Self::Fault(_) | Self::Context(ContextError::Fault(_)) => FailureClass::Fault,
             Self::Interrupted
-            | Self::Context(ContextError::GrantEnded(_) | ContextError::Succeeded(_) | ContextError::Unavailable(_)) => {
-                FailureClass::Infrastructure
-            }
+            | Self::Context(
+                ContextError::GrantEnded(_) | ContextError::NoLongerLeads(_) | ContextError::Unavailable(_),
+            ) => FailureClass::Infrastructure,
         }
     }
 }

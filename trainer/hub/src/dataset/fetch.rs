@@ -126,7 +126,7 @@ impl Fetch<'_> {
         Ok(fetched)
     }
 
-    /// Checks a folder that is there.
+    /// Checks an existing folder.
     fn compare(&self) -> Result<Fetched, FetchError> {
         let (mut differ, mut missing) = (Vec::new(), 0);
         for (name, listed) in &self.set.files {

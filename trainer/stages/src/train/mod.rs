@@ -177,7 +177,7 @@ pub fn train(
                 if saved_at != Some(state.step) {
                     // Publishing may fail or be interrupted; the last step should not have to be recomputed.
                     match save(&mut state, config, &recent, cx) {
-                        Err(StageError::Context(ContextError::Succeeded(_))) => {
+                        Err(StageError::Context(ContextError::NoLongerLeads(_))) => {
                             // The next leader makes the last save from its own copy of the state.
                             let applied = Some(state.step);
                             if meet(&mut state, applied, cx)? == Met::Adopted {
@@ -257,7 +257,7 @@ pub fn train(
                     cx.log(&format!("the checkpoint after step {} is delayed: {why}", state.step));
                 }
                 // The next exchange meets the others, and the next leader saves.
-                Err(StageError::Context(ContextError::Succeeded(_))) => {}
+                Err(StageError::Context(ContextError::NoLongerLeads(_))) => {}
                 Err(error) => return Err(error),
             }
         }
