@@ -1,6 +1,8 @@
 //! A stream from standard input to standard output.
 
+use std::fs::File;
 use std::io::{self, Write};
+use std::os::fd::AsFd;
 use std::sync::mpsc::{Receiver, TryRecvError, sync_channel};
 use std::thread;
 use std::time::Instant;
@@ -54,6 +56,12 @@ fn lines(form: Form) -> Receiver<Read> {
     lines
 }
 
+/// Returns true if standard input is a file on disk, whose next line never has to be written first.
+fn input_is_a_file() -> bool {
+    let file = io::stdin().as_fd().try_clone_to_owned().map(File::from);
+    file.and_then(|file| file.metadata()).is_ok_and(|metadata| metadata.is_file())
+}
+
 /// Frames kept for the output files.
 #[derive(Default)]
 struct Kept {
@@ -102,6 +110,9 @@ struct Pipe<'g> {
     stream: MotionStream,
     course: Course,
     lines: Receiver<Read>,
+    /// Waits for the next line or the end of the input before each segment, so that the frames do not depend on the
+    /// speed of the reading thread.
+    waits: bool,
     /// A line that was read before its turn.
     next: Option<Read>,
     pace: Option<Pace>,
@@ -117,7 +128,7 @@ impl Pipe<'_> {
         }
         let read = match self.next.take() {
             Some(read) => read,
-            None if !self.course.has_begun() => match self.lines.recv() {
+            None if self.waits || !self.course.has_begun() => match self.lines.recv() {
                 Ok(read) => read,
                 Err(_) => return Ok(false),
             },
@@ -198,8 +209,9 @@ pub(super) fn run(
     let Beginning { label, stream, form } = beginning;
     let kept = (!outs.is_empty()).then(Kept::default);
     let lines = lines(form);
+    let waits = pace.is_none() && input_is_a_file();
     let pace = pace.map(Pace::new);
-    let mut pipe = Pipe { generator, stream, course, lines, next: None, pace, kept, text: String::new() };
+    let mut pipe = Pipe { generator, stream, course, lines, waits, next: None, pace, kept, text: String::new() };
     let mut output = io::BufWriter::with_capacity(64 << 10, io::stdout().lock());
     let end = pipe.run(&mut output);
     // A closed output needs no more frames.
