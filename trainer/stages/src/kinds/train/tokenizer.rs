@@ -298,7 +298,8 @@ impl Objective for VqObjective {
 
 impl Gang for TrainTokenizer {
     fn run(&self, cx: &mut dyn GangContext) -> Result<Outcome, StageError> {
-        let windows = TokenWindows::read(cx, self.window, self.windows_of)?;
+        let mut windows = TokenWindows::read(cx, self.window, self.windows_of)?;
+        windows.dataset.std = windows.dataset.biased_std(self.feature_bias);
         let dataset = &windows.dataset;
         let meta = TokenizerMeta {
             format: dataset.format,
