@@ -103,7 +103,7 @@ pub struct TrainTokenizer {
     pub resets: Resets,
     /// Decay of the codebooks' running statistics in each update ("mu" upstream).
     #[schemars(range(min = 0.0, max = 1.0))]
-    pub decay: f64,
+    pub codebook_decay: f64,
     /// Divisor of the deviations of root and contact features, which increases their weight. 25 in MoMask, T2M-GPT and
     /// MMM, whose code divides the stored deviations by 5 twice.
     #[schemars(range(min = 1e-3, max = 1e3))]
@@ -137,7 +137,7 @@ impl Default for TrainTokenizer {
             quantize_dropout: 0.2,
             drawn: true,
             resets: Resets::Always,
-            decay: 0.99,
+            codebook_decay: 0.99,
             feature_bias: 1.0,
             network: TokenizerNetwork::default(),
             loss: TokenizerLoss::default(),
@@ -203,7 +203,7 @@ impl StageSpec for TrainTokenizer {
         }
         p.above_zero("feature_bias", self.feature_bias);
         p.fraction("network.dropout", self.network.dropout, true);
-        p.fraction("decay", self.decay, true);
+        p.fraction("codebook_decay", self.codebook_decay, true);
         p.fraction("quantize_dropout", self.quantize_dropout, false);
         if self.window < UNIT || !self.window.is_multiple_of(UNIT) {
             let message = format!("`window` is {}; expected a multiple of {UNIT}", self.window);

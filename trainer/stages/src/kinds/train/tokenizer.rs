@@ -269,7 +269,7 @@ impl Objective for VqObjective {
             let take = |after: &AfterStep<'_>, what: &str| after.buffers.get(&of(what, q)).to_vec();
             let (mut book, mut sums, mut counts) =
                 (take(&*after, "codebook"), take(&*after, "sums"), take(&*after, "counts"));
-            let decay = self.settings.decay;
+            let decay = self.settings.codebook_decay;
             let mut state = Book { codes: &mut book, sums: &mut sums, counts: &mut counts, decay };
             if let Some(first) = &first {
                 state.start(&first[q]);
