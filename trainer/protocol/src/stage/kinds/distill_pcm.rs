@@ -55,7 +55,6 @@ impl StageSpec for DistillPcm {
 
     fn check(&self, p: &mut Problems) {
         self.distillation.check(p);
-        p.positive("phases", self.phases);
         if let Some(grid) = self.distillation.grid()
             && self.phases > grid
         {
@@ -63,9 +62,6 @@ impl StageSpec for DistillPcm {
             let message = format!("`phases` is {phases}, but the grid of `skip` {skip} has only {grid} points");
             p.add("phases", message, "use fewer phases or a smaller `skip`");
         }
-        p.not_negative("adversarial", self.adversarial);
-        p.not_negative("discriminator_lr", self.discriminator_lr);
-        self.discriminator_optimizer.check(p, "discriminator_optimizer");
         if self.alternate && self.adversarial == 0.0 {
             let message = "`alternate` is true, but without `adversarial` there is no discriminator to alternate with";
             p.add("alternate", message, "remove `alternate`, or set `adversarial`");
