@@ -21,6 +21,9 @@ pub struct DistillPcm {
     pub discriminator_lr: f64,
     /// AdamW constants of the discriminator.
     pub discriminator_optimizer: Optimizer,
+    /// Slope below zero of the discriminator's leaky ReLUs, 0.01 in the image repository.
+    #[schemars(range(min = 0.0), extend("exclusiveMaximum" = 1.0))]
+    pub discriminator_slope: f64,
     /// Updates student and discriminator in alternate steps, as in the image repository; otherwise both in every step.
     /// The learning rate of each counts its own updates.
     pub alternate: bool,
@@ -36,6 +39,7 @@ impl Default for DistillPcm {
             adversarial: 0.1,
             discriminator_lr: 0.0,
             discriminator_optimizer: Optimizer::default(),
+            discriminator_slope: 0.01,
             alternate: false,
             distillation: Distillation::published(384_000, 128),
         }
