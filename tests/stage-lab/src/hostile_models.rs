@@ -23,7 +23,8 @@ use motion::text::EMBEDDING_WIDTH;
 use motion::{Stream, npy};
 use protocol::artifact::Role;
 use protocol::stage::{
-    DataFormat, FlowSolver, ImportModel, ImportedPart, Positions, Sampler, StageSettings, TokenizerNetwork,
+    DataFormat, FlowSolver, ImportModel, ImportedPart, LatentShape, MdmNetwork, Network, Positions, Sampler,
+    StageSettings, TokenNetwork, TokenizerNetwork,
 };
 use protocol::{ArtifactKind, Digest, Manifest, Seed};
 use serde_json::json;
@@ -96,32 +97,22 @@ fn add<M: Module>(all: &mut Named, prefix: &str, network: &M) {
 fn latent_diffusion(all: &mut Named, guidance: Option<usize>) -> DenoiserConfig {
     let device = Device::flex();
     let mut init = Init::new(Seed(0), "small", Positions::Uniform, &device);
-    let (width, norm_eps) = (WIDTH, 1e-5);
+    let width = WIDTH;
     let vae = VaeConfig {
         features: FEATURES,
-        tokens: 1,
-        dim: width,
-        width,
-        layers: 3,
-        heads: 1,
-        feed_forward: 2,
+        latent: LatentShape { tokens: 1, dim: width },
+        network: Network { width, layers: 3, heads: 1, feed_forward: 2, ..Network::default() },
         projection: false,
-        norm_eps,
     };
     add(all, "vae.", &Vae::new(&vae, &mut init));
     let denoiser = DenoiserConfig {
-        tokens: 1,
-        dim: width,
-        width,
-        layers: 3,
-        heads: 1,
-        feed_forward: 2,
+        latent: LatentShape { tokens: 1, dim: width },
+        network: Network { width, layers: 3, heads: 1, feed_forward: 2, ..Network::default() },
         text_dim: EMBEDDING_WIDTH,
         time_dim: 4,
         text_relu: true,
         projection: false,
         guidance_dim: guidance,
-        norm_eps,
     };
     add(all, "denoiser.", &Denoiser::new(&denoiser, &mut init));
     denoiser
@@ -154,6 +145,15 @@ pub fn small(part: ImportedPart) -> Named {
     let init = &mut init;
     let mut all = Named::new();
     let (width, layers, heads, text_dim, codes, feed_forward) = (WIDTH, 1, 1, EMBEDDING_WIDTH, 2, 2);
+    let network = |feed_forward| TokenNetwork {
+        width,
+        layers,
+        heads,
+        feed_forward,
+        embedding: width,
+        word_blocks: 1,
+        ..TokenNetwork::default()
+    };
     match part {
         ImportedPart::Vae => {
             latent_diffusion(&mut all, None);
@@ -166,34 +166,29 @@ pub fn small(part: ImportedPart) -> Named {
             add(&mut all, "controlnet.", &Denoiser::controlnet(&denoiser, 3, false, init));
             let trajectory = TrajectoryConfig {
                 joints: JOINTS,
-                tokens: 1,
-                dim: width,
-                width,
-                layers: 3,
-                heads,
-                feed_forward,
+                latent: LatentShape { tokens: 1, dim: width },
+                network: Network { width, layers: 3, heads, feed_forward, ..Network::default() },
                 projection: false,
-                norm_eps: 1e-5,
             };
             add(&mut all, "traj_encoder.", &TrajectoryEncoder::new(&trajectory, init));
         }
         ImportedPart::Tokenizer => return tokenizer(1),
         ImportedPart::T2mgpt => {
-            let config = GptConfig { codes, width, heads, layers, block: 51, text_dim, rate: 1 };
+            let config = GptConfig { codes, network: network(WIDTH), block: 51, text_dim };
             add(&mut all, "trans.", &Gpt::new(&config, init));
         }
         ImportedPart::Momask => {
-            let config =
-                MomaskConfig { codes, quantizers: BOOKS, dim: width, width, layers, heads, feed_forward, text_dim };
+            let config = MomaskConfig { codes, quantizers: BOOKS, network: network(feed_forward), text_dim };
             add(&mut all, "mask.", &MaskedTransformer::new(&config, init));
             add(&mut all, "res.", &ResidualTransformer::new(&config, true, init));
         }
         ImportedPart::Mmm => {
-            let config = MmmConfig { codes, dim: WIDTH, width, heads, layers, local: 1, block: 51, text_dim, rate: 1 };
+            let config = MmmConfig { codes, dim: WIDTH, network: network(WIDTH), block: 51, text_dim };
             add(&mut all, "trans.", &Mmm::new(&config, init));
         }
         ImportedPart::Mdm => {
-            let config = MdmConfig { features: FEATURES, width, layers, heads, feed_forward, text_dim, norm_eps: 1e-5 };
+            let network = MdmNetwork { width, layers, heads, feed_forward, ..MdmNetwork::default() };
+            let config = MdmConfig { features: FEATURES, network, text_dim };
             add(&mut all, "", &Mdm::new(&config, init));
         }
         ImportedPart::Discord => {

@@ -18,7 +18,7 @@ use models::{device, flat};
 use motion::Stream;
 use motion::skeleton::Skeleton;
 use protocol::Seed;
-use protocol::stage::{Backend, DataFormat, Positions, VaeLoss};
+use protocol::stage::{Backend, DataFormat, LatentShape, Network, Positions, VaeLoss};
 
 /// A network in training.
 struct Trained<M> {
@@ -59,14 +59,9 @@ fn noise<const D: usize>(shape: [usize; D], purpose: &str, device: &Device) -> T
 fn vae(device: &Device) -> Trained<Vae> {
     let config = VaeConfig {
         features: 263,
-        tokens: 16,
-        dim: 32,
-        width: 128,
-        layers: 5,
-        heads: 4,
-        feed_forward: 256,
+        latent: LatentShape { tokens: 16, dim: 32 },
+        network: Network { width: 128, layers: 5, heads: 4, feed_forward: 256, ..Network::default() },
         projection: true,
-        norm_eps: 1e-5,
     };
     Trained::new(Vae::new(&config, &mut Init::new(Seed(1), "vae", Positions::Sinusoid, &device.clone().autodiff())))
 }
@@ -89,18 +84,13 @@ fn vae_step(state: &mut Trained<Vae>, lengths: &[usize], joint: f64, dropout: f6
 /// d 128 and 5 layers, or the quickstart's d 96; 16 latent tokens and 2 of condition.
 fn denoiser(width: usize, device: &Device) -> Denoiser {
     let config = DenoiserConfig {
-        tokens: 16,
-        dim: 32,
-        width,
-        layers: 5,
-        heads: 4,
-        feed_forward: 2 * width,
+        latent: LatentShape { tokens: 16, dim: 32 },
+        network: Network { width, layers: 5, heads: 4, feed_forward: 2 * width, ..Network::default() },
         text_dim: 768,
         time_dim: 768,
         text_relu: false,
         projection: true,
         guidance_dim: None,
-        norm_eps: 1e-5,
     };
     Denoiser::new(&config, &mut Init::new(Seed(1), "denoiser", Positions::Uniform, device))
 }

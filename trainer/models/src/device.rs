@@ -3,7 +3,7 @@
 //! A Cargo feature decides which backends are compiled in. The pipeline's setting selects one of them here, in one
 //! place; neither an environment variable nor a "best available" guess takes part.
 
-use burn::tensor::Device;
+use burn::tensor::{Device, Tensor};
 use protocol::stage::Backend;
 
 /// A device cannot be opened.
@@ -67,6 +67,14 @@ pub fn open(backend: Backend, index: usize) -> Result<Device, DeviceError> {
         return Err(DeviceError::NotFound { backend, index, found: found.len() });
     }
     Ok(found.swap_remove(index))
+}
+
+/// Copies the values of a network's output to the host.
+///
+/// # Panics
+/// If they are not f32, in which all networks compute.
+pub fn host<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {
+    tensor.into_data().try_into_vec::<f32>().expect("networks compute in f32")
 }
 
 /// Returns true if `device` has memory of its own. Training then keeps its state there from step to step.

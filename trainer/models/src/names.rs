@@ -5,8 +5,9 @@ use std::convert::Infallible;
 
 use burn::module::Module;
 use bytemuck::{cast_slice, cast_slice_mut};
-use safetensors::SafeTensorError;
-use safetensors::tensor::{Dtype, Metadata, TensorInfo};
+pub use motion::tensor_header::ReadAt;
+use motion::tensor_header::{self, Header};
+use safetensors::tensor::{Dtype, TensorInfo};
 
 use crate::flat::{Entry, layout, read, replace};
 
@@ -14,8 +15,8 @@ use crate::flat::{Entry, layout, read, replace};
 #[derive(Debug, thiserror::Error)]
 pub enum LoadError {
     /// The bytes are not a safetensors file.
-    #[error("not a readable safetensors file: {0}")]
-    Unreadable(#[from] safetensors::SafeTensorError),
+    #[error("the file {0}")]
+    Unreadable(String),
     /// Names or shapes differ from the network's.
     #[error("the weights do not fit the network; missing: [{}]; unused: [{}]", missing.join(", "), unused.join(", "))]
     Mismatch {
@@ -60,17 +61,8 @@ impl<'a> Weights<'a> {
             }
             assert!(flat.is_empty(), "every value has a name");
         }
-        let mut end = 0;
-        let info = |(name, (shape, tensor)): (&&str, &(&Vec<usize>, &[f32]))| {
-            let begin = end;
-            end += size_of_val(*tensor);
-            let info = TensorInfo { dtype: Dtype::F32, shape: (*shape).clone(), data_offsets: (begin, end) };
-            ((*name).to_owned(), info)
-        };
-        let metadata = Metadata::new(None, by_name.iter().map(info).collect()).expect("tensors one after the other");
-        let mut json = serde_json::to_vec(&metadata).expect("names and numbers");
-        json.resize(json.len().next_multiple_of(8), b' ');
-        let header = [&(json.len() as u64).to_le_bytes()[..], &json].concat();
+        let infos = by_name.iter().map(|(name, (shape, _))| ((*name).to_owned(), Dtype::F32, (*shape).clone()));
+        let header = tensor_header::header(infos);
         Self { header, tensors: by_name.into_values().map(|(_, tensor)| tensor).collect() }
     }
 
@@ -85,65 +77,33 @@ pub fn to_bytes(entries: &[Entry], flat: &[f32]) -> Vec<u8> {
     Weights::new(entries, flat).pieces().concat()
 }
 
-/// A safetensors file whose header was read.
-#[derive(Debug)]
-struct Header {
-    metadata: Metadata,
-    /// Offset of the first tensor's data in the file.
-    data: u64,
+/// Reads the header of a file of `bytes` bytes.
+fn header<E>(bytes: u64, read: &mut ReadAt<'_, E>) -> Result<Result<Header, LoadError>, E> {
+    Ok(Header::read(bytes, read)?.map_err(LoadError::Unreadable))
 }
 
-impl Header {
-    /// Reads the header of a file of `bytes` bytes; `read` fills a buffer with the bytes at an offset.
-    fn read<E>(bytes: u64, read: &mut ReadAt<'_, E>) -> Result<Result<Self, LoadError>, E> {
-        let unreadable = |e: SafeTensorError| Ok(Err(LoadError::Unreadable(e)));
-        let mut length = [0; 8];
-        if bytes < 8 {
-            return unreadable(SafeTensorError::HeaderTooSmall);
-        }
-        read(0, &mut length)?;
-        let length = u64::from_le_bytes(length);
-        if length > HEADER_BYTES {
-            return unreadable(SafeTensorError::HeaderTooLarge);
-        }
-        if length > bytes - 8 {
-            return unreadable(SafeTensorError::InvalidHeaderLength);
-        }
-        let mut json = vec![0; usize::try_from(length).unwrap_or_default()];
-        read(8, &mut json)?;
-        let metadata: Metadata = match serde_json::from_slice(&json) {
-            Ok(metadata) => metadata,
-            Err(e) => return unreadable(SafeTensorError::InvalidHeaderDeserialization(e)),
-        };
-        if metadata.data_len() as u64 != bytes - 8 - length {
-            return unreadable(SafeTensorError::MetadataIncompleteBuffer);
-        }
-        Ok(Ok(Self { metadata, data: 8 + length }))
-    }
-
-    /// Finds the offsets in the file of the tensors of `entries`, whose names there start with `prefix`.
-    fn places(&self, entries: &[Entry], prefix: &str) -> Result<Vec<u64>, LoadError> {
-        let mut unused: BTreeMap<String, &TensorInfo> = self.metadata.tensors().into_iter().collect();
-        unused.retain(|name, _| name.starts_with(prefix));
-        let (mut places, mut missing) = (Vec::with_capacity(entries.len()), Vec::new());
-        for entry in entries {
-            let name = format!("{prefix}{}", entry.name);
-            match unused.remove(&name) {
-                Some(info) if info.shape == entry.shape && info.dtype == Dtype::F32 => {
-                    places.push(self.data + info.data_offsets.0 as u64);
-                }
-                other => {
-                    missing.push(format!("{name} {:?}", entry.shape));
-                    unused.extend(other.map(|info| (name, info)));
-                }
+/// Finds the offsets in a file of the tensors of `entries`, whose names there start with `prefix`.
+fn places(header: &Header, entries: &[Entry], prefix: &str) -> Result<Vec<u64>, LoadError> {
+    let mut unused: BTreeMap<String, &TensorInfo> = header.metadata.tensors().into_iter().collect();
+    unused.retain(|name, _| name.starts_with(prefix));
+    let (mut places, mut missing) = (Vec::with_capacity(entries.len()), Vec::new());
+    for entry in entries {
+        let name = format!("{prefix}{}", entry.name);
+        match unused.remove(&name) {
+            Some(info) if info.shape == entry.shape && info.dtype == Dtype::F32 => {
+                places.push(header.place(info));
+            }
+            other => {
+                missing.push(format!("{name} {:?}", entry.shape));
+                unused.extend(other.map(|info| (name, info)));
             }
         }
-        if missing.is_empty() && unused.is_empty() {
-            return Ok(places);
-        }
-        let unused = unused.into_iter().map(|(name, info)| format!("{name} {:?}", info.shape)).collect();
-        Err(LoadError::Mismatch { missing, unused })
     }
+    if missing.is_empty() && unused.is_empty() {
+        return Ok(places);
+    }
+    let unused = unused.into_iter().map(|(name, info)| format!("{name} {:?}", info.shape)).collect();
+    Err(LoadError::Mismatch { missing, unused })
 }
 
 /// The tensors of a file that fit a network.
@@ -165,7 +125,7 @@ pub fn fitting<E>(
     read: &mut ReadAt<'_, E>,
     prefix: &str,
 ) -> Result<Result<Fitted, LoadError>, E> {
-    let header = match Header::read(bytes, read)? {
+    let header = match header(bytes, read)? {
         Ok(header) => header,
         Err(error) => return Ok(Err(error)),
     };
@@ -177,7 +137,7 @@ pub fn fitting<E>(
         match found.filter(|info| info.shape == entry.shape && info.dtype == Dtype::F32) {
             Some(info) => {
                 let mut values = vec![0.0; entry.len()];
-                read_values(header.data + info.data_offsets.0 as u64, &mut values, read)?;
+                read_values(header.place(info), &mut values, read)?;
                 fitted.values.push(Some(values));
             }
             None => {
@@ -201,14 +161,8 @@ pub fn fitting<E>(
 pub fn tensors<E>(bytes: u64, read: &mut ReadAt<'_, E>) -> Result<Result<Vec<Entry>, LoadError>, E> {
     let entry = |(name, info): (String, &TensorInfo)| Entry { name, shape: info.shape.clone() };
     let entries = |header: Header| header.metadata.tensors().into_iter().map(entry).collect();
-    Ok(Header::read(bytes, read)?.map(entries))
+    Ok(header(bytes, read)?.map(entries))
 }
-
-/// The largest header that is read; the header of a thousand tensors has some hundred kilobytes.
-const HEADER_BYTES: u64 = 16 << 20;
-
-/// Fills a buffer with the bytes at an offset of a file.
-pub type ReadAt<'a, E> = dyn FnMut(u64, &mut [u8]) -> Result<(), E> + 'a;
 
 /// Adapts bytes in memory to [`ReadAt`].
 fn in_memory(bytes: &[u8]) -> impl FnMut(u64, &mut [u8]) -> Result<(), Infallible> {
@@ -226,8 +180,8 @@ fn in_memory(bytes: &[u8]) -> impl FnMut(u64, &mut [u8]) -> Result<(), Infallibl
 /// If the file is not safetensors, or its names or shapes are not those of `entries`.
 pub fn from_bytes(entries: &[Entry], bytes: &[u8], prefix: &str) -> Result<Vec<f32>, LoadError> {
     let mut read = in_memory(bytes);
-    let Ok(header) = Header::read(bytes.len() as u64, &mut read);
-    let places = header?.places(entries, prefix)?;
+    let Ok(header) = header(bytes.len() as u64, &mut read);
+    let places = places(&header?, entries, prefix)?;
     let mut flat = vec![0.0; entries.iter().map(Entry::len).sum()];
     let mut rest = flat.as_mut_slice();
     for (entry, place) in entries.iter().zip(places) {
@@ -271,7 +225,7 @@ pub fn load_from<M: Module, E>(
     read: &mut ReadAt<'_, E>,
     prefix: &str,
 ) -> Result<Result<M, LoadError>, E> {
-    let places = Header::read(bytes, read)?.and_then(|header| header.places(&layout(&module), prefix));
+    let places = header(bytes, read)?.and_then(|header| places(&header, &layout(&module), prefix));
     let places = match places {
         Ok(places) => places,
         Err(error) => return Ok(Err(error)),

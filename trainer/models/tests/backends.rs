@@ -12,7 +12,7 @@ use models::optim::{AdamW, clip_factor, global_norm};
 use models::{device, flat};
 use motion::skeleton::Skeleton;
 use protocol::Seed;
-use protocol::stage::{Backend, DataFormat, Positions, VaeLoss};
+use protocol::stage::{Backend, DataFormat, LatentShape, Network, Positions, VaeLoss};
 
 /// Loss, gradients, and parameters after an update.
 type Step = (f32, Vec<f32>, Vec<f32>);
@@ -41,14 +41,9 @@ fn vae(device: &Device) -> Step {
     let skeleton = Skeleton::of(DataFormat::Humanml3d);
     let config = VaeConfig {
         features: skeleton.features,
-        tokens: 2,
-        dim: 8,
-        width: 32,
-        layers: 3,
-        heads: 2,
-        feed_forward: 48,
+        latent: LatentShape { tokens: 2, dim: 8 },
+        network: Network { width: 32, layers: 3, heads: 2, feed_forward: 48, ..Network::default() },
         projection: true,
-        norm_eps: 1e-5,
     };
     let tracked = device.clone().autodiff();
     let vae = Vae::new(&config, &mut Init::new(Seed(3), "backends", Positions::Uniform, &tracked));
@@ -67,18 +62,13 @@ fn vae(device: &Device) -> Step {
 
 fn denoiser(device: &Device) -> Step {
     let config = DenoiserConfig {
-        tokens: 4,
-        dim: 8,
-        width: 32,
-        layers: 3,
-        heads: 2,
-        feed_forward: 48,
+        latent: LatentShape { tokens: 4, dim: 8 },
+        network: Network { width: 32, layers: 3, heads: 2, feed_forward: 48, ..Network::default() },
         text_dim: 24,
         time_dim: 16,
         text_relu: true,
         projection: true,
         guidance_dim: Some(12),
-        norm_eps: 1e-5,
     };
     let tracked = device.clone().autodiff();
     let network = Denoiser::new(&config, &mut Init::new(Seed(3), "backends", Positions::Uniform, &tracked));

@@ -11,75 +11,59 @@ use models::networks::{
     TrajectoryConfig, TrajectoryEncoder, Vae, VaeConfig,
 };
 use protocol::Seed;
-use protocol::stage::Positions;
+use protocol::stage::{LatentShape, MdmNetwork, Network, Positions};
 use safetensors::tensor::TensorView;
 use safetensors::{Dtype, SafeTensors, serialize};
 
 fn vae_config(v2: bool) -> VaeConfig {
     VaeConfig {
         features: 263,
-        tokens: if v2 { 16 } else { 1 },
-        dim: if v2 { 32 } else { 256 },
-        width: 256,
-        layers: 9,
-        heads: 4,
-        feed_forward: 1024,
+        latent: LatentShape { tokens: if v2 { 16 } else { 1 }, dim: if v2 { 32 } else { 256 } },
+        network: Network { width: 256, layers: 9, heads: 4, feed_forward: 1024, ..Network::default() },
         projection: v2,
-        norm_eps: 1e-5,
     }
 }
 
 fn denoiser_config(v2: bool, guidance_dim: Option<usize>) -> DenoiserConfig {
     DenoiserConfig {
-        tokens: if v2 { 16 } else { 1 },
-        dim: if v2 { 32 } else { 256 },
-        width: 256,
-        layers: 9,
-        heads: 4,
-        feed_forward: 1024,
+        latent: LatentShape { tokens: if v2 { 16 } else { 1 }, dim: if v2 { 32 } else { 256 } },
+        network: Network { width: 256, layers: 9, heads: 4, feed_forward: 1024, ..Network::default() },
         text_dim: 768,
         time_dim: 768,
         text_relu: !v2,
         projection: v2,
         guidance_dim,
-        norm_eps: 1e-5,
     }
 }
 
 fn trajectory_config(v2: bool) -> TrajectoryConfig {
     TrajectoryConfig {
         joints: 22,
-        tokens: if v2 { 16 } else { 1 },
-        dim: if v2 { 32 } else { 256 },
-        width: 256,
-        layers: 9,
-        heads: 4,
-        feed_forward: 1024,
+        latent: LatentShape { tokens: if v2 { 16 } else { 1 }, dim: if v2 { 32 } else { 256 } },
+        network: Network { width: 256, layers: 9, heads: 4, feed_forward: 1024, ..Network::default() },
         projection: v2,
-        norm_eps: 1e-5,
     }
 }
 
 fn mdm_config(features: usize) -> MdmConfig {
-    MdmConfig { features, width: 512, layers: 8, heads: 4, feed_forward: 1024, text_dim: 512, norm_eps: 1e-5 }
+    MdmConfig { features, network: MdmNetwork::default(), text_dim: 512 }
 }
 
 fn small_vae() -> VaeConfig {
-    VaeConfig { tokens: 2, dim: 4, width: 8, layers: 3, heads: 2, feed_forward: 12, ..vae_config(true) }
+    VaeConfig { latent: LatentShape { tokens: 2, dim: 4 }, network: small_network(), ..vae_config(true) }
+}
+
+fn small_network() -> Network {
+    Network { width: 8, layers: 3, heads: 2, feed_forward: 12, ..Network::default() }
 }
 
 fn small_denoiser(guidance_dim: Option<usize>) -> DenoiserConfig {
-    let big = denoiser_config(true, guidance_dim);
     DenoiserConfig {
-        tokens: 2,
-        dim: 4,
-        width: 8,
-        layers: 3,
-        heads: 2,
-        feed_forward: 12,
+        latent: LatentShape { tokens: 2, dim: 4 },
+        network: small_network(),
         text_dim: 6,
         time_dim: 10,
-        ..big
+        ..denoiser_config(true, guidance_dim)
     }
 }
 
@@ -145,7 +129,7 @@ fn vae_has_the_published_names() {
     let mut expected = listed(&format!("{v2}{}{}", stack("encoder", false), stack("decoder", true)));
     assert_eq!(sorted(&with(|init| Vae::new(&small_vae(), init))), expected);
     expected.retain(|name, _| !name.starts_with("latent_"));
-    let v1 = VaeConfig { projection: false, dim: 8, ..small_vae() };
+    let v1 = VaeConfig { projection: false, latent: LatentShape { tokens: 2, dim: 8 }, ..small_vae() };
     assert_eq!(sorted(&with(|init| Vae::new(&v1, init))), expected);
 }
 

@@ -9,36 +9,26 @@ use models::networks::{
     Denoiser, DenoiserConfig, Discriminator, Init, Vae, VaeConfig, guidance_embedding, time_sinusoid,
 };
 use protocol::Seed;
-use protocol::stage::Positions;
+use protocol::stage::{LatentShape, Network, Positions};
 
 fn vae_config() -> VaeConfig {
     VaeConfig {
         features: 20,
-        tokens: 3,
-        dim: 6,
-        width: 16,
-        layers: 5,
-        heads: 2,
-        feed_forward: 24,
+        latent: LatentShape { tokens: 3, dim: 6 },
+        network: Network { width: 16, layers: 5, heads: 2, feed_forward: 24, ..Network::default() },
         projection: true,
-        norm_eps: 1e-5,
     }
 }
 
 fn denoiser_config(guidance_dim: Option<usize>) -> DenoiserConfig {
     DenoiserConfig {
-        tokens: 3,
-        dim: 6,
-        width: 16,
-        layers: 5,
-        heads: 2,
-        feed_forward: 24,
+        latent: LatentShape { tokens: 3, dim: 6 },
+        network: Network { width: 16, layers: 5, heads: 2, feed_forward: 24, ..Network::default() },
         text_dim: 10,
         time_dim: 12,
         text_relu: false,
         projection: true,
         guidance_dim,
-        norm_eps: 1e-5,
     }
 }
 

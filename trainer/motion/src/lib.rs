@@ -21,6 +21,7 @@ pub mod random;
 pub mod roots;
 pub mod skeleton;
 pub mod synthetic;
+pub mod tensor_header;
 pub mod text;
 mod values;
 pub mod vocabulary;

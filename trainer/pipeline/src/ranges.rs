@@ -5,6 +5,7 @@
 //! of a machine's memory. Rules that depend on other settings are in `rules`.
 
 use std::collections::BTreeMap;
+use std::ops::{Bound, RangeBounds as _};
 use std::sync::LazyLock;
 
 use protocol::limits;
@@ -22,37 +23,51 @@ static KINDS: LazyLock<BTreeMap<&str, Value>> = LazyLock::new(|| {
 
 static PLACEMENT: LazyLock<Value> = LazyLock::new(|| Placement::json_schema(&mut generator()).to_value());
 
-/// Allowed numbers of a setting, both ends included.
+/// Allowed numbers of a setting.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Range {
-    /// Whole numbers in a range.
+    /// Whole numbers, both ends included.
     Whole(u64, u64),
-    /// Real numbers in a range.
-    Real(f64, f64),
+    /// Real numbers.
+    Real(Bound<f64>, Bound<f64>),
 }
 
 impl Range {
     /// The range that a schema states.
     fn of(schema: &Value) -> Option<Self> {
-        let (least, most) = (&schema["minimum"], &schema["maximum"]);
-        match (least.as_u64(), most.as_u64()) {
-            (Some(least), Some(most)) => Some(Self::Whole(least, most)),
-            _ => Some(Self::Real(least.as_f64()?, most.as_f64()?)),
+        if let (Some(least), Some(most)) = (schema["minimum"].as_u64(), schema["maximum"].as_u64()) {
+            return Some(Self::Whole(least, most));
         }
+        let bound = |included: &str, excluded: &str| match schema[included].as_f64() {
+            Some(number) => Some(Bound::Included(number)),
+            None => schema[excluded].as_f64().map(Bound::Excluded),
+        };
+        Some(Self::Real(bound("minimum", "exclusiveMinimum")?, bound("maximum", "exclusiveMaximum")?))
     }
 
     /// Returns true if `value`, a JSON number, is in the range.
     pub(crate) fn holds(self, value: &Value) -> bool {
         match self {
             Self::Whole(from, to) => value.as_u64().is_some_and(|value| (from..=to).contains(&value)),
-            Self::Real(from, to) => value.as_f64().is_some_and(|value| (from..=to).contains(&value)),
+            Self::Real(from, to) => value.as_f64().is_some_and(|value| (from, to).contains(&value)),
         }
     }
 
     fn describe(self, unit: &str) -> String {
         let range = match self {
             Self::Whole(from, to) => format!("{from} to {to}"),
-            Self::Real(from, to) => format!("a number from {from} to {to}"),
+            Self::Real(from, to) => {
+                let from = match from {
+                    Bound::Excluded(number) => format!("a number above {number}"),
+                    Bound::Included(number) => format!("a number from {number}"),
+                    Bound::Unbounded => "a number".to_owned(),
+                };
+                match to {
+                    Bound::Excluded(number) => format!("{from} to below {number}"),
+                    Bound::Included(number) => format!("{from} to {number}"),
+                    Bound::Unbounded => from,
+                }
+            }
         };
         if unit.is_empty() { range } else { format!("{range} {unit}") }
     }

@@ -219,6 +219,8 @@ fn kind_of_value(property: &Value) -> String {
     let range = match (number("minimum"), number("exclusiveMinimum"), number("maximum"), number("exclusiveMaximum")) {
         (Some(low), _, Some(high), _) => format!(", {low} to {high}"),
         (Some(low), _, _, Some(high)) => format!(", {low} to below {high}"),
+        (_, Some(low), Some(high), _) => format!(", above {low}, at most {high}"),
+        (_, Some(low), _, Some(high)) => format!(", above {low} and below {high}"),
         (_, Some(low), _, _) => format!(", above {low}"),
         (Some(low), _, _, _) if low > 0.0 || !whole => format!(", at least {low}"),
         _ => String::new(),

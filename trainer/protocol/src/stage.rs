@@ -15,7 +15,6 @@ mod data;
 mod diffusion;
 mod distillation;
 mod evaluation;
-mod features;
 mod flow;
 mod frequency;
 mod identity;

@@ -405,9 +405,9 @@ fn check_pooling(file: &DataPath, width: usize) -> Result<(), EncoderError> {
         return Err(refuse(format!("pools with `{}`; expected the mean of the tokens", excerpt(&on))));
     }
     match config["word_embedding_dimension"].as_u64() {
-        Some(said) if said != width as u64 => {
-            Err(refuse(format!("pools {said} numbers, but the network returns {width}")))
-        }
+        Some(said) if said != width as u64 => Err(refuse(format!(
+            "pools {said} numbers, but the network returns {width}; download the whole folder again"
+        ))),
         _ => Ok(()),
     }
 }

@@ -3,13 +3,10 @@
 use std::collections::BTreeMap;
 
 use half::{bf16, f16};
-use protocol::json_mistake;
-use safetensors::tensor::{Dtype, Metadata, TensorInfo};
+use motion::tensor_header::Header;
+use safetensors::tensor::{Dtype, TensorInfo};
 
 use crate::network::TensorSpec;
-
-/// Largest accepted header; the header of a thousand tensors has some hundred kilobytes.
-const HEADER_BYTES: u64 = 16 << 20;
 
 /// Stored type of a number.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -127,31 +124,13 @@ impl<R: ReadAt> WeightsFile<R> {
     /// # Errors
     /// The defect, without the file's name.
     pub fn open(source: R) -> Result<Self, String> {
-        let bytes = source.bytes();
-        let bad = |what: &str| format!("{what}; expected a safetensors file");
-        let mut length = [0; 8];
-        if bytes < 8 {
-            return Err(bad("is shorter than a header"));
-        }
-        source.read_at(0, &mut length)?;
-        let length = u64::from_le_bytes(length);
-        if length > HEADER_BYTES.min(bytes - 8) {
-            return Err(bad(&format!("declares a header of {length} bytes, but has {bytes} bytes")));
-        }
-        let mut json = vec![0; usize::try_from(length).unwrap_or_default()];
-        source.read_at(8, &mut json)?;
-        let header: Metadata =
-            serde_json::from_slice(&json).map_err(|e| bad(&format!("has an invalid header: {}", json_mistake(&e))))?;
-        if header.data_len() as u64 != bytes - 8 - length {
-            let said = header.data_len();
-            return Err(bad(&format!("declares tensors of {said} bytes, but has {}", bytes - 8 - length)));
-        }
+        let header = Header::read(source.bytes(), &mut |offset, out| source.read_at(offset, out))??;
         let place = |info: &TensorInfo| TensorFile {
             element: Element::of(info.dtype),
             shape: info.shape.clone(),
-            offset: 8 + length + info.data_offsets.0 as u64,
+            offset: header.place(info),
         };
-        let tensors = header.tensors().into_iter().map(|(name, info)| (name, place(info))).collect();
+        let tensors = header.metadata.tensors().into_iter().map(|(name, info)| (name, place(info))).collect();
         Ok(Self { source, tensors })
     }
 

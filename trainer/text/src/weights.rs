@@ -9,10 +9,9 @@ use std::fs::File;
 use std::io::{Read as _, Seek as _, SeekFrom};
 use std::rc::Rc;
 
-use motion::DataPath;
+use motion::{DataPath, tensor_header};
 use protocol::{excerpt, json_mistake, limits};
 use pytorch_reader::{DType, PytorchReader};
-use safetensors::tensor::{Metadata, TensorInfo};
 use serde::Deserialize;
 
 use crate::error::EncoderError;
@@ -330,19 +329,9 @@ pub fn archive_length(path: &DataPath) -> Result<u64, String> {
 
 /// Serialises tensors as the pieces of one safetensors file, in the order of their names.
 pub(crate) fn packed(place: &DataPath, tensors: &BTreeMap<String, StoredTensor>) -> Result<Vec<Vec<u8>>, EncoderError> {
-    let mut end = 0;
-    let info = |(name, tensor): (&String, &StoredTensor)| {
-        let begin = end;
-        end += tensor.shape.iter().product::<usize>() * tensor.element.bytes();
-        let info =
-            TensorInfo { dtype: tensor.element.dtype(), shape: tensor.shape.clone(), data_offsets: (begin, end) };
-        (name.clone(), info)
-    };
     let refuse = |what: String| EncoderError::at(place, what);
-    let header = Metadata::new(None, tensors.iter().map(info).collect()).map_err(|e| refuse(e.to_string()))?;
-    let mut json = serde_json::to_vec(&header).map_err(|e| refuse(e.to_string()))?;
-    json.resize(json.len().next_multiple_of(8), b' ');
-    let mut pieces = vec![[&(json.len() as u64).to_le_bytes()[..], &json].concat()];
+    let info = |(name, tensor): (&String, &StoredTensor)| (name.clone(), tensor.element.dtype(), tensor.shape.clone());
+    let mut pieces = vec![tensor_header::header(tensors.iter().map(info))];
     for (name, tensor) in tensors {
         pieces.push(tensor.read().map_err(|e| refuse(format!("`{name}`: {e}")))?);
     }

@@ -8,6 +8,7 @@
 //! The copy has no norm at its end; its `latent_post` is copied but unused.
 
 use burn::tensor::Tensor;
+use protocol::stage::Network;
 
 use super::{ConditionEmbedding, Denoiser, DenoiserConfig, Init, Linear};
 use crate::flat;
@@ -28,12 +29,10 @@ impl Denoiser {
     pub fn controlnet(config: &DenoiserConfig, embed: usize, activated: bool, init: &mut Init<'_>) -> Self {
         let mut network = Self::new(config, init);
         network.encoder.norm = None;
-        network.controlnet_cond_embedding = Some(ConditionEmbedding::new(init, config.dim, embed, activated));
-        let zero = || Linear {
-            weight: init.constant(0.0, [config.width, config.width]),
-            bias: Some(init.constant(0.0, [config.width])),
-        };
-        network.controlnet_down_mid_blocks = (0..config.layers).map(|_| zero()).collect();
+        network.controlnet_cond_embedding = Some(ConditionEmbedding::new(init, config.latent.dim, embed, activated));
+        let Network { width, layers, .. } = config.network;
+        let zero = || Linear { weight: init.constant(0.0, [width, width]), bias: Some(init.constant(0.0, [width])) };
+        network.controlnet_down_mid_blocks = (0..layers).map(|_| zero()).collect();
         network
     }
 

@@ -8,26 +8,19 @@
 use burn::module::Module;
 use burn::tensor::Tensor;
 use burn::tensor::activation::{relu, silu};
-use serde::{Deserialize, Serialize};
+use protocol::stage::{LatentShape, Network};
 
 use super::vae::Positions;
 use super::{ConditionEmbedding, Init, Linear, SkipStack, StackConfig, time_sinusoid};
 use crate::kernels::Dropout;
 
 /// Size of a denoiser.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct DenoiserConfig {
-    /// N latent tokens.
-    pub tokens: usize,
-    /// Width d of a latent token.
-    pub dim: usize,
-    /// Width H of the transformer.
-    pub width: usize,
-    /// Number of blocks.
-    pub layers: usize,
-    /// Number of attention heads.
-    pub heads: usize,
-    pub feed_forward: usize,
+    /// Shape N x d of a latent.
+    pub latent: LatentShape,
+    /// Size of the transformer, whose dropout is an argument of each pass.
+    pub network: Network,
     /// Width of a caption embedding.
     pub text_dim: usize,
     /// Width of the time sinusoid.
@@ -38,8 +31,6 @@ pub struct DenoiserConfig {
     pub projection: bool,
     /// Width of a student's guidance embedding.
     pub guidance_dim: Option<usize>,
-    /// Added to variances in layer norms.
-    pub norm_eps: f64,
 }
 
 /// Two layers on the time sinusoid.
@@ -79,15 +70,8 @@ pub struct Denoiser {
 impl Denoiser {
     /// Creates a denoiser with initial weights.
     pub fn new(config: &DenoiserConfig, init: &mut Init<'_>) -> Self {
-        let DenoiserConfig { tokens, dim, width, text_dim, time_dim, .. } = *config;
-        let stack = StackConfig {
-            width,
-            layers: config.layers,
-            heads: config.heads,
-            feed_forward: config.feed_forward,
-            norm_eps: config.norm_eps,
-            memory: false,
-        };
+        let DenoiserConfig { latent: LatentShape { tokens, dim }, text_dim, time_dim, .. } = *config;
+        let width = config.network.width;
         Self {
             latent_pre: config.projection.then(|| Linear::new(init, dim, width)),
             latent_post: config.projection.then(|| Linear::new(init, width, dim)),
@@ -98,7 +82,7 @@ impl Denoiser {
             },
             emb_proj: Linear::new(init, text_dim, width),
             query_pos: Positions::new(init, width),
-            encoder: SkipStack::new(init, &stack),
+            encoder: SkipStack::new(init, &StackConfig::of(&config.network)),
             controlnet_cond_embedding: None,
             controlnet_down_mid_blocks: Vec::new(),
             tokens,

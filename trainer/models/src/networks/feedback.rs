@@ -7,6 +7,7 @@
 
 use burn::module::{Module, Param};
 use burn::tensor::Tensor;
+use protocol::stage::{LatentShape, Network};
 
 use super::vae::Positions;
 use super::{Init, Linear, SkipStack, StackConfig};
@@ -15,14 +16,12 @@ use crate::kernels::{Dropout, KeyMask};
 /// Size of a feedback network.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FeedbackConfig {
-    /// N tokens of a latent.
-    pub tokens: usize,
-    /// Width d of a latent token.
-    pub dim: usize,
+    /// Shape N x d of a latent.
+    pub latent: LatentShape,
     /// Inputs per frame.
     pub inputs: usize,
-    /// Size of the transformer.
-    pub stack: StackConfig,
+    /// Size of the transformer, whose dropout is an argument of each pass.
+    pub network: Network,
 }
 
 /// The feedback network.
@@ -44,14 +43,15 @@ pub struct Feedback {
 impl Feedback {
     /// Creates a network with initial weights.
     pub fn new(config: &FeedbackConfig, init: &mut Init<'_>) -> Self {
-        let FeedbackConfig { tokens, dim, inputs, stack } = config;
+        let LatentShape { tokens, dim } = config.latent;
+        let width = config.network.width;
         Self {
-            latent_token: init.normal([*tokens, stack.width]),
-            latent_embedding: Linear::new(init, *dim, stack.width),
-            frame_embedding: Linear::new(init, *inputs, stack.width),
-            position_encoder: Positions::new(init, stack.width),
-            encoder: SkipStack::new(init, stack),
-            change: Linear::zero(init, stack.width, *dim),
+            latent_token: init.normal([tokens, width]),
+            latent_embedding: Linear::new(init, dim, width),
+            frame_embedding: Linear::new(init, config.inputs, width),
+            position_encoder: Positions::new(init, width),
+            encoder: SkipStack::new(init, &StackConfig::of(&config.network)),
+            change: Linear::zero(init, width, dim),
         }
     }
 

@@ -9,28 +9,23 @@
 
 use burn::module::Module;
 use burn::tensor::Tensor;
-use serde::{Deserialize, Serialize};
+use protocol::stage::TokenNetwork;
 
 use super::attend::{Embedding, GptBlock, GptHead, Sight, causal, linear, sinusoids};
 use super::{Init, Linear};
 use crate::kernels::Dropout;
 
 /// Size of the generator.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct GptConfig {
     /// Number of codes K.
     pub codes: usize,
-    pub width: usize,
-    /// Number of attention heads.
-    pub heads: usize,
-    /// Blocks of each half.
-    pub layers: usize,
+    /// Size of the network, with `layers` blocks in each half. Its dropout is an argument of each pass.
+    pub network: TokenNetwork,
     /// Number of positions, the caption's included.
     pub block: usize,
     /// Width of a caption embedding.
     pub text_dim: usize,
-    /// Feed-forward width as a multiple of H.
-    pub rate: usize,
 }
 
 impl GptConfig {
@@ -68,7 +63,9 @@ pub struct Gpt {
 impl Gpt {
     /// Creates a generator: weights normal with deviation 0.02, biases 0.
     pub fn new(config: &GptConfig, init: &mut Init<'_>) -> Self {
-        let GptConfig { codes, width, heads, layers, rate, .. } = *config;
+        let codes = config.codes;
+        let TokenNetwork { width, heads, layers, feed_forward, .. } = config.network;
+        let rate = feed_forward / width;
         Self {
             trans_base: GptBase {
                 tok_emb: Embedding::new(init, codes + 2, width),

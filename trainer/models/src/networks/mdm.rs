@@ -11,27 +11,21 @@
 use burn::module::Module;
 use burn::tensor::Tensor;
 use burn::tensor::activation::silu;
-use serde::{Deserialize, Serialize};
+use protocol::stage::MdmNetwork;
 
+use super::transformer::NORM_EPS;
 use super::{Init, Layers, Linear, StackConfig, position_sinusoid};
 use crate::kernels::{Dropout, KeyMask, dropout};
 
 /// Size of an MDM.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct MdmConfig {
     /// Features per frame: 263 or 251.
     pub features: usize,
-    /// Width H of the transformer.
-    pub width: usize,
-    /// Number of blocks.
-    pub layers: usize,
-    /// Number of attention heads.
-    pub heads: usize,
-    pub feed_forward: usize,
+    /// Size of the transformer, whose dropout is an argument of each pass.
+    pub network: MdmNetwork,
     /// Width of a caption's vector.
     pub text_dim: usize,
-    /// Added to variances in layer norms.
-    pub norm_eps: f64,
 }
 
 /// Features -> H.
@@ -74,8 +68,9 @@ pub struct Mdm {
 impl Mdm {
     /// Creates a network with initial weights.
     pub fn new(config: &MdmConfig, init: &mut Init<'_>) -> Self {
-        let MdmConfig { features, width, layers, heads, feed_forward, text_dim, norm_eps } = *config;
-        let stack = StackConfig { width, layers, heads, feed_forward, norm_eps, memory: false };
+        let MdmConfig { features, text_dim, .. } = *config;
+        let MdmNetwork { width, layers, heads, feed_forward, .. } = config.network;
+        let stack = StackConfig { width, layers, heads, feed_forward, norm_eps: NORM_EPS, memory: false };
         Self {
             input_process: InputProcess { poseEmbedding: Linear::new(init, features, width) },
             seqTransEncoder: Layers::new(init, &stack),

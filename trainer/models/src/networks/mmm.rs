@@ -10,32 +10,26 @@
 
 use burn::module::Module;
 use burn::tensor::Tensor;
-use serde::{Deserialize, Serialize};
+use protocol::stage::TokenNetwork;
 
 use super::attend::{CrossBlock, Embedding, GptBlock, GptHead, Sight, hiding, linear, rows_of, sinusoids};
 use super::{Init, Linear};
 use crate::kernels::{Dropout, KeyMask};
 
 /// Size of the generator.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct MmmConfig {
     /// Number of codes K.
     pub codes: usize,
     /// Width of a code.
     pub dim: usize,
-    pub width: usize,
-    /// Number of attention heads.
-    pub heads: usize,
-    /// Blocks of the head; the base has the same number, including cross blocks.
-    pub layers: usize,
-    /// Number of cross blocks in the base.
-    pub local: usize,
+    /// Size of the network: `layers` blocks in each half, `word_blocks` of the first half attend to words. Its dropout
+    /// is an argument of each pass.
+    pub network: TokenNetwork,
     /// Number of positions, those of the caption and the end included.
     pub block: usize,
     /// Width of the embeddings of captions and words.
     pub text_dim: usize,
-    /// Feed-forward width as a multiple of H.
-    pub rate: usize,
 }
 
 impl MmmConfig {
@@ -106,7 +100,9 @@ impl Mmm {
     /// # Panics
     /// If there are more cross blocks than blocks.
     pub fn new(config: &MmmConfig, init: &mut Init<'_>) -> Self {
-        let MmmConfig { codes, dim, width, heads, layers, local, text_dim, rate, .. } = *config;
+        let MmmConfig { codes, dim, text_dim, .. } = *config;
+        let TokenNetwork { width, heads, layers, feed_forward, word_blocks: local, .. } = config.network;
+        let rate = feed_forward / width;
         assert!(local <= layers, "{local} of {layers} blocks look at the words");
         Self {
             trans_base: MmmBase {

@@ -49,7 +49,7 @@ pub use mmm::{Mmm, MmmCondition, MmmConfig};
 pub use momask::{MaskedTransformer, MomaskConfig, ResidualTransformer};
 pub use stablemofusion::{StableMoFusion, StableMoFusionConfig, TokenCondition};
 pub use t5::{T5Config, T5Encoder, T5FeedForward, distance_bucket, mean_of_tokens, normalised};
-pub use tokenizer::{Tokenizer, TokenizerConfig};
+pub use tokenizer::{LEVELS, STRIDE, Tokenizer, TokenizerConfig, UNIT};
 pub use trajectory::{Hints, TrajectoryConfig, TrajectoryEncoder};
 pub use transformer::{Attention, Block, Linear, Norm, SkipStack, StackConfig};
 pub use vae::{Posterior, Vae, VaeConfig};

@@ -12,32 +12,25 @@
 
 use burn::module::{Module, Param};
 use burn::tensor::{Tensor, TensorData};
-use serde::{Deserialize, Serialize};
+use protocol::stage::TokenNetwork;
 
 use super::attend::{DEVIATION, Embedding, linear, rows_of, sinusoids};
+use super::transformer::NORM_EPS;
 use super::{Block, Init, Linear, Norm, StackConfig};
 use crate::kernels::{self, Dropout, KeyMask, dropout, gelu};
 
-/// Added to variances in the blocks.
-const EPS: f64 = 1e-5;
 /// Added to variances in the heads.
 const HEAD_EPS: f64 = 1e-12;
 
 /// Size of a generator.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct MomaskConfig {
     /// Number of codes K of a layer.
     pub codes: usize,
     /// Number of layers Q of codes.
     pub quantizers: usize,
-    /// Width of a token's embedding.
-    pub dim: usize,
-    pub width: usize,
-    /// Number of blocks.
-    pub layers: usize,
-    /// Number of attention heads.
-    pub heads: usize,
-    pub feed_forward: usize,
+    /// Size of the network, whose dropout is an argument of each pass.
+    pub network: TokenNetwork,
     /// Width of a caption embedding.
     pub text_dim: usize,
 }
@@ -57,17 +50,6 @@ impl MomaskConfig {
     pub fn residual_pad(&self) -> usize {
         self.codes
     }
-
-    fn stack(&self) -> StackConfig {
-        StackConfig {
-            width: self.width,
-            layers: self.layers,
-            heads: self.heads,
-            feed_forward: self.feed_forward,
-            norm_eps: EPS,
-            memory: false,
-        }
-    }
 }
 
 /// Embedding -> H.
@@ -86,7 +68,7 @@ pub struct Blocks {
 
 impl Blocks {
     fn new(config: &MomaskConfig, init: &mut Init<'_>) -> Self {
-        Self { layers: (0..config.layers).map(|_| block(config, init)).collect() }
+        Self { layers: (0..config.network.layers).map(|_| block(&config.network, init)).collect() }
     }
 
     fn forward(&self, x_bth: Tensor<3>, mask: &KeyMask, drop: &mut Dropout) -> Tensor<3> {
@@ -96,11 +78,13 @@ impl Blocks {
 
 /// Creates a block as published: weights normal with deviation 0.02 and biases 0. Only the packed projection is
 /// Xavier-uniform.
-fn block(config: &MomaskConfig, init: &mut Init<'_>) -> Block {
-    let mut block = Block::new(init, &config.stack());
-    block.self_attn.out_proj = linear(init, config.width, config.width);
-    block.linear1 = linear(init, config.width, config.feed_forward);
-    block.linear2 = linear(init, config.feed_forward, config.width);
+fn block(network: &TokenNetwork, init: &mut Init<'_>) -> Block {
+    let TokenNetwork { width, layers, heads, feed_forward, .. } = *network;
+    let mut block =
+        Block::new(init, &StackConfig { width, layers, heads, feed_forward, norm_eps: NORM_EPS, memory: false });
+    block.self_attn.out_proj = linear(init, width, width);
+    block.linear1 = linear(init, width, feed_forward);
+    block.linear2 = linear(init, feed_forward, width);
     block
 }
 
@@ -166,12 +150,13 @@ pub struct MaskedTransformer {
 impl MaskedTransformer {
     /// Creates a generator with initial weights.
     pub fn new(config: &MomaskConfig, init: &mut Init<'_>) -> Self {
+        let TokenNetwork { width, embedding, .. } = config.network;
         Self {
-            input_process: InputProcess { poseEmbedding: linear(init, config.dim, config.width) },
+            input_process: InputProcess { poseEmbedding: linear(init, embedding, width) },
             seqTransEncoder: Blocks::new(config, init),
-            cond_emb: linear(init, config.text_dim, config.width),
-            token_emb: Embedding::new(init, config.codes + 2, config.dim),
-            output_process: OutputProcess::new(init, config.width, config.codes),
+            cond_emb: linear(init, config.text_dim, width),
+            token_emb: Embedding::new(init, config.codes + 2, embedding),
+            output_process: OutputProcess::new(init, width, config.codes),
         }
     }
 
@@ -226,7 +211,8 @@ impl ResidualTransformer {
     /// # Panics
     /// If there are fewer than three layers of codes: upstream's shared tables start at the third.
     pub fn new(config: &MomaskConfig, shared: bool, init: &mut Init<'_>) -> Self {
-        let MomaskConfig { codes, quantizers, dim, width, .. } = *config;
+        let MomaskConfig { codes, quantizers, .. } = *config;
+        let TokenNetwork { width, embedding: dim, .. } = config.network;
         assert!(quantizers > 2, "a residual generator has at least three layers of codes");
         let mut table = |rows: usize| init.scaled_normal(DEVIATION, [rows, codes + 1, dim]);
         let mut part = |wanted: bool, rows: usize| wanted.then(|| table(rows));

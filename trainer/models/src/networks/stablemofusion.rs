@@ -20,9 +20,10 @@
 use burn::module::{Module, Param};
 use burn::tensor::activation::softmax;
 use burn::tensor::{Tensor, TensorData};
-use serde::{Deserialize, Serialize};
+use protocol::stage::StableMoFusionNetwork;
 
 use super::conv::Conv1d;
+use super::transformer::NORM_EPS;
 use super::{Deconv, Init, Layers, Linear, Norm, StackConfig, position_sinusoid};
 use crate::kernels::{Dropout, KeyMask, cross_attention, dropout, layer_norm, mish};
 
@@ -32,33 +33,16 @@ const TAPS: usize = 5;
 const GROUPS: usize = 8;
 /// Heads of the cross-attention.
 const HEADS: usize = 8;
-/// Added to variances in all norms.
-const EPS: f64 = 1e-5;
 
-/// Size of a StableMoFusion network. Published: width 512, multipliers 2, 2, 2, 2, time 512, text 256 with 4 layers, 4
-/// heads and 2048.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+/// Size of a StableMoFusion network.
+#[derive(Debug, Clone, PartialEq)]
 pub struct StableMoFusionConfig {
     /// Features per frame.
     pub features: usize,
-    /// Number of channels that the multipliers scale.
-    pub width: usize,
-    /// Channels of each level as a multiple of `width`.
-    pub multipliers: Vec<usize>,
-    /// Width of the timestep's embedding.
-    pub time_dim: usize,
+    /// Size of the network, whose dropout is an argument of each pass.
+    pub network: StableMoFusionNetwork,
     /// Width of a token from the text encoder.
     pub text_dim: usize,
-    /// Width of a token inside the network.
-    pub text_width: usize,
-    /// Feed-forward width of the text transformer.
-    pub text_feed_forward: usize,
-    /// Heads of the text transformer.
-    pub text_heads: usize,
-    /// Blocks of the text transformer.
-    pub text_layers: usize,
-    /// Uses softmax cross-attention instead of the linear one.
-    pub full_attention: bool,
 }
 
 /// The captions of a batch.
@@ -205,7 +189,7 @@ fn standardised(x_btc: Tensor<3>) -> Tensor<3> {
     let width = channels / GROUPS;
     let device = x_btc.device();
     let (ones, zeros) = (Tensor::ones([width], &device), Tensor::zeros([width], &device));
-    layer_norm(x_btc.reshape([batch, frames, GROUPS, width]), ones, zeros, EPS).reshape([batch, frames, channels])
+    layer_norm(x_btc.reshape([batch, frames, GROUPS, width]), ones, zeros, NORM_EPS).reshape([batch, frames, channels])
 }
 
 /// A convolution initialised to zero.
@@ -284,8 +268,8 @@ impl TextAttention {
 
     /// [B, T, c] and [B, N, text] -> [B, T, c].
     fn forward(&self, x_btc: Tensor<3>, condition: &TokenCondition, drop: &mut Dropout) -> Tensor<3> {
-        let query = self.query.forward(self.norm.forward(x_btc, EPS));
-        let text = self.text_norm.forward(condition.text_bnc.clone(), EPS);
+        let query = self.query.forward(self.norm.forward(x_btc, NORM_EPS));
+        let text = self.text_norm.forward(condition.text_bnc.clone(), NORM_EPS);
         let (key, value) = (self.key.forward(text.clone()), self.value.forward(text));
         if self.full {
             let mask = condition.lengths.as_deref().map(|lengths| KeyMask::new(lengths, 0));
@@ -344,9 +328,10 @@ struct Given<'a> {
 
 impl Unet {
     fn new(config: &StableMoFusionConfig, init: &mut Init<'_>) -> Self {
-        let StableMoFusionConfig { features, width, time_dim, .. } = *config;
-        let sizes = Sizes { time: time_dim, text: config.text_width, full: config.full_attention };
-        let widths: Vec<usize> = config.multipliers.iter().map(|m| width * m).collect();
+        let StableMoFusionConfig { features, ref network, .. } = *config;
+        let StableMoFusionNetwork { width, time: time_dim, .. } = *network;
+        let sizes = Sizes { time: time_dim, text: network.text, full: network.full_attention };
+        let widths: Vec<usize> = network.multipliers.iter().map(|m| width * m).collect();
         let inner: Vec<usize> = std::iter::once(features).chain(widths.iter().copied()).collect();
         let deepest = *inner.last().expect("at least the features");
         let down = |init: &mut Init<'_>, (inner, out): (&usize, &usize)| Down {
@@ -399,18 +384,20 @@ impl StableMoFusion {
 
     /// Creates a network with initial weights.
     pub fn new(config: &StableMoFusionConfig, init: &mut Init<'_>) -> Self {
+        let network = &config.network;
+        let width = network.text;
         let stack = StackConfig {
-            width: config.text_width,
-            layers: config.text_layers,
-            heads: config.text_heads,
-            feed_forward: config.text_feed_forward,
-            norm_eps: EPS,
+            width,
+            layers: network.text_layers,
+            heads: network.text_heads,
+            feed_forward: network.text_feed_forward,
+            norm_eps: NORM_EPS,
             memory: false,
         };
         Self {
-            embed_text: Linear::new(init, config.text_dim, config.text_width),
+            embed_text: Linear::new(init, config.text_dim, width),
             textTransEncoder: Layers::new(init, &stack),
-            text_ln: Norm::new(init, config.text_width),
+            text_ln: Norm::new(init, width),
             unet: Unet::new(config, init),
         }
     }
@@ -419,7 +406,7 @@ impl StableMoFusion {
     pub fn encode_text(&self, tokens_bnc: Tensor<3>, lengths: Option<&[usize]>, drop: &mut Dropout) -> Tensor<3> {
         let mask = lengths.map(|lengths| KeyMask::new(lengths, 0));
         let x = self.textTransEncoder.forward(self.embed_text.forward(tokens_bnc), mask.as_ref(), drop);
-        self.text_ln.forward(x, EPS)
+        self.text_ln.forward(x, NORM_EPS)
     }
 
     /// The timestep's embedding [B, time_dim].
@@ -467,18 +454,18 @@ mod tests {
 
     /// A small network whose zero layers are not zero.
     fn network(full_attention: bool, device: &Device) -> StableMoFusion {
-        let config = StableMoFusionConfig {
-            features: 10,
+        let network = StableMoFusionNetwork {
             width: 32,
             multipliers: vec![1, 2],
-            time_dim: 8,
-            text_dim: 6,
-            text_width: 8,
-            text_feed_forward: 12,
-            text_heads: 2,
+            time: 8,
+            text: 8,
             text_layers: 1,
+            text_heads: 2,
+            text_feed_forward: 12,
             full_attention,
+            dropout: 0.0,
         };
+        let config = StableMoFusionConfig { features: 10, network, text_dim: 6 };
         let mut init = Init::new(Seed(5), "small", Positions::Uniform, device);
         let fresh = StableMoFusion::new(&config, &mut init);
         let values = flat::read(&fresh).into_iter().enumerate().map(|(i, v)| v + 0.1 * (i as f32 * 0.37).sin());
@@ -527,18 +514,18 @@ mod tests {
     #[test]
     fn a_fresh_network_predicts_zero() {
         let device = Device::flex();
-        let config = StableMoFusionConfig {
-            features: 6,
+        let network = StableMoFusionNetwork {
             width: 16,
             multipliers: vec![1; 4],
-            time_dim: 8,
-            text_dim: 6,
-            text_width: 8,
-            text_feed_forward: 12,
-            text_heads: 2,
+            time: 8,
+            text: 8,
             text_layers: 1,
+            text_heads: 2,
+            text_feed_forward: 12,
             full_attention: false,
+            dropout: 0.0,
         };
+        let config = StableMoFusionConfig { features: 6, network, text_dim: 6 };
         let network = StableMoFusion::new(&config, &mut Init::new(Seed(5), "new", Positions::Uniform, &device));
         let found = network.forward(wave([1, 19, 6], &device), &[999], None, &mut Dropout::off());
         assert_eq!(found.dims(), [1, 19, 6]);

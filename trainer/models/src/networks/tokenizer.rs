@@ -8,37 +8,29 @@
 use burn::module::Module;
 use burn::tensor::Tensor;
 use burn::tensor::activation::relu;
-use serde::{Deserialize, Serialize};
+use protocol::stage::TokenizerNetwork;
 
 use super::Init;
 use super::conv::{Conv1d, GAP, Gap, repeat};
 use crate::kernels::{Dropout, dropout};
 
 /// Size of a tokenizer's networks.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct TokenizerConfig {
     /// Features per frame: 263 or 251.
     pub features: usize,
     /// Width of a code.
     pub dim: usize,
-    /// Width between the convolutions.
-    pub width: usize,
-    /// Number of levels; each shortens sequences by `stride`.
-    pub levels: usize,
-    /// Factor by which a level shortens sequences.
-    pub stride: usize,
-    /// Residual blocks per level.
-    pub depth: usize,
-    /// Factor between the dilations of neighbouring blocks.
-    pub growth: usize,
+    /// Size of encoder and decoder, whose dropout is an argument of each pass.
+    pub network: TokenizerNetwork,
 }
 
-impl TokenizerConfig {
-    /// Frames per token.
-    pub fn unit(&self) -> usize {
-        (0..self.levels).map(|_| self.stride).product()
-    }
-}
+/// Number of levels, each of which shortens sequences by [`STRIDE`].
+pub const LEVELS: usize = 2;
+/// Factor by which a level shortens sequences.
+pub const STRIDE: usize = 2;
+/// Frames per token.
+pub const UNIT: usize = STRIDE.pow(LEVELS as u32);
 
 /// A residual block, `x + D(C1(relu(C3(relu(x)))))` with dropout D.
 #[derive(Module, Debug)]
@@ -64,8 +56,8 @@ pub struct ResidualStack {
 }
 
 impl ResidualStack {
-    fn new(config: &TokenizerConfig, init: &mut Init<'_>) -> Self {
-        let TokenizerConfig { width, depth, growth, .. } = *config;
+    fn new(network: &TokenizerNetwork, init: &mut Init<'_>) -> Self {
+        let TokenizerNetwork { width, depth, growth, .. } = *network;
         let block = |i: usize| {
             let dilation = (i + 1..depth).map(|_| growth).product();
             ResidualBlock {
@@ -124,28 +116,28 @@ pub struct Tokenizer {
     pub encoder: TokenEncoder,
     /// Decoder from rows to motion.
     pub decoder: TokenDecoder,
-    stride: usize,
 }
 
 impl Tokenizer {
     /// Creates a tokenizer initialised in PyTorch's default range.
     pub fn new(config: &TokenizerConfig, init: &mut Init<'_>) -> Self {
-        let TokenizerConfig { features, dim, width, levels, stride, .. } = *config;
+        let TokenizerConfig { features, dim, ref network } = *config;
+        let width = network.width;
         let mut encoder = vec![EncoderPart::Conv(Conv1d::same(init, features, width, 3)), EncoderPart::Activation(GAP)];
-        encoder.extend((0..levels).map(|_| {
-            let down = Conv1d::strided(init, width, width, 2 * stride, stride, stride / 2);
-            EncoderPart::Level((down, ResidualStack::new(config, init)))
+        encoder.extend((0..LEVELS).map(|_| {
+            let down = Conv1d::strided(init, width, width, 2 * STRIDE, STRIDE, STRIDE / 2);
+            EncoderPart::Level((down, ResidualStack::new(network, init)))
         }));
         encoder.push(EncoderPart::Conv(Conv1d::same(init, width, dim, 3)));
         let mut decoder = vec![DecoderPart::Conv(Conv1d::same(init, dim, width, 3)), DecoderPart::Activation(GAP)];
-        decoder.extend((0..levels).map(|_| {
-            let stack = ResidualStack::new(config, init);
+        decoder.extend((0..LEVELS).map(|_| {
+            let stack = ResidualStack::new(network, init);
             DecoderPart::Level((stack, GAP, Conv1d::same(init, width, width, 3)))
         }));
         decoder.push(DecoderPart::Conv(Conv1d::same(init, width, width, 3)));
         decoder.push(DecoderPart::Activation(GAP));
         decoder.push(DecoderPart::Conv(Conv1d::same(init, width, features, 3)));
-        Self { encoder: TokenEncoder { model: encoder }, decoder: TokenDecoder { model: decoder }, stride }
+        Self { encoder: TokenEncoder { model: encoder }, decoder: TokenDecoder { model: decoder } }
     }
 
     /// Encodes normalised features [B, T, F] as rows [B, T / unit, d]. Frames at the end that do not fill a token get
@@ -163,7 +155,7 @@ impl Tokenizer {
         self.decoder.model.iter().fold(codes_bnd, |x, part| match part {
             DecoderPart::Conv(conv) => conv.forward(x),
             DecoderPart::Activation(_) => relu(x),
-            DecoderPart::Level((stack, _, conv)) => conv.forward(repeat(stack.forward(x, drop), self.stride)),
+            DecoderPart::Level((stack, _, conv)) => conv.forward(repeat(stack.forward(x, drop), STRIDE)),
         })
     }
 }

@@ -7,7 +7,7 @@
 
 use burn::module::{Module, Param};
 use burn::tensor::{Device, Int, Tensor, TensorData};
-use serde::{Deserialize, Serialize};
+use protocol::stage::{LatentShape, Network};
 
 use super::vae::Positions;
 use super::{Init, Linear, POSITIONS, SkipStack, StackConfig};
@@ -17,25 +17,16 @@ use crate::kernels::{Dropout, KeyMask};
 const AXES: usize = 3;
 
 /// Size of a trajectory encoder.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct TrajectoryConfig {
     /// Number of joints of the skeleton.
     pub joints: usize,
-    /// Number of tokens N.
-    pub tokens: usize,
-    /// Width d of a token.
-    pub dim: usize,
-    /// Width H of the transformer.
-    pub width: usize,
-    /// Number of blocks.
-    pub layers: usize,
-    /// Number of attention heads.
-    pub heads: usize,
-    pub feed_forward: usize,
+    /// Shape N x d of the tokens.
+    pub latent: LatentShape,
+    /// Size of the transformer, whose dropout is an argument of each pass.
+    pub network: Network,
     /// Adds a Linear H -> d at the end (v2); without it d is H (v1).
     pub projection: bool,
-    /// Added to variances in layer norms.
-    pub norm_eps: f64,
 }
 
 /// Joint targets of a batch, for the frames that have any.
@@ -106,13 +97,13 @@ pub struct TrajectoryEncoder {
 impl TrajectoryEncoder {
     /// Creates an encoder with initial weights.
     pub fn new(config: &TrajectoryConfig, init: &mut Init<'_>) -> Self {
-        let TrajectoryConfig { joints, tokens, dim, width, layers, heads, feed_forward, norm_eps, .. } = *config;
-        let stack = StackConfig { width, layers, heads, feed_forward, norm_eps, memory: false };
+        let LatentShape { tokens, dim } = config.latent;
+        let width = config.network.width;
         Self {
             global_motion_token: init.normal([tokens, width]),
-            skel_embedding: Linear::new(init, AXES * joints, width),
+            skel_embedding: Linear::new(init, AXES * config.joints, width),
             query_pos_encoder: Positions::new(init, width),
-            encoder: SkipStack::new(init, &stack),
+            encoder: SkipStack::new(init, &StackConfig::of(&config.network)),
             latent_proj: config.projection.then(|| Linear::new(init, width, dim)),
         }
     }

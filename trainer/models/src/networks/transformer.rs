@@ -8,6 +8,7 @@
 
 use burn::module::{Module, Param};
 use burn::tensor::Tensor;
+use protocol::stage::Network;
 
 use super::Init;
 use crate::kernels::{self, Dropout, KeyMask};
@@ -25,6 +26,17 @@ pub struct StackConfig {
     pub norm_eps: f64,
     /// Adds attention to a memory to every block.
     pub memory: bool,
+}
+
+/// Added to variances in the layer norms of all published transformers of motion.
+pub(super) const NORM_EPS: f64 = 1e-5;
+
+impl StackConfig {
+    /// The size in a stage's settings, without memory.
+    pub fn of(network: &Network) -> Self {
+        let Network { width, layers, heads, feed_forward, .. } = *network;
+        Self { width, layers, heads, feed_forward, norm_eps: NORM_EPS, memory: false }
+    }
 }
 
 /// `y = x W^T + b`; `weight` [out, in] as published.

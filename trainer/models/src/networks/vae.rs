@@ -6,31 +6,22 @@
 
 use burn::module::{Module, Param};
 use burn::tensor::{Tensor, TensorData};
-use serde::{Deserialize, Serialize};
+use protocol::stage::{LatentShape, Network};
 
 use super::{Init, Linear, POSITIONS, SkipStack, StackConfig};
 use crate::kernels::{Dropout, KeyMask};
 
 /// Size of a VAE.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct VaeConfig {
     /// Features per frame: 263 or 251.
     pub features: usize,
-    /// Number of latent tokens N.
-    pub tokens: usize,
-    /// Width d of a latent token.
-    pub dim: usize,
-    /// Width H of the transformers.
-    pub width: usize,
-    /// Number of blocks in each of encoder and decoder.
-    pub layers: usize,
-    /// Number of attention heads.
-    pub heads: usize,
-    pub feed_forward: usize,
+    /// Shape N x d of a latent.
+    pub latent: LatentShape,
+    /// Size of each of encoder and decoder, whose dropout is an argument of each pass.
+    pub network: Network,
     /// Adds linear layers around the bottleneck (v2); without them d is H (v1).
     pub projection: bool,
-    /// Added to variances in layer norms.
-    pub norm_eps: f64,
 }
 
 /// A diagonal normal distribution over latents.
@@ -99,15 +90,9 @@ pub struct Vae {
 impl Vae {
     /// Creates a VAE with initial weights.
     pub fn new(config: &VaeConfig, init: &mut Init<'_>) -> Self {
-        let VaeConfig { features, tokens, dim, width, .. } = *config;
-        let stack = |memory| StackConfig {
-            width,
-            layers: config.layers,
-            heads: config.heads,
-            feed_forward: config.feed_forward,
-            norm_eps: config.norm_eps,
-            memory,
-        };
+        let VaeConfig { features, latent: LatentShape { tokens, dim }, .. } = *config;
+        let width = config.network.width;
+        let stack = |memory| StackConfig { memory, ..StackConfig::of(&config.network) };
         Self {
             global_motion_token: init.normal([2 * tokens, width]),
             skel_embedding: Linear::new(init, features, width),

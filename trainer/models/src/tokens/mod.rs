@@ -14,6 +14,7 @@ pub mod residual;
 use burn::tensor::activation::log_softmax;
 use burn::tensor::{Tensor, TensorData};
 
+use crate::device::host;
 use crate::quantizer::{first_largest, gumbel};
 
 /// Fills uniform draws in [0, 1), one per class: step, example, position.
@@ -73,11 +74,6 @@ pub fn cross_entropy(logits_bnc: Tensor<3>, targets: &[usize], weights: &[f32]) 
     }
     let own = Tensor::<3>::from_data(TensorData::new(own, [batch, len, classes]), &logits_bnc.device());
     (log_softmax(logits_bnc, 2) * own).sum().neg()
-}
-
-/// Copies the values of a tensor to the host.
-fn host<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {
-    tensor.into_data().as_slice::<f32>().expect("f32 throughout").to_vec()
 }
 
 /// Logits with classifier-free guidance, `null + scale (conditional - null)`; scale 1 skips the null pass.

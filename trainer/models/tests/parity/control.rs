@@ -13,12 +13,12 @@ use models::networks::{
 };
 use models::optim::{AdamW, clip_factor, global_norm};
 use motion::skeleton::Skeleton;
-use protocol::stage::DataFormat;
+use protocol::stage::{DataFormat, LatentShape, Network};
 use serde_json::Value;
 
 use crate::common::{Arrays, Gates, device, error, folders, json, name, relative, shared, tracked};
 use crate::networks::{
-    check_gradients, count, denoiser, denoiser_config, draws, load, repeated, scalar, split, vae_at,
+    check_gradients, count, denoiser, denoiser_config, draws, load, only, repeated, scalar, split, vae_at,
 };
 use crate::{FORWARD, LOSS};
 
@@ -40,7 +40,7 @@ struct Fixture {
 
 fn controlnet(config: &Value, device: &Device) -> Denoiser {
     let sizes = denoiser_config(config);
-    let embed = config["controlnet_embed_dim"].as_u64().map_or(sizes.width, |width| width as usize);
+    let embed = config["controlnet_embed_dim"].as_u64().map_or(sizes.network.width, |width| width as usize);
     let activated = match config["controlnet_act_fn"].as_str() {
         None => false,
         Some("silu") => true,
@@ -52,16 +52,18 @@ fn controlnet(config: &Value, device: &Device) -> Denoiser {
 fn trajectory(config: &Value, device: &Device) -> TrajectoryEncoder {
     let latent: Vec<usize> = serde_json::from_value(config["latent_dim"].clone()).expect("two sizes");
     let width = config["hidden_dim"].as_u64().map_or(latent[1], |w| w as usize);
+    only(config, &[("norm_eps", 1e-5.into())]);
     let sizes = TrajectoryConfig {
         joints: count(config, "nfeats"),
-        tokens: latent[0],
-        dim: latent[1],
-        width,
-        layers: count(config, "num_layers"),
-        heads: count(config, "num_heads"),
-        feed_forward: count(config, "ff_size"),
+        latent: LatentShape { tokens: latent[0], dim: latent[1] },
+        network: Network {
+            width,
+            layers: count(config, "num_layers"),
+            heads: count(config, "num_heads"),
+            feed_forward: count(config, "ff_size"),
+            ..Network::default()
+        },
         projection: config["force_post_proj"].as_bool().expect("a flag") || width != latent[1],
-        norm_eps: config["norm_eps"].as_f64().expect("a number"),
     };
     TrajectoryEncoder::new(&sizes, &mut draws(device))
 }

@@ -6,6 +6,7 @@ use models::flat;
 use models::kernels::Dropout;
 use models::networks::{Gpt, GptConfig};
 use models::tokens::autoregressive::{Draw, Example, loss, sample};
+use protocol::stage::TokenNetwork;
 use serde_json::{Value, json as value};
 
 use crate::common::{Arrays, Gates, device, folders, json, name, relative, shared, tracked};
@@ -19,12 +20,15 @@ const NOT_OURS: [&str; 3] = ["attn.mask", "pos_embed.embed", "pos_embedding"];
 fn network(config: &Value, weights: &Arrays, device: &Device) -> (Gpt, GptConfig) {
     let config = GptConfig {
         codes: size(config, "num_vq"),
-        width: size(config, "embed_dim"),
-        heads: size(config, "heads"),
-        layers: size(config, "num_layers_base_and_head"),
+        network: TokenNetwork {
+            width: size(config, "embed_dim"),
+            layers: size(config, "num_layers_base_and_head"),
+            heads: size(config, "heads"),
+            feed_forward: size(config, "fc_rate") * size(config, "embed_dim"),
+            ..TokenNetwork::default()
+        },
         block: size(config, "block_size"),
         text_dim: size(config, "clip_dim"),
-        rate: size(config, "fc_rate"),
     };
     (filled(Gpt::new(&config, &mut draws(device)), weights, "", &NOT_OURS), config)
 }

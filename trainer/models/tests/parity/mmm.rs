@@ -7,6 +7,7 @@ use models::kernels::Dropout;
 use models::networks::{Mmm, MmmCondition, MmmConfig};
 use models::optim::{AdamW, global_norm};
 use models::tokens::mmm::{Corruption, Counts, Example, Sampling, Step, logits, loss, sample};
+use protocol::stage::TokenNetwork;
 use serde_json::Value;
 
 use crate::common::{Array, Arrays, Gates, device, error, folders, json, name, relative, row, shared, tracked};
@@ -42,13 +43,16 @@ fn load(config: &Value, weights: &Arrays, device: Device) -> Loaded {
     let sizes = MmmConfig {
         codes: size(config, "num_vq"),
         dim: size(config, "code_dim"),
-        width: size(config, "embed_dim"),
-        heads: size(config, "heads"),
-        layers: size(config, "num_layers"),
-        local: size(config, "num_local_layer"),
+        network: TokenNetwork {
+            width: size(config, "embed_dim"),
+            layers: size(config, "num_layers"),
+            heads: size(config, "heads"),
+            feed_forward: size(config, "fc_rate") * size(config, "embed_dim"),
+            word_blocks: size(config, "num_local_layer"),
+            ..TokenNetwork::default()
+        },
         block: size(config, "block_size"),
         text_dim: size(config, "clip_dim"),
-        rate: size(config, "fc_rate"),
     };
     let network = filled(Mmm::new(&sizes, &mut draws(&device)), weights, "", &NOT_OURS);
     let codes = weights.get("trans_base.vqvae.vqvae.quantizer.codebook").clone();

@@ -6,6 +6,7 @@ use models::kernels::Dropout;
 use models::networks::{MaskedTransformer, MomaskConfig, ResidualTransformer};
 use models::tokens::masked::{Canvas, Corruption, Example, Sampling};
 use models::tokens::{cross_entropy, masked, residual};
+use protocol::stage::TokenNetwork;
 use serde_json::Value;
 
 use crate::common::{Array, Arrays, Gates, device, folders, json, name, relative, row, shared, tracked};
@@ -18,11 +19,14 @@ fn sizes(config: &Value) -> MomaskConfig {
     MomaskConfig {
         codes: size(config, "num_tokens"),
         quantizers: size(config, "num_quantizers"),
-        dim: size(config, "code_dim"),
-        width: size(config, "latent_dim"),
-        layers: size(config, "layers"),
-        heads: size(config, "heads"),
-        feed_forward: size(config, "ff"),
+        network: TokenNetwork {
+            width: size(config, "latent_dim"),
+            layers: size(config, "layers"),
+            heads: size(config, "heads"),
+            feed_forward: size(config, "ff"),
+            embedding: size(config, "code_dim"),
+            ..TokenNetwork::default()
+        },
         text_dim: size(config, "clip_dim"),
     }
 }

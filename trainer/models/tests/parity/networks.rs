@@ -9,7 +9,7 @@ use models::names;
 use models::networks::{Denoiser, DenoiserConfig, Init, Vae, VaeConfig};
 use models::optim::global_norm;
 use protocol::Seed;
-use protocol::stage::Positions;
+use protocol::stage::{LatentShape, Network, Positions};
 use serde_json::Value;
 
 use crate::common::{Array, Arrays, Gates, error, relative};
@@ -59,6 +59,7 @@ pub(crate) fn vae_at(config: &Value, weights: &Path, prefix: &str, device: &Devi
             ("normalize_before", false.into()),
             ("activation", "gelu".into()),
             ("norm_post", true.into()),
+            ("norm_eps", 1e-5.into()),
             ("activation_post", Value::Null),
             ("position_embedding", "learned".into()),
         ],
@@ -66,14 +67,15 @@ pub(crate) fn vae_at(config: &Value, weights: &Path, prefix: &str, device: &Devi
     let (tokens, dim, width, projection) = sizes(config);
     let config = VaeConfig {
         features: count(config, "nfeats"),
-        tokens,
-        dim,
-        width,
-        layers: count(config, "num_layers"),
-        heads: count(config, "num_heads"),
-        feed_forward: count(config, "ff_size"),
+        latent: LatentShape { tokens, dim },
+        network: Network {
+            width,
+            layers: count(config, "num_layers"),
+            heads: count(config, "num_heads"),
+            feed_forward: count(config, "ff_size"),
+            ..Network::default()
+        },
         projection,
-        norm_eps: config["norm_eps"].as_f64().expect("a number"),
     };
     load(Vae::new(&config, &mut draws(device)), weights, prefix)
 }
@@ -92,6 +94,7 @@ pub(crate) fn denoiser_config(config: &Value) -> DenoiserConfig {
             ("normalize_before", false.into()),
             ("activation", "gelu".into()),
             ("norm_post", true.into()),
+            ("norm_eps", 1e-5.into()),
             ("activation_post", Value::Null),
             ("flip_sin_to_cos", true.into()),
             ("freq_shift", 0.into()),
@@ -107,18 +110,19 @@ pub(crate) fn denoiser_config(config: &Value) -> DenoiserConfig {
         Some(other) => panic!("activation `{other}` on the text does not exist here"),
     };
     DenoiserConfig {
-        tokens,
-        dim,
-        width,
-        layers: count(config, "num_layers"),
-        heads: count(config, "num_heads"),
-        feed_forward: count(config, "ff_size"),
+        latent: LatentShape { tokens, dim },
+        network: Network {
+            width,
+            layers: count(config, "num_layers"),
+            heads: count(config, "num_heads"),
+            feed_forward: count(config, "ff_size"),
+            ..Network::default()
+        },
         text_dim: count(config, "text_dim"),
         time_dim: count(config, "time_dim"),
         text_relu,
         projection,
         guidance_dim: config["time_cond_proj_dim"].as_u64().map(|g| g as usize),
-        norm_eps: config["norm_eps"].as_f64().expect("a number"),
     }
 }
 

@@ -13,7 +13,7 @@ use models::kernels::Dropout;
 use models::losses::{FrameWeights, Pointwise};
 use models::networks::{Mdm, MdmConfig, StableMoFusion, StableMoFusionConfig, TokenCondition};
 use models::optim::{AdamW, clip_factor, ema, global_norm};
-use protocol::stage::{Diffusion, NoiseSchedule, Prediction};
+use protocol::stage::{Diffusion, MdmNetwork, NoiseSchedule, Prediction, StableMoFusionNetwork};
 use serde_json::Value;
 
 use crate::common::{Array, Arrays, Gates, device, error, folders, json, name, relative, row, shared, tracked, values};
@@ -59,12 +59,14 @@ pub(crate) fn mdm(config: &Value, weights: &Path, prefix: &str, device: &Device)
     only(config, &[("arch", "trans_enc".into()), ("nfeats", 1.into()), ("cond_mode", "text".into())]);
     let sizes = MdmConfig {
         features: count(config, "njoints"),
-        width: count(config, "latent_dim"),
-        layers: count(config, "num_layers"),
-        heads: count(config, "num_heads"),
-        feed_forward: count(config, "ff_size"),
+        network: MdmNetwork {
+            width: count(config, "latent_dim"),
+            layers: count(config, "num_layers"),
+            heads: count(config, "num_heads"),
+            feed_forward: count(config, "ff_size"),
+            ..MdmNetwork::default()
+        },
         text_dim: count(config, "clip_dim"),
-        norm_eps: 1e-5,
     };
     let masked = config["mask_frames"].as_bool().expect("a flag");
     (load(Mdm::new(&sizes, &mut draws(device)), weights, prefix), masked)
@@ -75,15 +77,18 @@ pub(crate) fn stablemofusion(config: &Value, weights: &Path, prefix: &str, devic
     only(config, &[("adagn", true.into()), ("zero", true.into()), ("activation", "gelu".into())]);
     let sizes = StableMoFusionConfig {
         features: count(config, "input_feats"),
-        width: count(config, "base_dim"),
-        multipliers: serde_json::from_value(config["dim_mults"].clone()).expect("multipliers"),
-        time_dim: count(config, "time_dim"),
+        network: StableMoFusionNetwork {
+            width: count(config, "base_dim"),
+            multipliers: serde_json::from_value(config["dim_mults"].clone()).expect("multipliers"),
+            time: count(config, "time_dim"),
+            text: count(config, "text_latent_dim"),
+            text_layers: count(config, "num_text_layers"),
+            text_heads: count(config, "text_num_heads"),
+            text_feed_forward: count(config, "text_ff_size"),
+            full_attention: config["no_eff"].as_bool().expect("a flag"),
+            ..StableMoFusionNetwork::default()
+        },
         text_dim: count(config, "clip_dim"),
-        text_width: count(config, "text_latent_dim"),
-        text_feed_forward: count(config, "text_ff_size"),
-        text_heads: count(config, "text_num_heads"),
-        text_layers: count(config, "num_text_layers"),
-        full_attention: config["no_eff"].as_bool().expect("a flag"),
     };
     load(StableMoFusion::new(&sizes, &mut draws(device)), weights, prefix)
 }

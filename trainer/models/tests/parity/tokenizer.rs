@@ -8,11 +8,11 @@ use burn::tensor::{Device, Tensor, TensorData};
 use models::flat;
 use models::kernels::Dropout;
 use models::losses::Pointwise;
-use models::networks::{Init, Tokenizer, TokenizerConfig};
+use models::networks::{Init, LEVELS, STRIDE, Tokenizer, TokenizerConfig};
 use models::quantizer::{Book, Pass, candidates, look_up, perplexity};
 use motion::skeleton::Skeleton;
 use protocol::Seed;
-use protocol::stage::{DataFormat, Positions};
+use protocol::stage::{DataFormat, Positions, TokenizerNetwork};
 use serde_json::Value;
 
 use crate::common::{Array, Arrays, Gates, device, error, folders, json, name, relative, shared, tracked, values};
@@ -67,15 +67,17 @@ fn load(config: &Value, weights: &Arrays, prefix: &str, device: &Device) -> Load
     let features = weights.get(&format!("{prefix}encoder.model.0.weight")).shape[1];
     let format = [DataFormat::Humanml3d, DataFormat::Kit].into_iter().find(|f| Skeleton::of(*f).features == features);
     let or = |key: &str, other: usize| config[key].as_u64().map_or(other, |v| v as usize);
+    assert_eq!([or("down_t", LEVELS), or("stride_t", STRIDE)], [LEVELS, STRIDE]);
     let decay = config["mu"].as_f64().unwrap_or(0.99);
     let config = TokenizerConfig {
         features,
         dim: size(config, "code_dim"),
-        width: config["vq_width"].as_u64().map_or_else(|| size(config, "width"), |w| w as usize),
-        levels: or("down_t", 2),
-        stride: or("stride_t", 2),
-        depth: or("depth", 3),
-        growth: or("dilation_growth_rate", 3),
+        network: TokenizerNetwork {
+            width: config["vq_width"].as_u64().map_or_else(|| size(config, "width"), |w| w as usize),
+            depth: or("depth", 3),
+            growth: or("dilation_growth_rate", 3),
+            ..TokenizerNetwork::default()
+        },
     };
     let network = filled(Tokenizer::new(&config, &mut draws(device)), weights, prefix, &["quantizer."]);
     let single = weights.find(&format!("{prefix}quantizer.codebook"));

@@ -207,7 +207,7 @@ impl Dataset {
         if mean.len() != width || std.len() != width {
             return Err(bad(
                 INDEX,
-                format!("statistics have {} and {} values; expected {width}", mean.len(), std.len()),
+                format!("the mean has {} values and the deviation {}; expected {width} each", mean.len(), std.len()),
             ));
         }
         for entry in &index.entries {

@@ -3,8 +3,6 @@
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use super::Problems;
-
 /// Changed paths for training clips: the same poses along other curves and at another speed. Off by default, as
 /// published.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -22,10 +20,5 @@ impl Augment {
     /// Returns true if clips are not changed.
     pub fn is_none(&self) -> bool {
         self.bend == 0.0 && self.stretch == 0.0
-    }
-
-    pub(super) fn check(&self, p: &mut Problems) {
-        p.not_negative("augment.bend", self.bend);
-        p.fraction("augment.stretch", self.stretch, false);
     }
 }

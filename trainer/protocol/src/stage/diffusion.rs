@@ -78,4 +78,13 @@ impl Diffusion {
             p.add("diffusion.beta_first", message, "remove `beta_first` and `beta_last`, or use a linear schedule");
         }
     }
+
+    /// Checks also that samplers of features have the schedule.
+    pub(super) fn check_for_features(&self, p: &mut Problems) {
+        self.check(p);
+        if self.schedule == NoiseSchedule::Flow {
+            let message = "this stage has no sampler for the schedule `flow`";
+            p.add("diffusion.schedule", message, "write `schedule: cosine` or `schedule: linear`");
+        }
+    }
 }

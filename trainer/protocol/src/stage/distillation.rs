@@ -41,7 +41,7 @@ pub struct Distillation {
     #[schemars(range(min = 0.0, max = 1e6))]
     pub huber_c: f64,
     /// Decay of the target network.
-    #[schemars(range(min = 0.0, max = 1.0))]
+    #[schemars(range(min = 0.0), extend("exclusiveMaximum" = 1.0))]
     pub ema: f64,
     /// Applies dropout in the frozen networks, as the original script does by mistake.
     pub upstream_dropout: bool,
@@ -91,25 +91,16 @@ impl Distillation {
     }
 
     pub(super) fn check(&self, p: &mut Problems) {
-        let (low, high) = self.guidance;
-        if low > high {
-            p.add("guidance", format!("`guidance` is [{low}, {high}]; expected the smaller number first"), "");
-        }
-        if !(low >= 0.0 && high.is_finite()) {
-            p.add("guidance", format!("`guidance` is [{low}, {high}]; expected numbers of 0 or more"), "");
-        }
-        if self.guidance_dim < 4 || !self.guidance_dim.is_multiple_of(2) {
-            let message = format!("`guidance_dim` is {}; expected an even number of at least 4", self.guidance_dim);
+        p.ascending("guidance", self.guidance);
+        if !self.guidance_dim.is_multiple_of(2) {
+            let message = format!("`guidance_dim` is {}; expected an even number", self.guidance_dim);
             p.add("guidance_dim", message, "one half are sines, the other half cosines");
         }
-        if self.grid().is_none() {
-            let message = format!("`skip` is {}; expected a divisor of the 1000 timesteps", self.skip);
-            p.add("skip", message, "published: 100 (MotionLCM v2, MotionPCM) and 20 (MotionLCM v1)");
-        }
+        let help = "published: 100 (MotionLCM v2, MotionPCM) and 20 (MotionLCM v1)";
+        p.divides_timesteps("skip", self.skip, help);
         if self.distance == Distance::Huber {
             p.above_zero("huber_c", self.huber_c);
         }
-        p.fraction("ema", self.ema, true);
         self.training.check(p);
     }
 

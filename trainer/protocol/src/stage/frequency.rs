@@ -120,22 +120,12 @@ impl FrequencyLosses {
 
     pub(super) fn check(&self, p: &mut Problems) {
         let (low, semantic) = (&self.low_frequency, &self.semantic);
-        p.not_negative("losses.low_frequency.weight", low.weight);
-        p.not_negative("losses.semantic.weight", semantic.weight);
-        p.positive("losses.low_frequency.keep", low.keep);
         for (name, from, to) in [("low_frequency", low.from, low.to), ("semantic", semantic.from, semantic.to)] {
-            p.fraction(&format!("losses.{name}.from"), from, false);
-            p.fraction(&format!("losses.{name}.to"), to, false);
             if from > to {
                 let message =
                     format!("`losses.{name}` has `from` {from} and `to` {to}; expected `from` to be the smaller one");
                 p.add(&format!("losses.{name}.from"), message, "0 is no noise, 1 is all noise");
             }
-        }
-        if !(-1.0..=1.0).contains(&semantic.threshold) {
-            let message =
-                format!("`losses.semantic.threshold` is {}; expected a cosine from -1 to 1", semantic.threshold);
-            p.add("losses.semantic.threshold", message, "");
         }
     }
 }

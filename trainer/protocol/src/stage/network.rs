@@ -4,7 +4,6 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::Problems;
-use crate::limits;
 
 /// Size of a transformer. The published networks: width 256, 9 layers, 4 heads, feed-forward 1024, dropout 0.1.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -23,7 +22,7 @@ pub struct Network {
     #[schemars(range(min = 1, max = 65_536), extend("x-unit" = "channels"))]
     pub feed_forward: usize,
     /// Probability of dropout.
-    #[schemars(range(min = 0.0, max = 1.0))]
+    #[schemars(range(min = 0.0), extend("exclusiveMaximum" = 1.0))]
     pub dropout: f64,
     /// Initial values of the learned position tables.
     pub positions: Positions,
@@ -37,32 +36,19 @@ impl Default for Network {
 
 impl Network {
     pub(super) fn check(&self, p: &mut Problems) {
-        for (field, value) in [
-            ("network.width", self.width),
-            ("network.layers", self.layers),
-            ("network.heads", self.heads),
-            ("network.feed_forward", self.feed_forward),
-        ] {
-            p.positive(field, value);
-        }
-        // Four projections of attention and two of the feed-forward block.
-        let wide = self.width.saturating_mul(4).saturating_add(self.feed_forward.saturating_mul(2));
-        let parameters = self.width.saturating_mul(wide).saturating_mul(self.layers);
-        if parameters > limits::PARAMETERS && parameters < usize::MAX {
-            let message = format!("its layers have {parameters} parameters; expected at most {}", limits::PARAMETERS);
-            p.add("network", message, "use fewer or narrower layers");
-        }
+        p.parameters(transformer_parameters(self.width, self.feed_forward, self.layers));
         if self.layers > 0 && self.layers.is_multiple_of(2) {
             let message = format!("`network.layers` is {}; expected an odd number", self.layers);
             p.add("network.layers", message, "the skip stack has as many blocks before its middle block as after it");
         }
-        if self.heads > 0 && !self.width.is_multiple_of(self.heads) {
-            let (heads, width) = (self.heads, self.width);
-            let message = format!("`network.heads` is {heads}, which does not divide `network.width` ({width})");
-            p.add("network.heads", message, "");
-        }
-        p.fraction("network.dropout", self.dropout, true);
+        p.equal_heads("network.heads", self.heads, "network.width", self.width);
     }
+}
+
+/// Number of parameters of a transformer's weights: four projections of attention and two of the feed-forward block.
+pub(super) fn transformer_parameters(width: usize, feed_forward: usize, layers: usize) -> usize {
+    let wide = width.saturating_mul(4).saturating_add(feed_forward.saturating_mul(2));
+    width.saturating_mul(wide).saturating_mul(layers)
 }
 
 /// Initial values of learned position tables. The tables are trained, imported and exported in either case.
@@ -98,8 +84,6 @@ impl Default for LatentShape {
 
 impl LatentShape {
     pub(super) fn check(self, p: &mut Problems) {
-        p.positive("latent.tokens", self.tokens);
-        p.positive("latent.dim", self.dim);
         if self.tokens.saturating_mul(self.dim) > 1 << 20 {
             let message = format!("the latent is {}x{}; expected at most 1048576 numbers", self.tokens, self.dim);
             p.add("latent.tokens", message, "published: 1x256 and 16x32");

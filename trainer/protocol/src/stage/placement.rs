@@ -32,7 +32,6 @@ impl Placement {
 
     pub fn check(&self, p: &mut Problems) {
         let w = self.workers;
-        p.positive("workers.min", w.min);
         if w.max != 0 && w.max < w.min {
             let message = format!("`workers.max` is {}, which is less than `workers.min` ({})", w.max, w.min);
             p.add("workers.max", message, "0 sets no upper bound");
@@ -41,7 +40,6 @@ impl Placement {
             p.add("requires", format!("`requires`: {error}"), "");
         }
         let keep = &self.checkpoint.keep;
-        p.positive("checkpoint.keep.latest", keep.latest);
         if keep.metric.trim().is_empty() {
             p.add(
                 "checkpoint.keep.metric",

@@ -2,6 +2,9 @@
 
 use crate::limits;
 
+/// Frames of a token of every published tokenizer.
+const FRAMES_A_TOKEN: usize = 4;
+
 /// A violated rule.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Problem {
@@ -24,14 +27,8 @@ impl Problems {
         self.0.push(Problem { field: field.to_owned(), message: message.into(), help });
     }
 
-    pub(crate) fn positive(&mut self, field: &str, value: usize) {
-        if value == 0 {
-            self.add(field, format!("`{field}` is 0; expected at least 1"), "");
-        }
-    }
-
     pub(crate) fn above_zero(&mut self, field: &str, value: f64) {
-        if !(value > 0.0 && value.is_finite()) {
+        if value <= 0.0 {
             self.add(field, format!("`{field}` is {value}; expected a number above 0"), "");
         }
     }
@@ -42,19 +39,43 @@ impl Problems {
         }
     }
 
-    /// Requires 0 <= value <= 1, or < 1 if `open`.
-    pub(crate) fn fraction(&mut self, field: &str, value: f64, open: bool) {
-        let fits = value >= 0.0 && if open { value < 1.0 } else { value <= 1.0 };
-        if !fits {
-            let range = if open { "at least 0 and below 1" } else { "between 0 and 1" };
-            self.add(field, format!("`{field}` is {value}; expected {range}"), "");
+    /// Requires the smaller number of a range first.
+    pub(crate) fn ascending(&mut self, field: &str, range: (f64, f64)) {
+        let (low, high) = range;
+        if low > high {
+            self.add(field, format!("`{field}` is [{low}, {high}]; expected the smaller number first"), "");
         }
     }
 
-    /// Checks the number of shards of a map stage.
-    pub(crate) fn shards(&mut self, shards: usize) {
-        if !(1..=limits::SHARDS).contains(&(shards as u64)) {
-            self.add("shards", format!("`shards` is {shards}; expected 1 to {}", limits::SHARDS), "");
+    /// Requires a number of frames that tokens of four frames fill.
+    pub(crate) fn whole_tokens(&mut self, field: &str, frames: usize) {
+        if !frames.is_multiple_of(FRAMES_A_TOKEN) {
+            let message = format!("`{field}` is {frames}; expected a multiple of {FRAMES_A_TOKEN}");
+            self.add(field, message, "a token stands for 4 frames");
+        }
+    }
+
+    /// Requires a solver's step that divides the 1000 timesteps.
+    pub(crate) fn divides_timesteps(&mut self, field: &str, skip: usize, help: &str) {
+        if skip == 0 || !1000_usize.is_multiple_of(skip) {
+            self.add(field, format!("`{field}` is {skip}; expected a divisor of the 1000 timesteps"), help);
+        }
+    }
+
+    /// Requires attention heads of equal width; `heads` and `width` are the fields' paths.
+    pub(crate) fn equal_heads(&mut self, heads: &str, count: usize, width: &str, channels: usize) {
+        if count > 0 && !channels.is_multiple_of(count) {
+            let message = format!("`{heads}` is {count}, which does not divide `{width}` ({channels})");
+            self.add(heads, message, "");
+        }
+    }
+
+    /// Limits the parameters of `network`; `count` is a lower estimate.
+    pub(crate) fn parameters(&mut self, count: usize) {
+        if count > limits::PARAMETERS {
+            let message =
+                format!("the network has at least {count} parameters; expected at most {}", limits::PARAMETERS);
+            self.add("network", message, "use fewer or narrower layers");
         }
     }
 

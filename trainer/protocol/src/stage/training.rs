@@ -45,13 +45,13 @@ pub enum Decay {
 #[serde(default)]
 pub struct Optimizer {
     /// Decay of the first moment.
-    #[schemars(range(min = 0.0, max = 1.0))]
+    #[schemars(range(min = 0.0), extend("exclusiveMaximum" = 1.0))]
     pub beta1: f64,
     /// Decay of the second moment.
-    #[schemars(range(min = 0.0, max = 1.0))]
+    #[schemars(range(min = 0.0), extend("exclusiveMaximum" = 1.0))]
     pub beta2: f64,
     /// Added to the root of the second moment.
-    #[schemars(range(min = 0.0, max = 1.0))]
+    #[schemars(range(max = 1.0), extend("exclusiveMinimum" = 0.0))]
     pub eps: f64,
     /// Decoupled weight decay.
     #[schemars(range(min = 0.0, max = 1e3))]
@@ -64,15 +64,6 @@ impl Default for Optimizer {
     }
 }
 
-impl Optimizer {
-    pub(super) fn check(&self, p: &mut Problems, field: &str) {
-        p.fraction(&format!("{field}.beta1"), self.beta1, true);
-        p.fraction(&format!("{field}.beta2"), self.beta2, true);
-        p.above_zero(&format!("{field}.eps"), self.eps);
-        p.not_negative(&format!("{field}.weight_decay"), self.weight_decay);
-    }
-}
-
 /// Common settings of training stages.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Training {
@@ -82,7 +73,7 @@ pub struct Training {
     /// Global batch and its slices.
     pub batch: Batch,
     /// Peak learning rate.
-    #[schemars(range(min = 0.0, max = 1e3))]
+    #[schemars(range(max = 1e3), extend("exclusiveMinimum" = 0.0))]
     pub lr: f64,
     /// Linear warm-up; the first update has rate 0 when it is positive.
     #[schemars(range(min = 0, max = 1_000_000_000))]
@@ -122,16 +113,6 @@ impl Training {
     }
 
     pub(super) fn check(&self, p: &mut Problems) {
-        if self.steps.0 == 0 {
-            p.add("steps", "`steps` is 0; expected at least 1", "");
-        }
-        p.positive("batch.global", self.batch.global);
-        p.positive("batch.slices", self.batch.slices);
-        if self.batch.global > 0 {
-            self.batch.check_division(p, "batch.global");
-        }
-        p.above_zero("lr", self.lr);
-        self.optimizer.check(p, "optimizer");
-        p.not_negative("max_grad_norm", self.max_grad_norm);
+        self.batch.check_division(p, "batch.global");
     }
 }

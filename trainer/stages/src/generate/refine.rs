@@ -9,6 +9,7 @@
 use std::f64::consts::PI;
 
 use burn::tensor::{Device, Tensor, TensorData};
+use models::device::host;
 use models::losses::{Body, ControlTarget, Pointwise};
 use models::optim::AdamW;
 use motion::Skeleton;
@@ -43,7 +44,7 @@ pub(crate) fn refine(vae: &Autoencoder, z: &mut [f32], lengths: &[usize], hints:
         let joints = body.joints(features.clone()) * skeleton.metres_per_unit;
         let loss = told.loss(joints.clone()) + wanted.loss(joints) + as_drawn.loss(features);
         let gradient = z_bnd.grad(&loss.backward()).expect("motion depends on its latent");
-        let gradient = gradient.into_data().try_into_vec::<f32>().expect("networks compute in f32");
+        let gradient = host(gradient);
         let lr = RATE * (1.0 + (PI * step as f64 / steps as f64).cos()) / 2.0;
         ADAM.step(step as u64 + 1, lr, z, &gradient, &mut m, &mut v);
     }

@@ -5,9 +5,9 @@ use burn::tensor::Device;
 use checkpoint::Blobs;
 use checkpoint::model::Parts;
 use models::kernels::Dropout;
-use models::networks::{Denoiser, Feedback, FeedbackConfig, Init, StackConfig, TrajectoryConfig, TrajectoryEncoder};
-use protocol::stage::{ControlHints, DataFormat, Network, Positions};
-use protocol::{Manifest, Seed, limits};
+use models::networks::{Denoiser, Feedback, FeedbackConfig, Init, TrajectoryConfig, TrajectoryEncoder};
+use protocol::stage::{ControlHints, DataFormat, Network};
+use protocol::{Manifest, limits};
 use serde::{Deserialize, Serialize};
 
 use super::hint::{AXES, Hint, NormalisedHints};
@@ -17,8 +17,6 @@ use super::{feedback, weights};
 use crate::artifacts::{self, DenoiserMeta};
 use crate::context::StageError;
 
-/// Added to variances in layer norms.
-const NORM_EPS: f64 = 1e-5;
 /// Prefix of the ControlNet's weights, as in MotionLCM's checkpoints.
 pub(crate) const CONTROLNET_PREFIX: &str = "controlnet.";
 /// Prefix of the trajectory encoder's weights.
@@ -85,26 +83,19 @@ impl ControlMeta {
     pub fn trajectory(&self, denoiser: &DenoiserMeta, init: &mut Init<'_>) -> TrajectoryEncoder {
         let config = TrajectoryConfig {
             joints: self.mean.len() / AXES,
-            tokens: denoiser.latent.tokens,
-            dim: denoiser.latent.dim,
-            width: self.network.width,
-            layers: self.network.layers,
-            heads: self.network.heads,
-            feed_forward: self.network.feed_forward,
+            latent: denoiser.latent,
+            network: self.network.clone(),
             projection: self.projection.unwrap_or(denoiser.latent.dim != self.network.width),
-            norm_eps: NORM_EPS,
         };
         TrajectoryEncoder::new(&config, init)
     }
 
     /// Creates a feedback network for the denoiser's latents, if the part has one.
     pub fn feedback(&self, denoiser: &DenoiserMeta, init: &mut Init<'_>) -> Option<Feedback> {
-        let Network { width, layers, heads, feed_forward, .. } = self.network;
         let config = FeedbackConfig {
-            tokens: denoiser.latent.tokens,
-            dim: denoiser.latent.dim,
+            latent: denoiser.latent,
             inputs: feedback::inputs(self.mean.len() / AXES),
-            stack: StackConfig { width, layers, heads, feed_forward, norm_eps: NORM_EPS, memory: false },
+            network: self.network.clone(),
         };
         (self.feedback > 0).then(|| Feedback::new(&config, init))
     }
@@ -130,7 +121,7 @@ impl TrainedControl {
     ) -> Result<Self, StageError> {
         let meta: ControlMeta = artifacts::meta(manifest, "the control part")?;
         let device = device.clone().inner();
-        let mut blank = Init::new(Seed(0), "blank", Positions::Uniform, &device);
+        let mut blank = Init::blank(&device);
         let (control, trajectory) = (meta.controlnet(denoiser, &mut blank), meta.trajectory(denoiser, &mut blank));
         let what = "the control part's weights";
         let control = weights::load_under(control, blobs, manifest, CONTROLNET_PREFIX, what)?;

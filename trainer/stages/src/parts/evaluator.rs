@@ -7,14 +7,15 @@
 
 use burn::tensor::{Device, Tensor, TensorData};
 use checkpoint::Blobs;
+use models::device::host;
 use models::flat::Entry;
 use models::names::save;
 use models::networks::{Evaluator, EvaluatorConfig, Init};
 use motion::Skeleton;
 use motion::dataset::normalise;
 use motion::dataset::{Caption, Dataset, statistics};
-use protocol::stage::{DataFormat, EvaluatorNetwork, Positions};
-use protocol::{ArtifactKind, Digest, Manifest, Seed};
+use protocol::stage::{DataFormat, EvaluatorNetwork};
+use protocol::{ArtifactKind, Digest, Manifest};
 use serde::{Deserialize, Serialize};
 
 use super::weights;
@@ -84,7 +85,7 @@ impl TrainedEvaluator {
         let meta: EvaluatorMeta = artifacts::meta(manifest, "the evaluator")?;
         let words = Words::read(blobs, manifest, &meta.words)?;
         let device = device.clone().inner();
-        let fresh = Evaluator::new(&meta.config, &mut Init::new(Seed(0), "blank", Positions::Uniform, &device));
+        let fresh = Evaluator::new(&meta.config, &mut Init::blank(&device));
         let network = weights::load(fresh, blobs, manifest, "the evaluator's weights")?;
         Ok(Self { network, meta, words, device })
     }
@@ -195,7 +196,3 @@ impl TrainedEvaluator {
 const MOST_RATIO: f64 = 4.0;
 /// Largest allowed distance of their means, in deviations.
 const MOST_SHIFT: f64 = 2.5;
-
-fn host(tensor: Tensor<2>) -> Vec<f32> {
-    tensor.into_data().try_into_vec::<f32>().expect("networks compute in f32")
-}

@@ -10,6 +10,7 @@
 //! alone. It is the result of the best round: on a path unlike those of training a round may increase the error.
 
 use burn::tensor::{Tensor, TensorData};
+use models::device::host;
 use models::kernels::Dropout;
 use models::networks::Feedback;
 use motion::Skeleton;
@@ -52,7 +53,7 @@ impl Seen {
     pub(crate) fn of(vae: &Autoencoder, features: Tensor<3>, lengths: &[usize], hints: &[Hint]) -> Self {
         let skeleton = Skeleton::of(vae.meta().format);
         let [batch, frames, width] = features.dims();
-        let mut rows = features.into_data().try_into_vec::<f32>().expect("networks compute in f32");
+        let mut rows = host(features);
         vae.denormalise(&mut rows);
         let size = inputs(skeleton.joints);
         let (mut told, mut distances) = (vec![0.0; batch * frames * size], Vec::with_capacity(batch));
@@ -142,7 +143,7 @@ pub(crate) fn correct(
     for _ in 0..rounds {
         z_bnd = z_bnd.clone() + seen.change(network, z_bnd, &mut Dropout::off()) * (strength as f32);
         seen = see(&z_bnd);
-        let changed = z_bnd.to_data().try_into_vec::<f32>().expect("networks compute in f32");
+        let changed = host(z_bnd.clone());
         let motions = z.chunks_exact_mut(size).zip(changed.chunks_exact(size));
         for ((kept, changed), (nearest, distance)) in motions.zip(nearest.iter_mut().zip(&seen.distances)) {
             if distance < nearest {

@@ -10,14 +10,15 @@
 use burn::tensor::{Device, Tensor, TensorData};
 use checkpoint::Blobs;
 use checkpoint::model::Parts;
+use models::device::host;
 use models::flat::{self, Values};
 use models::flow::{Solver, between, follow, jump};
 use models::kernels::Dropout;
 use models::networks::{DitConfig, FlowDit, FlowUnet, Init, Projection, TimeFeatures, UnetConfig};
 use motion::Stream;
 use protocol::artifact::Role;
-use protocol::stage::{DataFormat, FlowBackbone, FlowNetwork, FlowPrediction, FlowProjection, FlowSolver, Positions};
-use protocol::{Digest, Manifest, Seed};
+use protocol::stage::{DataFormat, FlowBackbone, FlowNetwork, FlowPrediction, FlowProjection, FlowSolver};
+use protocol::{Digest, Manifest};
 use serde::{Deserialize, Serialize};
 
 use super::networks::Autoencoder;
@@ -276,7 +277,7 @@ impl FlowDecoder {
         }
         let device = device.clone().inner();
         let what = "the flow decoder's weights";
-        let blank = meta.field(&mut Init::new(Seed(0), "blank", Positions::Uniform, &device));
+        let blank = meta.field(&mut Init::blank(&device));
         let backbone = match blank.backbone {
             Backbone::Unet(network) => Backbone::Unet(weights::load(network, blobs, manifest, what)?),
             Backbone::Dit(network) => Backbone::Dit(weights::load(network, blobs, manifest, what)?),
@@ -335,14 +336,15 @@ impl FlowDecoder {
                 jump(self.meta.steps, noise, velocity, fresh)
             }
         };
-        rows.into_data().try_into_vec::<f32>().expect("networks compute in f32")
+        host(rows)
     }
 }
 
 #[cfg(test)]
 mod tests {
     use burn::tensor::Tolerance;
-    use protocol::stage::TrainDiscord;
+    use protocol::Seed;
+    use protocol::stage::{Positions, TrainDiscord};
 
     use super::*;
 

@@ -3,11 +3,12 @@
 use burn::tensor::{Device, Tensor, TensorData};
 use checkpoint::Blobs;
 use checkpoint::model::Parts;
+use models::device::host;
 use models::kernels::Dropout;
 use models::networks::{Init, LengthEstimator};
 use motion::Stream;
-use protocol::stage::{DataFormat, Positions};
-use protocol::{ArtifactKind, Manifest, Seed};
+use protocol::stage::DataFormat;
+use protocol::{ArtifactKind, Manifest};
 use serde::{Deserialize, Serialize};
 
 use super::weights;
@@ -49,7 +50,7 @@ impl Lengths {
             )));
         }
         let device = device.clone().inner();
-        let mut blank = Init::new(Seed(0), "blank", Positions::Uniform, &device);
+        let mut blank = Init::blank(&device);
         let fresh = LengthEstimator::new(meta.text_dim, meta.classes, &mut blank);
         let network = weights::load(fresh, blobs, manifest, "the length estimator's weights")?;
         Ok(Self { network, meta, device })
@@ -64,7 +65,7 @@ impl Lengths {
     pub fn draw(&self, pooled: &[f32], stream: &mut Stream) -> usize {
         let text = TensorData::new(pooled.to_vec(), [1, self.meta.text_dim]);
         let logits = self.network.forward(Tensor::from_data(text, &self.device), &mut Dropout::off());
-        let logits = logits.into_data().try_into_vec::<f32>().expect("networks compute in f32");
+        let logits = host(logits);
         LengthEstimator::sample(&logits, stream)
     }
 }

@@ -10,6 +10,7 @@ use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
 use checkpoint::Blobs;
 use checkpoint::model::Parts;
+use models::device::host;
 use models::diffusion::{
     DpmPath, Form, Last, Schedule, affine_one, ddim_sample_to_data, ddpm_sample, ddpm_timesteps, dpm_sample, guided,
     leading_timesteps,
@@ -18,15 +19,12 @@ use models::kernels::Dropout;
 use models::names::load;
 use models::networks::{Init, Mdm, MdmConfig, StableMoFusion, StableMoFusionConfig, TokenCondition};
 use motion::dataset::denormalise;
-use protocol::stage::{DataFormat, Diffusion, Family, MdmNetwork, Positions, Sampler, Solver, StableMoFusionNetwork};
-use protocol::{Manifest, Seed};
+use protocol::Manifest;
+use protocol::stage::{DataFormat, Diffusion, Family, MdmNetwork, Sampler, Solver, StableMoFusionNetwork};
 use serde::{Deserialize, Serialize};
 
 use crate::artifacts::{self, MODEL_FILE};
 use crate::context::{ContextError, StageError};
-
-/// Added to variances in layer norms.
-const NORM_EPS: f64 = 1e-5;
 
 /// The network's architecture and size.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -84,32 +82,14 @@ impl MotionDenoiserMeta {
 
     /// Creates an MDM of these sizes with initial weights.
     pub fn mdm(&self, network: &MdmNetwork, init: &mut Init<'_>) -> Mdm {
-        let config = MdmConfig {
-            features: self.mean.len(),
-            width: network.width,
-            layers: network.layers,
-            heads: network.heads,
-            feed_forward: network.feed_forward,
-            text_dim: self.text_dim,
-            norm_eps: NORM_EPS,
-        };
+        let config = MdmConfig { features: self.mean.len(), network: network.clone(), text_dim: self.text_dim };
         Mdm::new(&config, init)
     }
 
     /// Creates a StableMoFusion network of these sizes with initial weights.
     pub fn stablemofusion(&self, network: &StableMoFusionNetwork, init: &mut Init<'_>) -> StableMoFusion {
-        let config = StableMoFusionConfig {
-            features: self.mean.len(),
-            width: network.width,
-            multipliers: network.multipliers.clone(),
-            time_dim: network.time,
-            text_dim: self.text_dim,
-            text_width: network.text,
-            text_feed_forward: network.text_feed_forward,
-            text_heads: network.text_heads,
-            text_layers: network.text_layers,
-            full_attention: network.full_attention,
-        };
+        let config =
+            StableMoFusionConfig { features: self.mean.len(), network: network.clone(), text_dim: self.text_dim };
         StableMoFusion::new(&config, init)
     }
 }
@@ -238,7 +218,7 @@ impl MotionDenoiser {
         let weights = artifacts::file(blobs, manifest, MODEL_FILE)?;
         let device = device.clone().inner();
         let misfit = |e| StageError::Context(ContextError::Corrupt(format!("the denoiser's weights: {e}")));
-        let mut blank = Init::new(Seed(0), "blank", Positions::Uniform, &device);
+        let mut blank = Init::blank(&device);
         let network = match &meta.architecture {
             Architecture::Mdm(size) => Network::Mdm(load(meta.mdm(size, &mut blank), &weights, "").map_err(misfit)?),
             Architecture::StableMoFusion(size) => {
@@ -285,7 +265,7 @@ impl MotionDenoiser {
     /// Converts [B, T, F] to motions of `frames` frames in the data's own scale.
     fn motions(&self, drawn: Tensor<3>, frames: usize) -> Vec<Vec<f32>> {
         let [_, whole, width] = drawn.dims();
-        let values = drawn.into_data().try_into_vec::<f32>().expect("networks compute in f32");
+        let values = host(drawn);
         let mut motions: Vec<Vec<f32>> =
             values.chunks_exact(whole * width).map(|motion| motion[..frames * width].to_vec()).collect();
         motions.iter_mut().for_each(|motion| denormalise(motion, &self.meta.mean, &self.meta.std));

@@ -6,6 +6,7 @@
 
 use burn::tensor::{Device, Tensor, TensorData};
 use checkpoint::Blobs;
+use models::device::host;
 use models::diffusion::{
     DpmPath, Form, Grid, LcmTimesteps, Phases, Schedule, TIMESTEPS, affine_one, ddim_sample, dpm_sample, guided,
     lcm_sample, lcm_timesteps, pcm_sample,
@@ -14,8 +15,8 @@ use models::kernels::Dropout;
 use models::networks::{self, Control, DenoiserConfig, Init, POSITIONS, Vae, VaeConfig, guidance_embedding};
 use motion::Stream;
 use motion::dataset::{denormalise, normalise};
-use protocol::stage::{DataFormat, Family, Positions, Sampler, Solver};
-use protocol::{Manifest, Seed};
+use protocol::Manifest;
+use protocol::stage::{DataFormat, Family, Sampler, Solver};
 
 use super::steering::Steering;
 use super::weights;
@@ -24,22 +25,15 @@ use crate::context::StageError;
 
 /// Width of the time sinusoid in every published denoiser.
 pub(crate) const TIME_DIM: usize = 768;
-/// Added to variances in layer norms.
-const NORM_EPS: f64 = 1e-5;
 
 impl VaeMeta {
     /// The network's size. A bottleneck of the transformer's width has no projections (v1), any other has them (v2).
     pub fn config(&self) -> VaeConfig {
         VaeConfig {
             features: self.features,
-            tokens: self.latent.tokens,
-            dim: self.latent.dim,
-            width: self.network.width,
-            layers: self.network.layers,
-            heads: self.network.heads,
-            feed_forward: self.network.feed_forward,
+            latent: self.latent,
+            network: self.network.clone(),
             projection: self.projection.unwrap_or(self.latent.dim != self.network.width),
-            norm_eps: NORM_EPS,
         }
     }
 }
@@ -48,33 +42,19 @@ impl DenoiserMeta {
     /// The network's size; projections as in [`VaeMeta::config`].
     pub fn config(&self) -> DenoiserConfig {
         DenoiserConfig {
-            tokens: self.latent.tokens,
-            dim: self.latent.dim,
-            width: self.network.width,
-            layers: self.network.layers,
-            heads: self.network.heads,
-            feed_forward: self.network.feed_forward,
+            latent: self.latent,
+            network: self.network.clone(),
             text_dim: self.text_dim,
             time_dim: self.time_dim.unwrap_or(TIME_DIM),
             text_relu: self.text_relu,
             projection: self.projection.unwrap_or(self.latent.dim != self.network.width),
             guidance_dim: (self.guidance_dim > 0).then_some(self.guidance_dim),
-            norm_eps: NORM_EPS,
         }
     }
 }
 
-/// Initial values that the trained parameters replace.
-fn blank(device: &Device) -> Init<'_> {
-    Init::new(Seed(0), "blank", Positions::Uniform, device)
-}
-
 fn tensor(values: Vec<f32>, shape: [usize; 3], device: &Device) -> Tensor<3> {
     Tensor::from_data(TensorData::new(values, shape), device)
-}
-
-fn host(tensor: Tensor<3>) -> Vec<f32> {
-    tensor.into_data().try_into_vec::<f32>().expect("networks compute in f32")
 }
 
 /// A trained VAE.
@@ -106,7 +86,7 @@ impl Autoencoder {
     pub fn read(blobs: &dyn Blobs, manifest: &Manifest, device: &Device) -> Result<Self, StageError> {
         let meta: VaeMeta = artifacts::meta(manifest, "the VAE")?;
         let device = device.clone().inner();
-        let fresh = Vae::new(&meta.config(), &mut blank(&device));
+        let fresh = Vae::new(&meta.config(), &mut Init::blank(&device));
         let vae = weights::load(fresh, blobs, manifest, "the VAE's weights")?;
         Ok(Self { vae, meta, device })
     }
@@ -211,7 +191,7 @@ impl Denoiser {
     pub fn read(blobs: &dyn Blobs, manifest: &Manifest, device: &Device) -> Result<Self, StageError> {
         let meta: DenoiserMeta = artifacts::meta(manifest, "the denoiser")?;
         let device = device.clone().inner();
-        let fresh = networks::Denoiser::new(&meta.config(), &mut blank(&device));
+        let fresh = networks::Denoiser::new(&meta.config(), &mut Init::blank(&device));
         let network = weights::load(fresh, blobs, manifest, "the denoiser's weights")?;
         let schedule = Schedule::new(&meta.diffusion, TIMESTEPS);
         Ok(Self { network, meta, schedule, device })

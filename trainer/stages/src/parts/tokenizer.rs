@@ -5,23 +5,20 @@
 
 use burn::tensor::{Device, Tensor, TensorData};
 use checkpoint::Blobs;
+use models::device::host;
 use models::flat::{self, Entry};
 use models::kernels::Dropout;
 use models::names::from_bytes;
-use models::networks::{Init, Tokenizer, TokenizerConfig};
+use models::networks::{Init, Tokenizer, TokenizerConfig, UNIT};
 use models::quantizer::{Pass, look_up};
 use motion::dataset::{denormalise, normalise};
-use protocol::stage::{DataFormat, Positions, TokenizerNetwork};
-use protocol::{ArtifactKind, Digest, Manifest, Seed};
+use protocol::stage::{DataFormat, TokenizerNetwork};
+use protocol::{ArtifactKind, Digest, Manifest};
 use serde::{Deserialize, Serialize};
 
 use super::weights;
 use crate::artifacts::{self, Draft, HostTensor, MODEL_FILE, Tensors, to_meta, word};
 use crate::context::{AttemptContext, ContextError, StageError};
-
-/// Number of levels of every published tokenizer; each halves the frames.
-const LEVELS: usize = 2;
-const STRIDE: usize = 2;
 
 /// Meta of an artifact of kind `tokenizer`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -47,15 +44,7 @@ pub struct TokenizerMeta {
 impl TokenizerMeta {
     /// The networks' size.
     pub fn config(&self) -> TokenizerConfig {
-        TokenizerConfig {
-            features: self.features,
-            dim: self.code_dim,
-            width: self.network.width,
-            levels: LEVELS,
-            stride: STRIDE,
-            depth: self.network.depth,
-            growth: self.network.growth,
-        }
+        TokenizerConfig { features: self.features, dim: self.code_dim, network: self.network.clone() }
     }
 
     /// Names and shapes of the codebooks in the file.
@@ -98,7 +87,7 @@ impl TrainedTokenizer {
     /// Creates a tokenizer from its meta and weights.
     pub fn load(meta: TokenizerMeta, weights: &[u8], device: &Device) -> Result<Self, StageError> {
         let device = device.clone().inner();
-        let fresh = Tokenizer::new(&meta.config(), &mut Init::new(Seed(0), "blank", Positions::Uniform, &device));
+        let fresh = Tokenizer::new(&meta.config(), &mut Init::blank(&device));
         let entries: Vec<Entry> = flat::layout(&fresh).into_iter().chain(meta.books()).collect();
         let mut all = from_bytes(&entries, weights, "")
             .map_err(|error| StageError::Context(ContextError::Corrupt(format!("the tokenizer's weights: {error}"))))?;
@@ -114,7 +103,7 @@ impl TrainedTokenizer {
 
     /// Number of frames per token.
     pub fn unit(&self) -> usize {
-        self.meta.config().unit()
+        UNIT
     }
 
     /// Codes of each codebook, `[K, d]`.
@@ -148,7 +137,7 @@ impl TrainedTokenizer {
         let frames = rows.len() / self.meta.features;
         let rows = Tensor::<3>::from_data(TensorData::new(rows, [1, frames, self.meta.features]), &self.device);
         let encoded = self.network.encode(rows, &mut Dropout::off());
-        let encoded = encoded.into_data().try_into_vec::<f32>().expect("networks compute in f32");
+        let encoded = host(encoded);
         let book = |layer: usize, _: &[f32]| std::borrow::Cow::<[f32]>::Borrowed(self.books[layer].as_slice());
         let quantizers = self.meta.quantizers;
         Pass::through(encoded, self.meta.code_dim, quantizers, &self.device, book, None).ids(quantizers)
@@ -164,11 +153,7 @@ impl TrainedTokenizer {
         let codes = self.codes(ids);
         let tokens = codes.len() / self.meta.code_dim;
         let codes = Tensor::<3>::from_data(TensorData::new(codes, [1, tokens, self.meta.code_dim]), &self.device);
-        self.network
-            .decode(codes, &mut Dropout::off())
-            .into_data()
-            .try_into_vec::<f32>()
-            .expect("networks compute in f32")
+        host(self.network.decode(codes, &mut Dropout::off()))
     }
 }
 

@@ -4,20 +4,15 @@
 //! the sizes before anything is allocated.
 
 use models::networks::{
-    DenoiserConfig, GptConfig, MdmConfig, MmmConfig, MomaskConfig, Projection, TimeFeatures, TrajectoryConfig,
-    UnetConfig, VaeConfig,
+    DenoiserConfig, GptConfig, LEVELS, MdmConfig, MmmConfig, MomaskConfig, Projection, STRIDE, TimeFeatures,
+    TokenizerConfig, TrajectoryConfig, UnetConfig, VaeConfig,
 };
 use protocol::limits;
-use protocol::stage::{Network, Positions};
+use protocol::stage::{LatentShape, MdmNetwork, Network, TokenNetwork, TokenizerNetwork};
 
 use super::{Found, Place};
 use crate::context::StageError;
 
-/// Added to variances in layer norms.
-const NORM_EPS: f64 = 1e-5;
-/// Number of levels of every published tokenizer; each halves the frames.
-const LEVELS: usize = 2;
-const STRIDE: usize = 2;
 /// Largest number of a network's consecutive blocks, and of codebooks.
 const BLOCKS: usize = 255;
 /// Largest number of residual blocks in a tokenizer's level.
@@ -69,22 +64,28 @@ fn listed(found: &Found<'_>, stem: &str) -> Result<usize> {
     Ok(count)
 }
 
-/// Width, layers and feed-forward width of a skip stack.
-fn stack(found: &Found<'_>, stem: &str) -> Result<(usize, usize, usize)> {
-    Ok((
-        found.dim(&format!("{stem}.middle_block.self_attn.in_proj_weight"), 1)?,
-        2 * listed(found, &format!("{stem}.input_blocks"))? + 1,
-        found.dim(&format!("{stem}.middle_block.linear1.weight"), 0)?,
-    ))
+/// Size of a skip stack.
+fn stack(found: &Found<'_>, stem: &str, heads: usize) -> Result<Network> {
+    let width = found.dim(&format!("{stem}.middle_block.self_attn.in_proj_weight"), 1)?;
+    Ok(Network {
+        width,
+        layers: 2 * listed(found, &format!("{stem}.input_blocks"))? + 1,
+        heads: divided(found, width, heads)?,
+        feed_forward: found.dim(&format!("{stem}.middle_block.linear1.weight"), 0)?,
+        ..Network::default()
+    })
 }
 
-/// Width, layers and feed-forward width of consecutive blocks.
-fn blocks(found: &Found<'_>, stem: &str) -> Result<(usize, usize, usize)> {
-    Ok((
-        found.dim(&format!("{stem}.0.self_attn.in_proj_weight"), 1)?,
-        listed(found, stem)?,
-        found.dim(&format!("{stem}.0.linear1.weight"), 0)?,
-    ))
+/// Size of consecutive blocks, without an embedding.
+fn blocks(found: &Found<'_>, stem: &str, heads: usize) -> Result<TokenNetwork> {
+    let width = found.dim(&format!("{stem}.0.self_attn.in_proj_weight"), 1)?;
+    Ok(TokenNetwork {
+        width,
+        layers: listed(found, stem)?,
+        heads: divided(found, width, heads)?,
+        feed_forward: found.dim(&format!("{stem}.0.linear1.weight"), 0)?,
+        ..TokenNetwork::default()
+    })
 }
 
 /// Refuses heads that do not divide the width.
@@ -105,7 +106,7 @@ fn without(found: &Found<'_>, name: &str, axis: usize, less: usize) -> Result<us
 
 /// Sizes of a VAE.
 pub fn of_vae(found: &Found<'_>, heads: usize) -> Result<VaeConfig> {
-    let (width, layers, feed_forward) = stack(found, "encoder")?;
+    let network = stack(found, "encoder", heads)?;
     let projection = found.has("latent_pre.weight");
     let tokens = found.dim("global_motion_token", 0)?;
     // Each latent token has a mean and a deviation, and they precede the frames.
@@ -117,21 +118,19 @@ pub fn of_vae(found: &Found<'_>, heads: usize) -> Result<VaeConfig> {
     }
     Ok(VaeConfig {
         features: found.dim("skel_embedding.weight", 1)?,
-        tokens: tokens / 2,
-        dim: if projection { found.dim("latent_pre.weight", 0)? } else { width },
-        width,
-        layers,
-        heads: divided(found, width, heads)?,
-        feed_forward,
+        latent: LatentShape {
+            tokens: tokens / 2,
+            dim: if projection { found.dim("latent_pre.weight", 0)? } else { network.width },
+        },
+        network,
         projection,
-        norm_eps: NORM_EPS,
     })
 }
 
 /// Sizes of a denoiser of latents of `tokens` tokens, which the weights do not show. The ReLU is assumed without
 /// projections.
 pub fn of_denoiser(found: &Found<'_>, tokens: usize, heads: usize) -> Result<DenoiserConfig> {
-    let (width, layers, feed_forward) = stack(found, "encoder")?;
+    let network = stack(found, "encoder", heads)?;
     let projection = found.has("latent_pre.weight");
     let guided = "time_embedding.cond_proj.weight";
     let guidance_dim = if found.has(guided) { Some(found.dim(guided, 1)?) } else { None };
@@ -146,24 +145,22 @@ pub fn of_denoiser(found: &Found<'_>, tokens: usize, heads: usize) -> Result<Den
         }
     }
     Ok(DenoiserConfig {
-        tokens,
-        dim: if projection { found.dim("latent_pre.weight", 1)? } else { width },
-        width,
-        layers,
-        heads: divided(found, width, heads)?,
-        feed_forward,
+        latent: LatentShape {
+            tokens,
+            dim: if projection { found.dim("latent_pre.weight", 1)? } else { network.width },
+        },
+        network,
         text_dim: found.dim("emb_proj.1.weight", 1)?,
         time_dim,
         text_relu: !projection,
         projection,
         guidance_dim,
-        norm_eps: NORM_EPS,
     })
 }
 
 /// Sizes of a trajectory encoder.
 pub fn of_trajectory(found: &Found<'_>, heads: usize) -> Result<TrajectoryConfig> {
-    let (width, layers, feed_forward) = stack(found, "encoder")?;
+    let network = stack(found, "encoder", heads)?;
     let projection = found.has("latent_proj.weight");
     let coordinates = found.dim("skel_embedding.weight", 1)?;
     if !coordinates.is_multiple_of(3) {
@@ -171,43 +168,30 @@ pub fn of_trajectory(found: &Found<'_>, heads: usize) -> Result<TrajectoryConfig
     }
     Ok(TrajectoryConfig {
         joints: coordinates / 3,
-        tokens: found.dim("global_motion_token", 0)?,
-        dim: if projection { found.dim("latent_proj.weight", 0)? } else { width },
-        width,
-        layers,
-        heads: divided(found, width, heads)?,
-        feed_forward,
+        latent: LatentShape {
+            tokens: found.dim("global_motion_token", 0)?,
+            dim: if projection { found.dim("latent_proj.weight", 0)? } else { network.width },
+        },
+        network,
         projection,
-        norm_eps: NORM_EPS,
     })
 }
 
-/// Sizes in the form of settings.
-pub fn network(width: usize, layers: usize, heads: usize, feed_forward: usize) -> Network {
-    Network { width, layers, heads, feed_forward, positions: Positions::Uniform, ..Network::default() }
-}
-
 /// A tokenizer's networks and codebooks.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct TokenizerSizes {
-    /// Features per frame.
-    pub features: usize,
+    /// Size of the networks.
+    pub config: TokenizerConfig,
     /// Number of codes of a codebook.
     pub codes: usize,
-    /// Width of a code.
-    pub code_dim: usize,
     /// Number of codebooks.
     pub quantizers: usize,
-    /// Width of the convolutions.
-    pub width: usize,
-    /// Number of residual blocks per level.
-    pub depth: usize,
     /// True if the only codebook has no number in its name (T2M-GPT, MMM).
     pub single: bool,
 }
 
-/// Sizes of a tokenizer.
-pub fn of_tokenizer(found: &Found<'_>) -> Result<TokenizerSizes> {
+/// Sizes of a tokenizer; its weights do not show the growth of its dilations.
+pub fn of_tokenizer(found: &Found<'_>, growth: usize) -> Result<TokenizerSizes> {
     let single = found.has("quantizer.codebook");
     let first = if single { "quantizer.codebook" } else { "quantizer.layers.0.codebook" };
     let depth = found.count("encoder.model.2.1.model");
@@ -222,27 +206,29 @@ pub fn of_tokenizer(found: &Found<'_>) -> Result<TokenizerSizes> {
         );
     }
     Ok(TokenizerSizes {
-        features: found.dim("encoder.model.0.weight", 1)?,
+        config: TokenizerConfig {
+            features: found.dim("encoder.model.0.weight", 1)?,
+            dim: found.dim(first, 1)?,
+            network: TokenizerNetwork {
+                width: found.dim("encoder.model.0.weight", 0)?,
+                depth,
+                growth,
+                ..TokenizerNetwork::default()
+            },
+        },
         codes: found.dim(first, 0)?,
-        code_dim: found.dim(first, 1)?,
         quantizers: if single { 1 } else { books },
-        width: found.dim("encoder.model.0.weight", 0)?,
-        depth,
         single,
     })
 }
 
 /// Sizes of MoMask's masked transformer; its weights do not show the number of codebooks.
 pub fn of_masked(found: &Found<'_>, quantizers: usize, heads: usize) -> Result<MomaskConfig> {
-    let (width, layers, feed_forward) = blocks(found, "seqTransEncoder.layers")?;
+    let network = blocks(found, "seqTransEncoder.layers", heads)?;
     Ok(MomaskConfig {
         codes: without(found, "token_emb.weight", 0, 2)?,
         quantizers,
-        dim: found.dim("token_emb.weight", 1)?,
-        width,
-        layers,
-        heads: divided(found, width, heads)?,
-        feed_forward,
+        network: TokenNetwork { embedding: found.dim("token_emb.weight", 1)?, ..network },
         text_dim: found.dim("cond_emb.weight", 1)?,
     })
 }
@@ -254,7 +240,7 @@ pub fn of_residual(found: &Found<'_>, heads: usize) -> Result<MomaskConfig> {
             found.refuse("its output tables differ from its input tables; published residual transformers share them")
         );
     }
-    let (width, layers, feed_forward) = blocks(found, "seqTransEncoder.layers")?;
+    let network = blocks(found, "seqTransEncoder.layers", heads)?;
     let quantizers = found.dim("quant_emb.weight", 1)?;
     if quantizers < 3 {
         return Err(found.refuse(format!("it has {quantizers} codebooks; expected at least 3")));
@@ -262,11 +248,7 @@ pub fn of_residual(found: &Found<'_>, heads: usize) -> Result<MomaskConfig> {
     Ok(MomaskConfig {
         codes: without(found, "token_embed_weight_", 1, 1)?,
         quantizers,
-        dim: found.dim("token_embed_weight_", 2)?,
-        width,
-        layers,
-        heads: divided(found, width, heads)?,
-        feed_forward,
+        network: TokenNetwork { embedding: found.dim("token_embed_weight_", 2)?, ..network },
         text_dim: found.dim("cond_emb.weight", 1)?,
     })
 }
@@ -282,13 +264,13 @@ fn positions(found: &Found<'_>, longest: usize) -> Result<usize> {
     Ok(block)
 }
 
-/// Feed-forward width as a multiple of the width.
-fn rate(found: &Found<'_>, name: &str, width: usize) -> Result<usize> {
+/// Feed-forward width, a multiple of the width.
+fn multiple(found: &Found<'_>, name: &str, width: usize) -> Result<usize> {
     let wide = found.dim(name, 0)?;
     if !wide.is_multiple_of(width) {
         return Err(found.refuse(format!("`{name}` has {wide} rows; expected a multiple of the width, {width}")));
     }
-    Ok(wide / width)
+    Ok(wide)
 }
 
 /// Sizes of T2M-GPT's transformer; `longest` tokens if the file has no table of positions.
@@ -296,12 +278,15 @@ pub fn of_gpt(found: &Found<'_>, longest: usize, heads: usize) -> Result<GptConf
     let width = found.dim("trans_base.blocks.0.attn.key.weight", 0)?;
     Ok(GptConfig {
         codes: without(found, "trans_base.tok_emb.weight", 0, 2)?,
-        width,
-        heads: divided(found, width, heads)?,
-        layers: listed(found, "trans_base.blocks")?,
+        network: TokenNetwork {
+            width,
+            layers: listed(found, "trans_base.blocks")?,
+            heads: divided(found, width, heads)?,
+            feed_forward: multiple(found, "trans_base.blocks.0.mlp.0.weight", width)?,
+            ..TokenNetwork::default()
+        },
         block: positions(found, longest)?,
         text_dim: found.dim("trans_base.cond_emb.weight", 1)?,
-        rate: rate(found, "trans_base.blocks.0.mlp.0.weight", width)?,
     })
 }
 
@@ -312,30 +297,29 @@ pub fn of_mmm(found: &Found<'_>, longest: usize, heads: usize) -> Result<MmmConf
     Ok(MmmConfig {
         codes: found.dim("trans_head.head.weight", 0)?,
         dim: found.dim("trans_base.learn_tok_emb.weight", 1)?,
-        width,
-        heads: divided(found, width, heads)?,
-        layers,
-        local: listed(found, "trans_base.cross_att")?.min(layers),
+        network: TokenNetwork {
+            width,
+            layers,
+            heads: divided(found, width, heads)?,
+            feed_forward: multiple(found, "trans_head.blocks.0.mlp.0.weight", width)?,
+            word_blocks: listed(found, "trans_base.cross_att")?.min(layers),
+            ..TokenNetwork::default()
+        },
         block: positions(found, longest)?,
         text_dim: found.dim("trans_base.cond_emb.weight", 1)?,
-        rate: rate(found, "trans_head.blocks.0.mlp.0.weight", width)?,
     })
 }
 
 /// Sizes of MDM's transformer.
 pub fn of_mdm(found: &Found<'_>, heads: usize) -> Result<MdmConfig> {
-    let (width, layers, feed_forward) = blocks(found, "seqTransEncoder.layers")?;
+    let TokenNetwork { width, layers, heads, feed_forward, .. } = blocks(found, "seqTransEncoder.layers", heads)?;
     if !width.is_multiple_of(2) {
         return Err(found.refuse(format!("its width is {width}; expected an even number")));
     }
     Ok(MdmConfig {
         features: found.dim("input_process.poseEmbedding.weight", 1)?,
-        width,
-        layers,
-        heads: divided(found, width, heads)?,
-        feed_forward,
+        network: MdmNetwork { width, layers, heads, feed_forward, ..MdmNetwork::default() },
         text_dim: found.dim("embed_text.weight", 1)?,
-        norm_eps: NORM_EPS,
     })
 }
 

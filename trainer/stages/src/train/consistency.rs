@@ -14,8 +14,8 @@ use models::kernels::Dropout;
 use models::losses;
 use models::networks::{Denoiser, Init, guidance_embedding};
 use protocol::artifact::Role;
-use protocol::stage::{Distance, Distillation, Family, Positions};
-use protocol::{ArtifactKind, Digest, Manifest, Seed};
+use protocol::stage::{Distance, Distillation, Family};
+use protocol::{ArtifactKind, Digest, Manifest};
 use serde_json::json;
 
 use super::data::latents::{self, LatentData, LatentSlice};
@@ -84,7 +84,7 @@ impl Distiller {
         let device = cx.device();
         let blank = |guidance: Option<usize>, device: &Device| {
             let config = models::networks::DenoiserConfig { guidance_dim: guidance, ..teacher_meta.config() };
-            Denoiser::new(&config, &mut Init::new(Seed(0), "blank", Positions::Uniform, device))
+            Denoiser::new(&config, &mut Init::blank(device))
         };
         let teacher = weights::load(blank(None, &device), &*blobs, &manifest, "the teacher")?;
         let tracked = device.clone().autodiff();

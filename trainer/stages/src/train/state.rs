@@ -6,14 +6,11 @@ use burn::tensor::Device;
 use bytemuck::{cast_slice, cast_slice_mut};
 use checkpoint::{Blob, BlobError};
 use models::flat::Entry;
+use motion::tensor_header::{self, Header};
 use safetensors::Dtype;
-use safetensors::tensor::{Metadata, TensorInfo};
 
 use super::buffers::{BufferPlan, Buffers};
 use super::group::{Group, GroupPlan};
-
-/// The largest header of a saved state that is read; ours have some hundred bytes.
-pub(super) const HEADER_BYTES: u64 = 1 << 20;
 
 /// A saved state was not loaded.
 #[derive(Debug, thiserror::Error)]
@@ -96,22 +93,10 @@ impl TrainState {
     /// `NAME.v`, `NAME.average`, and `buffer.NAME`, in the order and with the alignment of the `safetensors` crate.
     /// [`Self::saved`] writes the values after it.
     fn header(&self) -> Vec<u8> {
-        let mut end = 0;
-        let mut info = |dtype, shape: usize, bytes: usize| {
-            let begin = end;
-            end += bytes;
-            TensorInfo { dtype, shape: vec![shape], data_offsets: (begin, end) }
-        };
-        let mut tensors = vec![("step".to_owned(), info(Dtype::I64, 1, 8))];
+        let step = ("step".to_owned(), Dtype::I64, vec![1]);
         let all = self.values();
-        tensors.extend(
-            all.iter()
-                .map(|(name, values)| (name.clone(), info(Dtype::F32, values.len(), size_of_val(values.as_slice())))),
-        );
-        let metadata = Metadata::new(None, tensors).expect("flat buffers one after the other");
-        let mut json = serde_json::to_vec(&metadata).expect("names and numbers");
-        json.resize(json.len().next_multiple_of(8), b' ');
-        [&(json.len() as u64).to_le_bytes()[..], &json].concat()
+        let values = all.iter().map(|(name, values)| (name.clone(), Dtype::F32, vec![values.len()]));
+        tensor_header::header(std::iter::once(step).chain(values))
     }
 
     /// Calls `save` with the bytes of a saved state in pieces. Nearly all pieces borrow the buffers: a large state is
@@ -132,25 +117,9 @@ impl TrainState {
     /// state is then unusable.
     pub fn restore(&mut self, saved: &dyn Blob) -> Result<(), RestoreError> {
         let wrong = |text: String| RestoreError::Wrong(text);
-        let mut length = [0; 8];
-        if saved.bytes() < 8 {
-            return Err(wrong(format!("the file has {} bytes; expected at least 8", saved.bytes())));
-        }
-        saved.read_at(0, &mut length)?;
-        let length = u64::from_le_bytes(length);
-        if length > HEADER_BYTES || length > saved.bytes() - 8 {
-            return Err(wrong(format!("the header declares {length} bytes, but the file has {} bytes", saved.bytes())));
-        }
-        let mut json = vec![0; usize::try_from(length).unwrap_or_default()];
-        saved.read_at(8, &mut json)?;
-        let metadata: Metadata = serde_json::from_slice(&json).map_err(|e| wrong(e.to_string()))?;
-        let end = metadata.data_len();
-        if end as u64 != saved.bytes() - 8 - length {
-            return Err(wrong(format!(
-                "the header declares tensors of {end} bytes, but the file has {} bytes of data",
-                saved.bytes() - 8 - length
-            )));
-        }
+        let header = Header::read(saved.bytes(), &mut |offset, out| saved.read_at(offset, out))?;
+        let header = header.map_err(|what| wrong(format!("the file {what}")))?;
+        let metadata = &header.metadata;
         let place = |name: &str, dtype: Dtype, values: usize| {
             let info = metadata.info(name).ok_or_else(|| {
                 let mut there: Vec<String> = metadata.tensors().into_keys().collect();
@@ -163,7 +132,7 @@ impl TrainState {
                     info.dtype, info.shape
                 )));
             }
-            Ok(8 + length + info.data_offsets.0 as u64)
+            Ok(header.place(info))
         };
 
         let mut step = [0; 8];

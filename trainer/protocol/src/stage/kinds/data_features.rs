@@ -39,10 +39,10 @@ pub struct DataFeatures {
     /// Division of clips into splits.
     pub splits: Splits,
     /// Share of the validation clips, for `source`.
-    #[schemars(range(min = 0.0, max = 1.0), extend("x-unit" = "of the clips"))]
+    #[schemars(range(min = 0.0), extend("exclusiveMaximum" = 1.0, "x-unit" = "of the clips"))]
     pub val: f64,
     /// Share of the test clips, for `source`.
-    #[schemars(range(min = 0.0, max = 1.0), extend("x-unit" = "of the clips"))]
+    #[schemars(range(min = 0.0), extend("exclusiveMaximum" = 1.0, "x-unit" = "of the clips"))]
     pub test: f64,
     /// Leaves out broken files and reports them; otherwise they fail the stage.
     pub skip_broken: bool,
@@ -137,8 +137,6 @@ impl StageSpec for DataFeatures {
         if self.path.trim().is_empty() {
             p.add("path", "`path` is missing; set it to the folder with the recordings", "");
         }
-        p.fraction("val", self.val, true);
-        p.fraction("test", self.test, true);
         if (0.0..1.0).contains(&self.val) && (0.0..1.0).contains(&self.test) && self.val + self.test >= 1.0 {
             p.add("test", "`val` and `test` leave no training clips; expected a sum below 1", "");
         }
@@ -146,7 +144,6 @@ impl StageSpec for DataFeatures {
             let help = "set it to a `.npy` file with 21 offsets or lengths";
             p.add("target", "`target` is missing; the uniform skeleton of KIT-ML is not public", help);
         }
-        p.shards(self.shards);
     }
 
     fn format(&self) -> Option<DataFormat> {

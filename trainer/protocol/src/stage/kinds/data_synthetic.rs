@@ -14,10 +14,10 @@ pub struct DataSynthetic {
     #[schemars(range(min = 1, max = 100_000), extend("x-unit" = "clips"))]
     pub clips: usize,
     /// Share of the validation clips.
-    #[schemars(range(min = 0.0, max = 1.0), extend("x-unit" = "of the clips"))]
+    #[schemars(range(min = 0.0), extend("exclusiveMaximum" = 1.0, "x-unit" = "of the clips"))]
     pub val: f64,
     /// Share of the test clips.
-    #[schemars(range(min = 0.0, max = 1.0), extend("x-unit" = "of the clips"))]
+    #[schemars(range(min = 0.0), extend("exclusiveMaximum" = 1.0, "x-unit" = "of the clips"))]
     pub test: f64,
     /// Adds a mirrored twin of every clip.
     pub mirror: bool,
@@ -39,9 +39,6 @@ impl StageSpec for DataSynthetic {
     }
 
     fn check(&self, p: &mut Problems) {
-        p.positive("clips", self.clips);
-        p.fraction("val", self.val, true);
-        p.fraction("test", self.test, true);
         if (0.0..1.0).contains(&self.val) && (0.0..1.0).contains(&self.test) && self.val + self.test >= 1.0 {
             p.add("test", "`val` and `test` leave no training clips; expected a sum below 1", "");
         }

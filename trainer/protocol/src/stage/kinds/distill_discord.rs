@@ -9,9 +9,6 @@ use crate::stage::{
 };
 use crate::{ArtifactKind, Steps};
 
-/// Frames per token.
-const UNIT: usize = 4;
-
 /// `distill.discord`: a flow decoder with fewer evaluations of its network, which is faster by the same factor. All
 /// settings are our choice.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -42,7 +39,7 @@ pub struct DistillDiscord {
     #[schemars(range(min = 0.0, max = 1e6))]
     pub huber_c: f64,
     /// Decay of the target network.
-    #[schemars(range(min = 0.0, max = 1.0))]
+    #[schemars(range(min = 0.0), extend("exclusiveMaximum" = 1.0))]
     pub ema: f64,
     /// Stage or version, such as `discord@prod`, whose flow decoder supplies initial weights where shapes fit; empty
     /// starts from the teacher's weights.
@@ -92,16 +89,10 @@ impl StageSpec for DistillDiscord {
     }
 
     fn check(&self, p: &mut Problems) {
-        p.positive("intervals", self.intervals);
-        p.positive("solver_steps", self.solver_steps);
-        if self.window < UNIT || !self.window.is_multiple_of(UNIT) {
-            let message = format!("`window` is {}; expected a multiple of {UNIT}", self.window);
-            p.add("window", message, "a token stands for 4 frames");
-        }
+        p.whole_tokens("window", self.window);
         if self.distance == Distance::Huber {
             p.above_zero("huber_c", self.huber_c);
         }
-        p.fraction("ema", self.ema, true);
         self.training.check(p);
     }
 

@@ -22,7 +22,7 @@ pub struct DistillPcm {
     /// AdamW constants of the discriminator.
     pub discriminator_optimizer: Optimizer,
     /// Slope below zero of the discriminator's leaky ReLUs, 0.01 in the image repository.
-    #[schemars(range(min = 0.0, max = 1.0))]
+    #[schemars(range(min = 0.0), extend("exclusiveMaximum" = 1.0))]
     pub discriminator_slope: f64,
     /// Updates student and discriminator in alternate steps, as in the image repository; otherwise both in every step.
     /// The learning rate of each counts its own updates.
@@ -59,7 +59,6 @@ impl StageSpec for DistillPcm {
 
     fn check(&self, p: &mut Problems) {
         self.distillation.check(p);
-        p.positive("phases", self.phases);
         if let Some(grid) = self.distillation.grid()
             && self.phases > grid
         {
@@ -67,10 +66,6 @@ impl StageSpec for DistillPcm {
             let message = format!("`phases` is {phases}, but the grid of `skip` {skip} has only {grid} points");
             p.add("phases", message, "use fewer phases or a smaller `skip`");
         }
-        p.not_negative("adversarial", self.adversarial);
-        p.not_negative("discriminator_lr", self.discriminator_lr);
-        p.fraction("discriminator_slope", self.discriminator_slope, true);
-        self.discriminator_optimizer.check(p, "discriminator_optimizer");
         if self.alternate && self.adversarial == 0.0 {
             let message = "`alternate` is true, but without `adversarial` there is no discriminator to alternate with";
             p.add("alternate", message, "remove `alternate`, or set `adversarial`");

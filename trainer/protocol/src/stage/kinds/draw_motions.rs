@@ -73,7 +73,6 @@ impl StageSpec for DrawMotions {
         if self.sentences.is_empty() {
             p.add("sentences", "there are no sentences", "such as `sentences: [a person walks in a circle]`");
         }
-        p.positive("count", self.count);
         let motions = self.sentences.len().saturating_mul(self.count);
         if motions > MOTIONS {
             let message = format!("{motions} motions; expected at most {MOTIONS}");
@@ -85,7 +84,6 @@ impl StageSpec for DrawMotions {
         if self.path.len() > POSITIONS {
             p.add("path", format!("{} positions; expected at most {POSITIONS}", self.path.len()), "leave some out");
         }
-        p.not_negative("seconds", self.seconds);
         if self.guidance != -1.0 {
             p.not_negative("guidance", self.guidance);
         }

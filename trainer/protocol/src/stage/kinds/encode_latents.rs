@@ -4,7 +4,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::ArtifactKind;
-use crate::stage::{Augment, Output, Problems, Ref, Shape, StageSpec};
+use crate::stage::{Augment, Output, Ref, Shape, StageSpec};
 
 /// `encode.latents`: posteriors of random crops, computed once.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -42,12 +42,6 @@ impl StageSpec for EncodeLatents {
             Ref::stage("dataset", &mut self.dataset, ArtifactKind::Dataset),
             Ref::stage("vae", &mut self.vae, ArtifactKind::Vae),
         ]
-    }
-
-    fn check(&self, p: &mut Problems) {
-        p.positive("crops", self.crops);
-        self.augment.check(p);
-        p.shards(self.shards);
     }
 
     fn shards(&self) -> usize {

@@ -7,9 +7,6 @@ use serde::{Deserialize, Serialize};
 use crate::ArtifactKind;
 use crate::stage::{Neighbours, Output, Problems, Ref, Shape, StageSpec};
 
-/// Frames per token.
-const UNIT: usize = 4;
-
 /// `encode.tokens`: token ids of all clips.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
@@ -46,11 +43,7 @@ impl StageSpec for EncodeTokens {
     }
 
     fn check(&self, p: &mut Problems) {
-        if !self.padded.is_multiple_of(UNIT) {
-            let message = format!("`padded` is {}; expected a multiple of {UNIT}, or 0", self.padded);
-            p.add("padded", message, "a token stands for 4 frames");
-        }
-        p.shards(self.shards);
+        p.whole_tokens("padded", self.padded);
     }
 
     fn check_neighbours(&self, stages: &Neighbours<'_>, p: &mut Problems) {

@@ -31,7 +31,7 @@ pub struct EvaluateControl {
     #[schemars(inner(range(min = 1, max = 10_000)), extend("x-unit" = "frames"))]
     pub frames: Vec<usize>,
     /// Distance in metres beyond which a target is missed.
-    #[schemars(range(min = 0.0, max = 1e3), extend("x-unit" = "metres"))]
+    #[schemars(range(max = 1e3), extend("exclusiveMinimum" = 0.0, "x-unit" = "metres"))]
     pub threshold: f64,
     /// Factor on the ControlNet's residuals and on the changes by feedback.
     #[schemars(range(min = 0.0, max = 1e3))]
@@ -109,14 +109,7 @@ impl StageSpec for EvaluateControl {
                 p.add(&format!("percent[{i}]"), message, "");
             }
         }
-        if self.frames.contains(&0) {
-            p.add("frames", "`frames` has 0; expected at least 1", "");
-        }
-        p.above_zero("threshold", self.threshold);
-        p.not_negative("scale", self.scale);
         self.sampler.check(p);
-        p.positive("repeats", self.repeats);
-        p.shards(self.shards);
         let densities = self.percent.len() + self.frames.len();
         p.product(
             "joints",

@@ -76,11 +76,7 @@ impl StageSpec for EvaluateLatentFid {
 
     fn check(&self, p: &mut Problems) {
         self.sampler.check(p);
-        p.positive("repeats", self.repeats);
-        p.positive("samples", self.samples);
-        p.positive("components", self.components);
         p.product("samples", &[("repeats", self.repeats), ("samples", self.samples)], 1_000);
-        p.shards(self.shards);
     }
 
     fn check_neighbours(&self, stages: &Neighbours<'_>, p: &mut Problems) {

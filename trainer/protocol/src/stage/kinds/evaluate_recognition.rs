@@ -114,7 +114,6 @@ impl StageSpec for EvaluateRecognition {
             }
         }
         self.sampler.check(p);
-        p.positive("motions", self.motions);
         if self.split == Split::Train {
             p.add("split", "the classifier is trained on the split `train`", "use `val`, `test` or `all`");
         }

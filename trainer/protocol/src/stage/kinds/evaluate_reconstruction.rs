@@ -73,7 +73,6 @@ impl StageSpec for EvaluateReconstruction {
             let message = format!("`decoder_steps` is {}, but `decoder` is missing", self.decoder_steps);
             p.add("decoder_steps", message, "set `decoder` to the stage of a flow decoder");
         }
-        p.shards(self.shards);
     }
 
     fn check_neighbours(&self, stages: &Neighbours<'_>, p: &mut Problems) {

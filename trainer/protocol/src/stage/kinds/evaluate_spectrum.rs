@@ -60,9 +60,7 @@ impl StageSpec for EvaluateSpectrum {
             let message = format!("`bands` is {:?}; expected frequencies in hertz in ascending order", self.bands);
             p.add("bands", message, "for example [0.5, 1, 2, 4]");
         }
-        self.bands.iter().for_each(|band| p.above_zero("bands", *band));
         self.sampler.check(p);
-        p.positive("motions", self.motions);
     }
 
     fn check_neighbours(&self, stages: &Neighbours<'_>, p: &mut Problems) {

@@ -168,7 +168,6 @@ impl StageSpec for EvaluateT2m {
             let message = "`perturbed` changes the captions of a model, but no model is measured";
             p.add("perturbed", message, "remove it");
         }
-        p.positive("repeats", self.repeats);
         if self.pools.is_empty() {
             p.add(
                 "pools",
@@ -179,7 +178,6 @@ impl StageSpec for EvaluateT2m {
         if let Some((i, pool)) = self.pools.iter().enumerate().find(|(i, pool)| self.pools[..*i].contains(pool)) {
             p.add("pools", format!("`pools` has {pool} twice; remove entry {}", i + 1), "");
         }
-        p.shards(self.shards);
         let MultiModality { captions, samples, pairs } = self.multimodality;
         p.product(
             "multimodality.samples",

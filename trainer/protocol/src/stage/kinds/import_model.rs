@@ -5,7 +5,6 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::ArtifactKind;
-use crate::stage::features::check_frames;
 use crate::stage::{
     ControlHints, DataFormat, Family, FlowSolver, Neighbours, Output, Problems, Ref, Shape, Solver, StageSpec,
 };
@@ -292,17 +291,8 @@ impl StageSpec for ImportModel {
             let message = format!("`residual` is set, but `{}` has only one file", part.name());
             p.add("residual", message, "remove it");
         }
-        let (low, high) = self.guidance;
-        if !(low >= 0.0 && low <= high && high.is_finite()) {
-            let message =
-                format!("`guidance` is [{low}, {high}]; expected numbers of 0 or more, the smaller one first");
-            p.add("guidance", message, "published: [5, 15]");
-        }
-        if self.skip == 0 || !1000usize.is_multiple_of(self.skip) {
-            let message = format!("`skip` is {}; expected a divisor of the 1000 timesteps", self.skip);
-            p.add("skip", message, "published: 100 (v2) and 20 (v1)");
-        }
-        check_frames(p, self.max_frames);
+        p.ascending("guidance", self.guidance);
+        p.divides_timesteps("skip", self.skip, "published: 100 (v2) and 20 (v1)");
     }
 
     fn check_neighbours(&self, stages: &Neighbours<'_>, p: &mut Problems) {

@@ -169,7 +169,6 @@ impl StageSpec for TextEmbed {
             let message = format!("`max_tokens` is {}; expected 0, or at least 3", self.max_tokens);
             p.add("max_tokens", message, "");
         }
-        p.shards(self.shards);
     }
 
     fn shards(&self) -> usize {

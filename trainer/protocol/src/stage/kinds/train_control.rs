@@ -163,26 +163,12 @@ impl StageSpec for TrainControl {
 
     fn check(&self, p: &mut Problems) {
         self.hints.check(p);
-        p.not_negative("loss.latent", self.loss.latent);
-        p.not_negative("loss.tokens", self.loss.tokens);
-        p.not_negative("loss.control", self.loss.control);
         if self.loss.latent == 0.0 && self.loss.control == 0.0 {
             p.add("loss.latent", "`loss.latent` and `loss.control` are both 0, so nothing is learned", "");
         }
-        let (low, high) = self.guidance;
-        if !(low >= 0.0 && low <= high && high.is_finite()) {
-            let message =
-                format!("`guidance` is [{low}, {high}]; expected numbers of 0 or more, the smaller one first");
-            p.add("guidance", message, "published: [5, 15] (v2) and [6.5, 6.5] (v1)");
-        }
-        if self.skip == 0 || !1000usize.is_multiple_of(self.skip) {
-            let message = format!("`skip` is {}; expected a divisor of the 1000 timesteps", self.skip);
-            p.add("skip", message, "published: 100 (v2) and 1 (v1)");
-        }
+        p.ascending("guidance", self.guidance);
+        p.divides_timesteps("skip", self.skip, "published: 100 (v2) and 1 (v1)");
         self.network.check(p);
-        p.positive("embedding", self.embedding);
-        p.not_negative("trajectory_lr", self.trajectory_lr);
-        p.not_negative("feedback.lr", self.feedback.lr);
         self.training.check(p);
     }
 

@@ -8,10 +8,7 @@ use crate::stage::{
     Batch, Decay, FlowSolver, ImportModel, ImportedPart, Neighbours, Optimizer, Output, Problems, Ref, Shape,
     StageSpec, Training, WindowsOf,
 };
-use crate::{ArtifactKind, Steps, limits};
-
-/// Frames per token.
-const UNIT: usize = 4;
+use crate::{ArtifactKind, Steps};
 
 /// Network that predicts the velocity.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
@@ -109,7 +106,7 @@ pub struct FlowNetwork {
     /// Conversion of tokens into the condition, for a U-Net.
     pub projection: FlowProjection,
     /// Probability of dropout.
-    #[schemars(range(min = 0.0, max = 1.0))]
+    #[schemars(range(min = 0.0), extend("exclusiveMaximum" = 1.0))]
     pub dropout: f64,
 }
 
@@ -156,7 +153,7 @@ pub struct TrainDiscord {
     #[schemars(range(min = 1, max = 1_000), extend("x-unit" = "steps"))]
     pub solver_steps: usize,
     /// Decay of the moving average of the weights, which is the result; 0 uses the weights themselves.
-    #[schemars(range(min = 0.0, max = 1.0))]
+    #[schemars(range(min = 0.0), extend("exclusiveMaximum" = 1.0))]
     pub ema: f64,
     /// Stage or version, such as `discord@prod`, whose flow decoder supplies initial weights where shapes fit; empty
     /// starts from random ones.
@@ -214,36 +211,16 @@ impl StageSpec for TrainDiscord {
     }
 
     fn check(&self, p: &mut Problems) {
-        let FlowNetwork { width, condition, layers, heads, dropout, .. } = self.network;
-        for (field, value) in [
-            ("network.width", width),
-            ("network.condition", condition),
-            ("network.layers", layers),
-            ("network.heads", heads),
-            ("solver_steps", self.solver_steps),
-        ] {
-            p.positive(field, value);
-        }
+        let FlowNetwork { width, layers, heads, .. } = self.network;
         // The second level has twice the width, and blocks on the way up read the same again.
-        let parameters = width.saturating_mul(width).saturating_mul(100).saturating_mul(layers);
-        if parameters > limits::PARAMETERS {
-            let message =
-                format!("its layers have up to {parameters} parameters; expected at most {}", limits::PARAMETERS);
-            p.add("network", message, "use fewer or narrower layers");
-        }
+        p.parameters(width.saturating_mul(width).saturating_mul(100).saturating_mul(layers));
         if width < 4 || !width.is_multiple_of(2) {
             p.add("network.width", format!("`network.width` is {width}; expected an even number of at least 4"), "");
         }
-        if self.backbone == FlowBackbone::Dit && heads > 0 && !width.is_multiple_of(heads) {
-            let message = format!("`network.heads` is {heads}, which does not divide `network.width` ({width})");
-            p.add("network.heads", message, "");
+        if self.backbone == FlowBackbone::Dit {
+            p.equal_heads("network.heads", heads, "network.width", width);
         }
-        p.fraction("network.dropout", dropout, true);
-        if self.window < UNIT || !self.window.is_multiple_of(UNIT) {
-            let message = format!("`window` is {}; expected a multiple of {UNIT}", self.window);
-            p.add("window", message, "a token stands for 4 frames");
-        }
-        p.fraction("ema", self.ema, true);
+        p.whole_tokens("window", self.window);
         self.training.check(p);
     }
 

@@ -25,7 +25,7 @@ pub struct EvaluatorNetwork {
     #[schemars(range(min = 1, max = 4_096), extend("x-unit" = "channels"))]
     pub embedding: usize,
     /// Probability of dropout in the movement encoder, first phase only.
-    #[schemars(range(min = 0.0, max = 1.0))]
+    #[schemars(range(min = 0.0), extend("exclusiveMaximum" = 1.0))]
     pub dropout: f64,
 }
 
@@ -39,11 +39,11 @@ impl Default for EvaluatorNetwork {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct MovementPhase {
-    /// Share of the steps in this phase.
-    #[schemars(range(min = 0.0, max = 1.0), extend("x-unit" = "of the steps"))]
+    /// Share of the steps in this phase, which comes first.
+    #[schemars(extend("exclusiveMinimum" = 0.0, "exclusiveMaximum" = 1.0, "x-unit" = "of the steps"))]
     pub until: f64,
-    /// Frames of an example.
-    #[schemars(range(min = 1, max = 10_000), extend("x-unit" = "frames"))]
+    /// Frames of an example, at least two movements of four.
+    #[schemars(range(min = 8, max = 10_000), extend("x-unit" = "frames"))]
     pub window: usize,
     /// Examples per update; 0 uses `batch.global`.
     #[schemars(range(min = 0, max = 65_536), extend("x-unit" = "examples"))]
@@ -76,13 +76,13 @@ pub struct TrainEvaluator {
     /// Settings of the first phase.
     pub movement: MovementPhase,
     /// Divisor of the deviations of root and contacts, which increases their weight. The published files have about 25.
-    #[schemars(range(min = 0.0, max = 1e6))]
+    #[schemars(range(max = 1e6), extend("exclusiveMinimum" = 0.0))]
     pub emphasis: f64,
     /// Distance up to which captions and motions that do not match are separated.
-    #[schemars(range(min = 0.0, max = 1e6))]
+    #[schemars(range(max = 1e6), extend("exclusiveMinimum" = 0.0))]
     pub margin: f64,
     /// Decay of the moving average of the weights, which is the result; 0 uses the weights themselves.
-    #[schemars(range(min = 0.0, max = 1.0))]
+    #[schemars(range(min = 0.0), extend("exclusiveMaximum" = 1.0))]
     pub ema: f64,
     /// Stage or version, such as `motionlcm@prod`, whose evaluator supplies initial weights where shapes fit; empty
     /// starts from random ones.
@@ -132,19 +132,7 @@ impl StageSpec for TrainEvaluator {
     }
 
     fn check(&self, p: &mut Problems) {
-        for (field, value) in [
-            ("network.movement", self.network.movement),
-            ("network.motion", self.network.motion),
-            ("network.text", self.network.text),
-            ("network.embedding", self.network.embedding),
-        ] {
-            p.positive(field, value);
-        }
-        p.fraction("network.dropout", self.network.dropout, true);
         self.movement.check(p, self.training.batch.slices);
-        p.above_zero("emphasis", self.emphasis);
-        p.above_zero("margin", self.margin);
-        p.fraction("ema", self.ema, true);
         self.training.check(p);
         let batch = self.training.batch;
         if batch.slices > 0 && batch.global / batch.slices < 2 {
@@ -170,22 +158,8 @@ impl StageSpec for TrainEvaluator {
 
 impl MovementPhase {
     fn check(&self, p: &mut Problems, slices: usize) {
-        p.fraction("movement.until", self.until, true);
-        if self.until == 0.0 {
-            p.add(
-                "movement.until",
-                "`movement.until` is 0; expected a number above 0, because the movement phase comes first",
-                "",
-            );
-        }
-        if self.window < 8 {
-            let message = format!("`movement.window` is {}; expected at least 8 frames", self.window);
-            p.add("movement.window", message, "a window needs two movements of four frames each");
-        }
         if self.batch != 0 {
             Batch { global: self.batch, slices }.check_division(p, "movement.batch");
         }
-        p.not_negative("movement.sparsity", self.sparsity);
-        p.not_negative("movement.smoothness", self.smoothness);
     }
 }

@@ -16,7 +16,7 @@ pub struct TrainLength {
     /// Stage that gives the caption embeddings.
     pub text: String,
     /// Probability of dropout before the second and the third layer.
-    #[schemars(range(min = 0.0, max = 1.0))]
+    #[schemars(range(min = 0.0), extend("exclusiveMaximum" = 1.0))]
     pub dropout: f64,
     /// Stage or version, such as `motionlcm@prod`, whose length estimator supplies initial weights where shapes fit;
     /// empty starts from random ones.
@@ -64,7 +64,6 @@ impl StageSpec for TrainLength {
     }
 
     fn check(&self, p: &mut Problems) {
-        p.fraction("dropout", self.dropout, true);
         self.training.check(p);
     }
 

@@ -3,7 +3,7 @@
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::stage::features::{check_diffusion, check_frames, check_parameters};
+use crate::stage::network::transformer_parameters;
 use crate::stage::{
     Batch, Decay, Diffusion, Family, FrequencyLosses, Neighbours, NoiseSchedule, Optimizer, Output, Prediction,
     Problems, Ref, Shape, Solver, StageSpec, Training,
@@ -27,7 +27,7 @@ pub struct MdmNetwork {
     #[schemars(range(min = 1, max = 65_536), extend("x-unit" = "channels"))]
     pub feed_forward: usize,
     /// Probability of dropout.
-    #[schemars(range(min = 0.0, max = 1.0))]
+    #[schemars(range(min = 0.0), extend("exclusiveMaximum" = 1.0))]
     pub dropout: f64,
 }
 
@@ -39,26 +39,12 @@ impl Default for MdmNetwork {
 
 impl MdmNetwork {
     fn check(&self, p: &mut Problems) {
-        for (field, value) in [
-            ("network.width", self.width),
-            ("network.layers", self.layers),
-            ("network.heads", self.heads),
-            ("network.feed_forward", self.feed_forward),
-        ] {
-            p.positive(field, value);
-        }
-        if self.heads > 0 && !self.width.is_multiple_of(self.heads) {
-            let message =
-                format!("`network.heads` is {}, which does not divide `network.width` ({})", self.heads, self.width);
-            p.add("network.heads", message, "");
-        }
+        p.equal_heads("network.heads", self.heads, "network.width", self.width);
         if !self.width.is_multiple_of(2) {
             let message = format!("`network.width` is {}; expected an even number", self.width);
             p.add("network.width", message, "positions are pairs of a sine and a cosine");
         }
-        let wide = self.width.saturating_mul(4).saturating_add(self.feed_forward.saturating_mul(2));
-        check_parameters(p, self.width.saturating_mul(wide).saturating_mul(self.layers));
-        p.fraction("network.dropout", self.dropout, true);
+        p.parameters(transformer_parameters(self.width, self.feed_forward, self.layers));
     }
 }
 
@@ -90,7 +76,7 @@ pub struct TrainMdm {
     pub guidance_dropout: f64,
     /// Decay of the moving average of the weights, which is the result; 0 uses the weights themselves. The authors'
     /// model of 50 steps has 0.9999.
-    #[schemars(range(min = 0.0, max = 1.0))]
+    #[schemars(range(min = 0.0), extend("exclusiveMaximum" = 1.0))]
     pub ema: f64,
     /// Losses of Free-T2M.
     pub losses: FrequencyLosses,
@@ -148,10 +134,7 @@ impl StageSpec for TrainMdm {
 
     fn check(&self, p: &mut Problems) {
         self.network.check(p);
-        check_diffusion(p, &self.diffusion, self.timesteps);
-        check_frames(p, self.max_frames);
-        p.fraction("guidance_dropout", self.guidance_dropout, false);
-        p.fraction("ema", self.ema, true);
+        self.diffusion.check_for_features(p);
         self.losses.check(p);
         self.training.check(p);
     }

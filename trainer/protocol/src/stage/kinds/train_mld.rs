@@ -32,7 +32,7 @@ pub struct TrainMld {
     #[schemars(range(min = 0.0, max = 1.0), extend("x-unit" = "of the captions"))]
     pub guidance_dropout: f64,
     /// Decay of the moving average of the weights, which is the result; 0 uses the weights themselves.
-    #[schemars(range(min = 0.0, max = 1.0))]
+    #[schemars(range(min = 0.0), extend("exclusiveMaximum" = 1.0))]
     pub ema: f64,
     /// Losses of Free-T2M, on motions from the frozen decoder.
     pub losses: FrequencyLosses,
@@ -83,10 +83,7 @@ impl StageSpec for TrainMld {
     fn check(&self, p: &mut Problems) {
         self.network.check(p);
         self.diffusion.check(p);
-        p.fraction("guidance_dropout", self.guidance_dropout, false);
-        p.fraction("ema", self.ema, true);
         self.losses.check(p);
-        p.fraction("decoded", self.decoded, false);
         if self.losses.any() && self.decoded == 0.0 {
             p.add("decoded", "`decoded` is 0, so `losses` have no effect", "set it above 0");
         }

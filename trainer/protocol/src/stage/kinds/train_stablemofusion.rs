@@ -3,7 +3,7 @@
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::stage::features::{check_diffusion, check_frames, check_parameters};
+use crate::stage::network::transformer_parameters;
 use crate::stage::{
     Batch, Decay, Diffusion, Family, FrequencyLosses, Neighbours, NoiseSchedule, Optimizer, Output, Prediction,
     Problems, Ref, Shape, Solver, StageSpec, Training,
@@ -43,7 +43,7 @@ pub struct StableMoFusionNetwork {
     /// Uses softmax cross-attention instead of the linear one.
     pub full_attention: bool,
     /// Probability of dropout.
-    #[schemars(range(min = 0.0, max = 1.0))]
+    #[schemars(range(min = 0.0), extend("exclusiveMaximum" = 1.0))]
     pub dropout: f64,
 }
 
@@ -65,16 +65,6 @@ impl Default for StableMoFusionNetwork {
 
 impl StableMoFusionNetwork {
     fn check(&self, p: &mut Problems) {
-        for (field, value) in [
-            ("network.width", self.width),
-            ("network.time", self.time),
-            ("network.text", self.text),
-            ("network.text_layers", self.text_layers),
-            ("network.text_heads", self.text_heads),
-            ("network.text_feed_forward", self.text_feed_forward),
-        ] {
-            p.positive(field, value);
-        }
         if !(1..=LEVELS).contains(&self.multipliers.len()) || self.multipliers.contains(&0) {
             let message =
                 format!("`network.multipliers` is {:?}; expected 1 to {LEVELS} numbers above 0", self.multipliers);
@@ -89,11 +79,7 @@ impl StableMoFusionNetwork {
                 break;
             }
         }
-        if self.text_heads > 0 && !self.text.is_multiple_of(self.text_heads) {
-            let (heads, text) = (self.text_heads, self.text);
-            let message = format!("`network.text_heads` is {heads}, which does not divide `network.text` ({text})");
-            p.add("network.text_heads", message, "");
-        }
+        p.equal_heads("network.text_heads", self.text_heads, "network.text", self.text);
         if !self.time.is_multiple_of(2) {
             let message = format!("`network.time` is {}; expected an even number", self.time);
             p.add("network.time", message, "the timestep becomes pairs of a sine and a cosine");
@@ -101,10 +87,8 @@ impl StableMoFusionNetwork {
         // Two convolutions of five taps per block, five blocks per level.
         let widest = self.multipliers.iter().max().map_or(0, |m| self.width.saturating_mul(*m));
         let block = widest.saturating_mul(widest.saturating_mul(10));
-        check_parameters(p, block.saturating_mul(5 * self.multipliers.len().min(LEVELS)));
-        let wide = self.text.saturating_mul(4).saturating_add(self.text_feed_forward.saturating_mul(2));
-        check_parameters(p, self.text.saturating_mul(wide).saturating_mul(self.text_layers));
-        p.fraction("network.dropout", self.dropout, true);
+        p.parameters(block.saturating_mul(5 * self.multipliers.len().min(LEVELS)));
+        p.parameters(transformer_parameters(self.text, self.text_feed_forward, self.text_layers));
     }
 }
 
@@ -137,7 +121,7 @@ pub struct TrainStableMoFusion {
     pub guidance_dropout: f64,
     /// Decay of the moving average of the weights, which is the result; 0 uses the weights themselves. As published,
     /// the weight of an update is `1 - ema` times `106667 ema_every / steps`, at most 1.
-    #[schemars(range(min = 0.0, max = 1.0))]
+    #[schemars(range(min = 0.0), extend("exclusiveMaximum" = 1.0))]
     pub ema: f64,
     /// Updates of the weights per update of the average; the first of these copies.
     #[schemars(range(min = 1, max = 1_000_000), extend("x-unit" = "updates"))]
@@ -209,14 +193,7 @@ impl StageSpec for TrainStableMoFusion {
 
     fn check(&self, p: &mut Problems) {
         self.network.check(p);
-        check_diffusion(p, &self.diffusion, self.timesteps);
-        check_frames(p, self.max_frames);
-        p.above_zero("feature_bias", self.feature_bias);
-        p.fraction("guidance_dropout", self.guidance_dropout, false);
-        p.fraction("ema", self.ema, true);
-        if self.ema_every == 0 {
-            p.add("ema_every", "`ema_every` is 0; expected at least 1", "write `ema: 0` for no average");
-        }
+        self.diffusion.check_for_features(p);
         self.losses.check(p);
         self.training.check(p);
     }

@@ -6,8 +6,6 @@ use serde::{Deserialize, Serialize};
 use crate::stage::{Batch, Decay, Optimizer, Output, Problems, Ref, Shape, StageSpec, Training};
 use crate::{ArtifactKind, Steps, limits};
 
-/// Frames per token.
-const UNIT: usize = 4;
 /// Weights per residual block and its connections, divided by the square of the width: an upper bound, not a count.
 const SQUARES_A_BLOCK: usize = 16;
 
@@ -25,7 +23,7 @@ pub struct TokenizerNetwork {
     #[schemars(range(min = 1, max = 16))]
     pub growth: usize,
     /// Probability of dropout in the blocks: 0.2 in MoMask, none in T2M-GPT and MMM.
-    #[schemars(range(min = 0.0, max = 1.0))]
+    #[schemars(range(min = 0.0), extend("exclusiveMaximum" = 1.0))]
     pub dropout: f64,
 }
 
@@ -102,7 +100,7 @@ pub struct TrainTokenizer {
     /// Codes that are replaced by rows of the batch.
     pub resets: Resets,
     /// Decay of the codebooks' running statistics in each update ("mu" upstream).
-    #[schemars(range(min = 0.0, max = 1.0))]
+    #[schemars(range(min = 0.0), extend("exclusiveMaximum" = 1.0))]
     pub codebook_decay: f64,
     /// Divisor of the deviations of root and contact features, which increases their weight. 25 in MoMask, T2M-GPT and
     /// MMM, whose code divides the stored deviations by 5 twice.
@@ -172,16 +170,6 @@ impl StageSpec for TrainTokenizer {
     }
 
     fn check(&self, p: &mut Problems) {
-        for (field, value) in [
-            ("codes", self.codes),
-            ("code_dim", self.code_dim),
-            ("quantizers", self.quantizers),
-            ("network.width", self.network.width),
-            ("network.depth", self.network.depth),
-            ("network.growth", self.network.growth),
-        ] {
-            p.positive(field, value);
-        }
         p.product(
             "codes",
             &[("codes", self.codes), ("code_dim", self.code_dim), ("quantizers", self.quantizers)],
@@ -189,32 +177,15 @@ impl StageSpec for TrainTokenizer {
         );
         let TokenizerNetwork { width, depth, growth, .. } = self.network;
         let squares = SQUARES_A_BLOCK.saturating_mul(depth.saturating_add(2));
-        let parameters = width.saturating_mul(width).saturating_mul(squares);
-        if parameters > limits::PARAMETERS {
-            let message =
-                format!("its convolutions have about {parameters} weights; expected at most {}", limits::PARAMETERS);
-            p.add("network", message, "use fewer or narrower blocks");
-        }
+        p.parameters(width.saturating_mul(width).saturating_mul(squares));
         let reach = u32::try_from(depth).ok().and_then(|depth| growth.checked_pow(depth));
         if reach.is_none_or(|reach| reach > 10_000) {
             let message =
                 format!("the largest dilation is `network.growth` to the power of `network.depth`, {growth}^{depth}");
             p.add("network.growth", message, "expected at most 10000 frames");
         }
-        p.above_zero("feature_bias", self.feature_bias);
-        p.fraction("network.dropout", self.network.dropout, true);
-        p.fraction("codebook_decay", self.codebook_decay, true);
-        p.fraction("quantize_dropout", self.quantize_dropout, false);
-        if self.window < UNIT || !self.window.is_multiple_of(UNIT) {
-            let message = format!("`window` is {}; expected a multiple of {UNIT}", self.window);
-            p.add("window", message, "a token stands for 4 frames");
-        }
-        let TokenizerLoss { feature, position, commitment } = self.loss;
-        for (field, weight) in [("loss.feature", feature), ("loss.position", position), ("loss.commitment", commitment)]
-        {
-            p.not_negative(field, weight);
-        }
-        if feature == 0.0 && position == 0.0 {
+        p.whole_tokens("window", self.window);
+        if self.loss.feature == 0.0 && self.loss.position == 0.0 {
             p.add("loss.feature", "`loss.feature` and `loss.position` are both 0, so nothing is reconstructed", "");
         }
         self.training.check(p);

@@ -4,10 +4,11 @@
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use crate::stage::network::transformer_parameters;
 use crate::stage::{
     Batch, Decay, Family, Neighbours, Optimizer, Output, Problems, Ref, Shape, StageSpec, TrainTokenizer, Training,
 };
-use crate::{ArtifactKind, Steps, limits};
+use crate::{ArtifactKind, Steps};
 
 /// Method of generating tokens.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
@@ -41,7 +42,7 @@ pub struct TokenNetwork {
     #[schemars(range(min = 1, max = 65_536), extend("x-unit" = "channels"))]
     pub feed_forward: usize,
     /// Probability of dropout.
-    #[schemars(range(min = 0.0, max = 1.0))]
+    #[schemars(range(min = 0.0), extend("exclusiveMaximum" = 1.0))]
     pub dropout: f64,
     /// Width of MoMask's token embeddings. T2M-GPT's have the network's width, MMM's are the tokenizer's codes.
     #[schemars(range(min = 1, max = 4_096), extend("x-unit" = "channels"))]
@@ -59,27 +60,8 @@ impl Default for TokenNetwork {
 
 impl TokenNetwork {
     fn check(&self, p: &mut Problems) {
-        for (field, value) in [
-            ("network.width", self.width),
-            ("network.layers", self.layers),
-            ("network.heads", self.heads),
-            ("network.feed_forward", self.feed_forward),
-            ("network.embedding", self.embedding),
-        ] {
-            p.positive(field, value);
-        }
-        let wide = self.width.saturating_mul(4).saturating_add(self.feed_forward.saturating_mul(2));
-        let parameters = self.width.saturating_mul(wide).saturating_mul(self.layers).saturating_mul(2);
-        if parameters > limits::PARAMETERS {
-            let message = format!("its layers have {parameters} parameters; expected at most {}", limits::PARAMETERS);
-            p.add("network", message, "use fewer or narrower layers");
-        }
-        if self.heads > 0 && !self.width.is_multiple_of(self.heads) {
-            let (heads, width) = (self.heads, self.width);
-            let message = format!("`network.heads` is {heads}, which does not divide `network.width` ({width})");
-            p.add("network.heads", message, "");
-        }
-        p.fraction("network.dropout", self.dropout, true);
+        p.parameters(transformer_parameters(self.width, self.feed_forward, self.layers).saturating_mul(2));
+        p.equal_heads("network.heads", self.heads, "network.width", self.width);
     }
 }
 
@@ -165,13 +147,10 @@ impl StageSpec for TrainTokens {
 
     fn check(&self, p: &mut Problems) {
         self.network.check(p);
-        p.positive("longest", self.longest);
-        p.fraction("corruption", self.corruption, false);
         if self.generator == TokenGenerator::Masked && self.guidance_dropout > 0.5 {
             let message = format!("`guidance_dropout` is {}; expected at most 0.5", self.guidance_dropout);
             p.add("guidance_dropout", message, "the residual transformer uses twice this value");
         }
-        p.fraction("guidance_dropout", self.guidance_dropout, false);
         let TokenNetwork { width, layers, feed_forward, word_blocks, .. } = self.network;
         if self.generator != TokenGenerator::Masked && width > 0 && !feed_forward.is_multiple_of(width) {
             let message =

@@ -83,7 +83,7 @@ pub struct TrainVae {
     /// on new ones.
     pub augment: Augment,
     /// Decay of the moving average of the weights, which is the result; 0 uses the weights themselves.
-    #[schemars(range(min = 0.0, max = 1.0))]
+    #[schemars(range(min = 0.0), extend("exclusiveMaximum" = 1.0))]
     pub ema: f64,
     /// Stage or version, such as `motionlcm@prod`, whose VAE supplies initial weights where shapes fit; empty starts
     /// from random ones.
@@ -128,8 +128,6 @@ impl StageSpec for TrainVae {
         self.network.check(p);
         self.loss.check(p);
         self.windows.check(p, self.training.batch.slices);
-        self.augment.check(p);
-        p.fraction("ema", self.ema, true);
         self.training.check(p);
     }
 
@@ -161,25 +159,14 @@ impl StageSpec for TrainVae {
 
 impl VaeLoss {
     fn check(&self, p: &mut Problems) {
-        for (field, weight) in [
-            ("loss.feature", self.feature),
-            ("loss.joint", self.joint),
-            ("loss.velocity", self.velocity),
-            ("loss.feet", self.feet),
-            ("loss.kl", self.kl),
-        ] {
-            p.not_negative(field, weight);
-        }
         if self.feature == 0.0 && self.joint == 0.0 {
             p.add("loss.feature", "`loss.feature` and `loss.joint` are both 0, so nothing is reconstructed", "");
         }
-        p.fraction("loss.joint_from", self.joint_from, false);
     }
 }
 
 impl Windows {
     fn check(&self, p: &mut Problems, slices: usize) {
-        p.fraction("windows.until", self.until, false);
         if self.until > 0.0 {
             if self.min < 4 {
                 p.add("windows.min", format!("`windows.min` is {}; expected at least 4 frames", self.min), "");

@@ -24,8 +24,8 @@ use models::tokens::autoregressive::{self, Draw};
 use models::tokens::masked::{self, Canvas, Sampling};
 use models::tokens::{mmm, residual};
 use protocol::artifact::Role;
-use protocol::stage::{DataFormat, Family, Positions, Sampler, TokenNetwork};
-use protocol::{ArtifactKind, Manifest, Seed};
+use protocol::stage::{DataFormat, Family, Sampler, TokenNetwork};
+use protocol::{ArtifactKind, Manifest};
 use serde::{Deserialize, Serialize};
 
 use super::words::{codebook, with_words};
@@ -73,15 +73,7 @@ pub(crate) struct GeneratorMeta {
 impl GeneratorMeta {
     /// Size of an autoregressive network, with one place for the caption and one for the end.
     pub(crate) fn gpt(&self) -> GptConfig {
-        GptConfig {
-            codes: self.codes,
-            width: self.network.width,
-            heads: self.network.heads,
-            layers: self.network.layers,
-            block: self.longest + 2,
-            text_dim: self.text_dim,
-            rate: self.network.feed_forward / self.network.width,
-        }
+        GptConfig { codes: self.codes, network: self.network.clone(), block: self.longest + 2, text_dim: self.text_dim }
     }
 
     /// Size of each of a masked generator's networks.
@@ -89,28 +81,19 @@ impl GeneratorMeta {
         MomaskConfig {
             codes: self.codes,
             quantizers: self.quantizers,
-            dim: self.network.embedding,
-            width: self.network.width,
-            layers: self.network.layers,
-            heads: self.network.heads,
-            feed_forward: self.network.feed_forward,
+            network: self.network.clone(),
             text_dim: self.text_dim,
         }
     }
 
     /// Size of MMM's network, on codes of width `code_dim`.
     pub(crate) fn mmm(&self, code_dim: usize) -> MmmConfig {
-        let TokenNetwork { width, layers, heads, feed_forward, word_blocks, .. } = self.network;
         MmmConfig {
             codes: self.codes,
             dim: code_dim,
-            width,
-            heads,
-            layers,
-            local: word_blocks,
+            network: self.network.clone(),
             block: self.longest + 2,
             text_dim: self.text_dim,
-            rate: feed_forward / width,
         }
     }
 
@@ -204,7 +187,7 @@ fn network(
     device: &Device,
 ) -> Result<Network, StageError> {
     let what = "the token generator's weights";
-    let mut init = Init::new(Seed(0), "blank", Positions::Uniform, device);
+    let mut init = Init::blank(device);
     match meta.family {
         Family::Autoregressive => {
             let network = weights::load(Gpt::new(&meta.gpt(), &mut init), blobs, manifest, what)?;

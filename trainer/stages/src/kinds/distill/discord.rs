@@ -12,8 +12,8 @@ use models::flow::{Solver, between, to_data};
 use models::kernels::Dropout;
 use models::losses;
 use models::networks::Init;
-use protocol::stage::{Distance, DistillDiscord, Positions};
-use protocol::{ArtifactKind, Seed};
+use protocol::ArtifactKind;
+use protocol::stage::{Distance, DistillDiscord};
 
 use crate::artifacts::{self, to_meta};
 use crate::context::{GangContext, Outcome, StageError};
@@ -91,7 +91,7 @@ impl Gang for DistillDiscord {
         let data = FlowData::read(cx, encoder, (self.window, self.windows_of), &self.training)?;
         let meta = FlowMeta { solver: FlowPath::Jumps, steps: self.solver_steps, ..teacher.meta().clone() };
         let tracked = cx.device().autodiff();
-        let mut student = meta.field(&mut Init::new(Seed(0), "blank", Positions::Uniform, &tracked));
+        let mut student = meta.field(&mut Init::blank(&tracked));
         let field = teacher.into_field();
         student.take(Values::Host(&field.params()));
         let mut start = WarmStart::find(cx, ArtifactKind::FlowDecoder)?;

@@ -15,8 +15,8 @@ use models::flat::layout;
 use models::names::from_bytes;
 use models::networks::{Evaluator, EvaluatorConfig, Init};
 use motion::{DataPath, Skeleton, npy};
-use protocol::stage::{ImportEvaluator, Positions};
-use protocol::{Digest, Seed, excerpt, limits};
+use protocol::stage::ImportEvaluator;
+use protocol::{Digest, excerpt, limits};
 use pytorch_reader::{DType, PytorchReader};
 use safetensors::SafeTensors;
 
@@ -76,7 +76,7 @@ fn import(settings: &ImportEvaluator, cx: &mut dyn AttemptContext, given: &Given
         )));
     }
     let device = cx.device().inner();
-    let blank = Evaluator::new(&config, &mut Init::new(Seed(0), "blank", Positions::Uniform, &device));
+    let blank = Evaluator::new(&config, &mut Init::blank(&device));
     let entries = layout(&blank);
     let flat = from_bytes(&entries, &bytes, "").map_err(|e| refuse(e.to_string()))?;
     if let Some(bad) = flat.iter().position(|v| !v.is_finite()) {
@@ -243,6 +243,8 @@ mod tests {
 
     use models::flat;
     use models::names::to_bytes;
+    use protocol::Seed;
+    use protocol::stage::Positions;
 
     use super::*;
 

@@ -19,8 +19,7 @@ use motion::{DataPath, Skeleton, npy};
 use protocol::artifact::Role;
 use protocol::stage::{
     DataFormat, Diffusion, Family, FlowBackbone, FlowNetwork, FlowPrediction, FlowProjection, ImportModel,
-    ImportedPart, LatentShape, MdmNetwork, NoiseSchedule, Prediction, StageSpec, TextActivation, TokenNetwork,
-    TokenizerNetwork,
+    ImportedPart, NoiseSchedule, Prediction, StageSpec, TextActivation, TokenNetwork, TokenizerNetwork,
 };
 use protocol::{ArtifactKind, Digest, Manifest};
 use serde::Serialize;
@@ -38,6 +37,7 @@ use crate::parts::motion_networks::{Architecture, MotionDenoiserMeta};
 use crate::parts::networks::TIME_DIM;
 use crate::parts::tokenizer::TokenizerMeta;
 use crate::parts::{self, model_error, weights};
+use crate::published::sizes::TokenizerSizes;
 use crate::published::{Checkpoint, Found, Taken, sizes};
 use crate::train::data::latents;
 
@@ -265,11 +265,11 @@ impl Import<'_> {
         let meta = VaeMeta {
             format,
             features: config.features,
-            latent: LatentShape { tokens: config.tokens, dim: config.dim },
-            network: sizes::network(config.width, config.layers, config.heads, config.feed_forward),
+            latent: config.latent,
+            projection: departing(config.projection, config.latent.dim != config.network.width),
+            network: config.network,
             mean,
             std,
-            projection: departing(config.projection, config.dim != config.width),
         };
         let network = self.network(&found, |init| Vae::new(&meta.config(), init))?;
         Ok(cx.put_manifest(&part(cx, ArtifactKind::Vae, &meta, &[network])?)?)
@@ -290,8 +290,8 @@ impl Import<'_> {
             }
             _ => {}
         }
-        if config.dim != vae.latent.dim {
-            let (ours, theirs) = (config.dim, vae.latent);
+        if config.latent != vae.latent {
+            let (ours, theirs) = (config.latent.dim, vae.latent);
             return Err(found.refuse(format!(
                 "its latent tokens are {ours} wide, but the latents of `vae` are {}x{}; use the VAE that it was \
                  trained with",
@@ -304,7 +304,8 @@ impl Import<'_> {
         let meta = DenoiserMeta {
             family,
             latent: vae.latent,
-            network: sizes::network(config.width, config.layers, config.heads, config.feed_forward),
+            projection: departing(config.projection, config.latent.dim != config.network.width),
+            network: config.network,
             diffusion: Diffusion::default(),
             text_relu: match self.settings.text_activation {
                 TextActivation::Published => config.text_relu,
@@ -314,7 +315,6 @@ impl Import<'_> {
             guidance_dim: config.guidance_dim.unwrap_or_default(),
             text_dim: config.text_dim,
             fits: Parts::from([(Role::VAE, vae_digest), (Role::TEXT, text.digest())]),
-            projection: departing(config.projection, config.dim != config.width),
             time_dim: (config.time_dim != TIME_DIM).then_some(config.time_dim),
         };
         let network = self.network(&found, |init| Denoiser::new(&meta.config(), init))?;
@@ -351,10 +351,10 @@ impl Import<'_> {
             let (found, format) = (config.joints, word(&model.format));
             return Err(trajectory.refuse(format!("it expects {found} joints, but `{format}` has {joints}")));
         }
-        if (config.tokens, config.dim) != (base.latent.tokens, base.latent.dim) {
+        if config.latent != base.latent {
             return Err(trajectory.refuse(format!(
                 "its tokens are {}x{}, but the latents of `model` are {}x{}; use the model that it was trained with",
-                config.tokens, config.dim, base.latent.tokens, base.latent.dim
+                config.latent.tokens, config.latent.dim, base.latent.tokens, base.latent.dim
             )));
         }
         let (mean, std) = statistics(self.given.path("hint_statistics")?, JOINTS, 3 * joints)?;
@@ -362,11 +362,11 @@ impl Import<'_> {
             format: model.format,
             hints: self.settings.hints.clone(),
             embedding: control.dim("controlnet_cond_embedding.0.weight", 0)?,
-            network: sizes::network(config.width, config.layers, config.heads, config.feed_forward),
+            projection: departing(config.projection, config.latent.dim != config.network.width),
+            network: config.network,
             mean,
             std,
             fits: Parts::from([(Role::DENOISER, part.digest())]),
-            projection: departing(config.projection, config.dim != config.width),
             feedback: 0,
         };
         let control = self.network(&control, |init| meta.controlnet(&base, init))?.under(CONTROLNET_PREFIX);
@@ -379,9 +379,9 @@ impl Import<'_> {
 
     fn tokenizer(&mut self, cx: &mut dyn AttemptContext) -> Result<Digest, StageError> {
         let found = self.file.network(&sizes::TOKENIZER)?;
-        let found_sizes = sizes::of_tokenizer(&found)?;
-        let (format, mean, std) = self.statistics(cx, found_sizes.features, &found)?;
-        let (depth, growth) = (found_sizes.depth, self.settings.growth);
+        let TokenizerSizes { config, codes, quantizers, single } = sizes::of_tokenizer(&found, self.settings.growth)?;
+        let (format, mean, std) = self.statistics(cx, config.features, &found)?;
+        let TokenizerNetwork { depth, growth, .. } = config.network;
         let reach = u32::try_from(depth).ok().and_then(|depth| growth.checked_pow(depth));
         if reach.is_none_or(|reach| reach > REACH) {
             return Err(found.refuse(format!(
@@ -391,17 +391,17 @@ impl Import<'_> {
         }
         let meta = TokenizerMeta {
             format,
-            features: found_sizes.features,
-            codes: found_sizes.codes,
-            code_dim: found_sizes.code_dim,
-            quantizers: found_sizes.quantizers,
-            network: TokenizerNetwork { width: found_sizes.width, depth, growth, ..TokenizerNetwork::default() },
+            features: config.features,
+            codes,
+            code_dim: config.dim,
+            quantizers,
+            network: config.network,
             mean,
             std,
         };
         let network = Tokenizer::new(&meta.config(), &mut Init::shapes(&self.device));
         let entries: Vec<Entry> = layout(&network).into_iter().chain(meta.books()).collect();
-        let alias = |name: &str| match found_sizes.single && name == CODEBOOK.0 {
+        let alias = |name: &str| match single && name == CODEBOOK.0 {
             true => CODEBOOK.1.to_owned(),
             false => name.to_owned(),
         };
@@ -455,15 +455,8 @@ impl Import<'_> {
         Self::expect_codes(&found, config.codes, &tokenizer.2, true)?;
         let text = self.text(cx, &found, config.text_dim)?;
         let network = self.network(&found, |init| Gpt::new(&config, init))?;
-        let size = TokenNetwork {
-            width: config.width,
-            layers: config.layers,
-            heads: config.heads,
-            feed_forward: config.rate * config.width,
-            ..TokenNetwork::default()
-        };
         let lengths = (config.block - 2, config.text_dim);
-        self.generator(cx, (Family::Autoregressive, size), lengths, (tokenizer, text), &[network])
+        self.generator(cx, (Family::Autoregressive, config.network), lengths, (tokenizer, text), &[network])
     }
 
     fn mmm(&mut self, cx: &mut dyn AttemptContext) -> Result<Digest, StageError> {
@@ -480,16 +473,8 @@ impl Import<'_> {
         }
         let text = self.text(cx, &found, config.text_dim)?;
         let network = self.network(&found, |init| Mmm::new(&config, init))?;
-        let size = TokenNetwork {
-            width: config.width,
-            layers: config.layers,
-            heads: config.heads,
-            feed_forward: config.rate * config.width,
-            word_blocks: config.local,
-            ..TokenNetwork::default()
-        };
         let lengths = (config.block - 2, config.text_dim);
-        self.generator(cx, (Family::Mmm, size), lengths, (tokenizer, text), &[network])
+        self.generator(cx, (Family::Mmm, config.network), lengths, (tokenizer, text), &[network])
     }
 
     fn momask(&mut self, cx: &mut dyn AttemptContext) -> Result<Digest, StageError> {
@@ -511,10 +496,8 @@ impl Import<'_> {
             }
             _ => networks.push(self.above(cx, &config)?.under(RESIDUAL_PREFIX)),
         }
-        let MomaskConfig { dim, width, layers, heads, feed_forward, text_dim, .. } = config;
-        let size = TokenNetwork { width, layers, heads, feed_forward, embedding: dim, ..TokenNetwork::default() };
-        let lengths = (self.settings.longest, text_dim);
-        self.generator(cx, (Family::Masked, size), lengths, (tokenizer, text), &networks)
+        let lengths = (self.settings.longest, config.text_dim);
+        self.generator(cx, (Family::Masked, config.network), lengths, (tokenizer, text), &networks)
     }
 
     /// Reads MoMask's network of the layers above the first.
@@ -545,18 +528,11 @@ impl Import<'_> {
         let text = self.text(cx, &found, config.text_dim)?;
         let family =
             self.settings.family().ok_or_else(|| StageError::Fault("the MDM denoiser has no family".into()))?;
-        let size = MdmNetwork {
-            width: config.width,
-            layers: config.layers,
-            heads: config.heads,
-            feed_forward: config.feed_forward,
-            ..MdmNetwork::default()
-        };
         let diffusion =
             Diffusion { schedule: NoiseSchedule::Cosine, prediction: Prediction::Sample, ..Diffusion::default() };
         let meta = MotionDenoiserMeta {
             family,
-            architecture: Architecture::Mdm(size.clone()),
+            architecture: Architecture::Mdm(config.network.clone()),
             format,
             diffusion,
             mask_frames: self.settings.mask_frames,
@@ -566,7 +542,7 @@ impl Import<'_> {
             text_dim: config.text_dim,
             fits: Parts::from([(Role::TEXT, text.digest())]),
         };
-        let network = self.network(&found, |init| meta.mdm(&size, init))?;
+        let network = self.network(&found, |init| meta.mdm(&config.network, init))?;
         let denoiser = part(cx, ArtifactKind::Denoiser, &meta, &[network])?;
         let parts = BTreeMap::from([(Role::DENOISER, denoiser), (Role::TEXT, text)]);
         parts::publish_model(cx, FEATURE_DIFFUSION, meta.format, &parts)

@@ -29,10 +29,8 @@ use models::networks::{Control, Denoiser, Feedback, Init, TrajectoryEncoder, cop
 use motion::Skeleton;
 use motion::dataset::Dataset;
 use protocol::artifact::Role;
-use protocol::stage::{
-    ControlDistance, ControlFeedback, ControlMean, ControlSetting, Family, Positions, TrainControl, Training,
-};
-use protocol::{ArtifactKind, Digest, Manifest, Seed};
+use protocol::stage::{ControlDistance, ControlFeedback, ControlMean, ControlSetting, Family, TrainControl, Training};
+use protocol::{ArtifactKind, Digest, Manifest};
 
 use crate::artifacts::{self, DenoiserMeta, Draft, VaeMeta, to_meta};
 use crate::context::{AttemptContext, GangContext, Outcome, StageError};
@@ -422,7 +420,7 @@ impl Gang for TrainControl {
         };
         let device = cx.device();
         let tracked = device.clone().autodiff();
-        let blank = Denoiser::new(&base_meta.config(), &mut Init::new(Seed(0), "blank", Positions::Uniform, &device));
+        let blank = Denoiser::new(&base_meta.config(), &mut Init::blank(&device));
         let base = weights::load(blank, &*blobs, &denoiser, "the denoiser of `model`")?;
         let purpose = format!("{}/init", cx.task().name);
         let mut init = Init::new(cx.task().seed, &purpose, self.network.positions, &tracked);

@@ -317,10 +317,7 @@ impl Gang for TrainEvaluator {
             meta,
         };
         train(&mut objective, &self.training, cx)?.publish(|state| {
-            let blank = Evaluator::new(
-                &objective.meta.config,
-                &mut Init::new(Seed(0), "blank", Positions::Uniform, &plain.clone().inner()),
-            );
+            let blank = Evaluator::new(&objective.meta.config, &mut Init::blank(&plain.clone().inner()));
             let encoder = objective.frozen.num_params();
             let mut weights = state.result(0).to_vec();
             weights.extend_from_slice(state.result(1));

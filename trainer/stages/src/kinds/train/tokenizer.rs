@@ -16,6 +16,7 @@ use std::borrow::Cow;
 use std::rc::Rc;
 
 use burn::tensor::{Device, Tensor, TensorData};
+use models::device::host;
 use models::kernels::Dropout;
 use models::losses::{FrameWeights, Pointwise};
 use models::networks::{Init, Tokenizer};
@@ -175,10 +176,6 @@ impl VqObjective {
         }
         sums
     }
-}
-
-fn host(encoded: Tensor<3>) -> Vec<f32> {
-    encoded.into_data().try_into_vec::<f32>().expect("networks compute in f32")
 }
 
 fn noise(len: usize, draw: &mut Stream) -> Vec<f32> {

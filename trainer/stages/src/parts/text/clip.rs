@@ -6,7 +6,8 @@
 
 use std::sync::Arc;
 
-use burn::tensor::{Device, Tensor};
+use burn::tensor::Device;
+use models::device::host;
 use models::networks::{ClipText, ClipTextConfig, Init};
 use protocol::stage::ClipOutput;
 use text_models::Network;
@@ -60,8 +61,8 @@ impl TextEncoder for Clip {
             self.pooled.of(caption, || {
                 let states = self.tower.forward(&self.captions.ids(caption)?, 1, None);
                 Ok(match self.captions.meta.output {
-                    ClipOutput::Projected => values(states.projected_bc),
-                    ClipOutput::Pooled => values(states.pooled_bh),
+                    ClipOutput::Projected => host(states.projected_bc),
+                    ClipOutput::Pooled => host(states.pooled_bh),
                 })
             })
         };
@@ -72,13 +73,9 @@ impl TextEncoder for Clip {
         let one = |caption: &&str| {
             self.words.of(caption, || {
                 let ids = self.captions.padded(caption, self.positions)?;
-                Ok(values(self.tower.forward(&ids, 1, None).tokens_bth))
+                Ok(host(self.tower.forward(&ids, 1, None).tokens_bth))
             })
         };
         captions.iter().map(one).collect()
     }
-}
-
-fn values<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {
-    tensor.into_data().try_into_vec::<f32>().expect("networks compute in f32")
 }

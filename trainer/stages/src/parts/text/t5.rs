@@ -6,6 +6,7 @@
 use std::sync::Arc;
 
 use burn::tensor::{Device, Tensor};
+use models::device::host;
 use models::networks::{Init, Linear, T5Config, T5Encoder, mean_of_tokens, normalised};
 use text_models::{DENSE, Network};
 
@@ -85,18 +86,14 @@ impl TextEncoder for T5 {
                 if let Some(dense) = &self.dense {
                     vector = dense.forward(vector);
                 }
-                Ok(values(if self.normalise { normalised(vector) } else { vector }))
+                Ok(host(if self.normalise { normalised(vector) } else { vector }))
             })
         };
         Ok(captions.iter().map(one).collect::<Result<Vec<_>, _>>()?.concat())
     }
 
     fn tokens(&self, captions: &[&str]) -> Result<Vec<Vec<f32>>, StageError> {
-        let one = |caption: &&str| self.words.of(caption, || Ok(values(self.states(caption)?.0)));
+        let one = |caption: &&str| self.words.of(caption, || Ok(host(self.states(caption)?.0)));
         captions.iter().map(one).collect()
     }
-}
-
-fn values<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {
-    tensor.into_data().try_into_vec::<f32>().expect("networks compute in f32")
 }
