@@ -117,7 +117,7 @@ const CASES: &[(&str, &str, &str, &[&str])] = &[
     ("    lr: 1e-3", "    lr: \"0.1\"", "9:9", &["expected a number", "remove the quotes"]),
     ("    lr: 1e-3", "    lr: .inf", "9:9", &["finite number"]),
     ("    lr: 1e-3", "    lr: 1e999", "9:9", &["finite number"]),
-    ("    lr: 1e-3", "    lr: -1", "9:9", &["`lr` is -1; expected a number above 0"]),
+    ("    lr: 1e-3", "    lr: -1", "9:9", &["`lr` is -1.0; expected a number above 0"]),
     ("    lr: 1e-3", "    lr:", "9:", &["nothing; expected a number", "remove the key"]),
     ("steps: 10", "steps: 1.5k5", "8:12", &["whole number of steps"]),
     ("steps: 10", "steps: 0", "8:12", &["`steps` is 0"]),
