@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# What people come to the page for, in Chromium: at 360 x 640 by touch and at 1280 by keyboard alone, in both themes, over real runs.
+# Tasks of people on the page, in Chromium: at 360 x 640 by touch and at 1280 by keyboard alone, in both themes, over real runs.
 # Needs python3 with venv, packages of PyPI, Chromium, and `target/debug/trainer` or that of STRIDE_TRAINER.
 # STRIDE_SCREENSHOTS=FOLDER keeps what it shows. STRIDE_PAGE=trainer/page/static shows these files in place of those in the program.
 set -euo pipefail

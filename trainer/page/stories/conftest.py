@@ -184,7 +184,7 @@ class Hand:
         self.page.keyboard.type(text)
 
     def in_sight(self, target: Locator) -> bool:
-        """Whether all of it is on the screen without scrolling, and nothing lies over its middle."""
+        """True if all of it is on the screen without scrolling, and nothing lies over its middle."""
         target.wait_for()
         return bool(
             target.evaluate(

@@ -1,4 +1,4 @@
-"""What people come to the page for, and how many presses it takes them. The link that opens a view is the first press."""
+"""Tasks of people on the page, and the presses that they take. The link that opens a view is the first press."""
 
 from __future__ import annotations
 
