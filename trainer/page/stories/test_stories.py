@@ -47,6 +47,7 @@ def test_a_run_is_compared_with_the_one_before(hand: Hand) -> None:
 
 
 def test_a_version_is_promoted_with_a_reason(hand: Hand) -> None:
+    hand.world.server.model("walks").promote(1, to="prod", reason=f"before {hand.way}")
     hand.open("/models/walks")
     hand.press(hand.page.get_by_role("button", name="Promote", exact=True).first)
     expect(hand.page.locator("#promote-title")).to_be_visible()
