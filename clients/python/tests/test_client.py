@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 import stride
@@ -131,7 +132,8 @@ def test_a_version_draws_motions(server: stride.Server, pipeline: Path) -> None:
     page = html.unescape(shown.split('srcdoc="')[1].rsplit('"', 1)[0])
     assert page.startswith("<!DOCTYPE html>") and "a person walks" in page and "default-src 'none'" in page
     assert server.url not in shown, "a saved notebook needs no server"
-    assert motions[0]._repr_html_() is None and (motions * 2.0)._repr_html_() is None
+    parts: list[Any] = [motions[0], motions * 2.0]
+    assert [part._repr_html_() for part in parts] == [None, None]
     assert numpy.array_equal(version.generate("a person walks", seconds=2.0, seed=5), motions[2:3])
     with pytest.raises(stride.StrideError, match="60") as error:
         version.generate("a person walks", seconds=61.0)

@@ -16,7 +16,7 @@ MOST_BYTES = 400_000
 
 def cells(nbformat: Any) -> list[Any]:
     """Cells of the Python file: ``# %%`` begins one of code, ``# %% [markdown]`` one of comments."""
-    found = []
+    found: list[Any] = []
     for part in (EXAMPLES / f"{NAME}.py").read_text().split("# %%")[1:]:
         kind, _, text = part.partition("\n")
         if "markdown" in kind:
