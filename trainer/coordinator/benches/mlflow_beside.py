@@ -18,6 +18,7 @@ import statistics
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -74,6 +75,13 @@ class Stride:
         while not (found := self.poll()["assignments"]):
             time.sleep(0.1)
         self.grant, self.secret = found[0]["grant"], found[0]["secret"]
+        self.ended = threading.Event()
+        threading.Thread(target=self.live, daemon=True).start()
+
+    def live(self) -> None:
+        """Polls, so that the lease lasts."""
+        while not self.ended.wait(3):
+            self.poll()
 
     def start(self) -> None:
         self.log.write_text("")
@@ -223,6 +231,7 @@ def main() -> None:
         try:
             measure(ours, theirs)
         finally:
+            ours.ended.set()
             ours.stop()
             theirs.stop()
 
@@ -234,10 +243,8 @@ def measure(ours: Stride, theirs: MLflow) -> None:
     part = POINTS // ROUNDS // BATCH * BATCH
     writes: list[tuple[float, float]] = []
     for turn in range(ROUNDS):
-        ours.poll()
         writes.append((timed(lambda: ours.write(turn * part, part)), timed(lambda: theirs.write(turn * part, part))))
     for number in range(RUNS):
-        ours.poll()
         ours.add_run(number)
         theirs.add_run(number)
     for number in range(VERSIONS):
@@ -256,7 +263,6 @@ def measure(ours: Stride, theirs: MLflow) -> None:
         (f"{VERSIONS} versions of a model, ms", "versions"),
     ]:
         pairs = [(timed(getattr(ours, call)), timed(getattr(theirs, call))) for _ in range(ROUNDS)]
-        ours.poll()
         mine, other = (1000 * statistics.median(side) for side in zip(*pairs))
         print(f"{title:34}{mine:12.1f}{other:12.1f}{other / mine:8.1f}")
 

@@ -56,7 +56,6 @@ async def watch(stride: Stride, late: float) -> int:
 def train(stride: Stride, ends: threading.Event) -> None:
     step = 0
     while not ends.wait(1):
-        stride.poll()
         rows = [{"step": at, "key": "loss", "value": 1 / (1 + at)} for at in range(step, step + 20)]
         stride.call("POST", "/v1/metrics", {"grant": stride.grant, "rows": rows}, stride.secret)
         step += 20
@@ -85,6 +84,7 @@ def main() -> None:
             alone = spent / took
             spent, took, calls = measure(stride, CLIENTS)
         finally:
+            stride.ended.set()
             stride.stop()
         # On a busy machine the beats of clients take longer than a second; each beat counts as one.
         watched = alone + (spent - alone * took) / SECONDS
