@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import html
 import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 import stride
@@ -125,6 +127,13 @@ def test_a_version_draws_motions(server: stride.Server, pipeline: Path) -> None:
     motions = version.generate("a person walks", n=4, seconds=2.0, seed=3)
     assert (motions.dtype, motions.shape) == (numpy.float32, (4, 40, 22, 3))
     assert numpy.isfinite(motions).all()
+    shown = motions._repr_html_()
+    assert shown is not None and shown.startswith("<iframe ") and 'sandbox="allow-scripts"' in shown
+    page = html.unescape(shown.split('srcdoc="')[1].rsplit('"', 1)[0])
+    assert page.startswith("<!DOCTYPE html>") and "a person walks" in page and "default-src 'none'" in page
+    assert server.url not in shown, "a saved notebook needs no server"
+    parts: list[Any] = [motions[0], motions * 2.0]
+    assert [part._repr_html_() for part in parts] == [None, None]
     assert numpy.array_equal(version.generate("a person walks", seconds=2.0, seed=5), motions[2:3])
     with pytest.raises(stride.StrideError, match="60") as error:
         version.generate("a person walks", seconds=61.0)

@@ -61,7 +61,7 @@ macro_rules! files {
 }
 
 /// Everything that lies in `static` but licences.
-static FILES: [(&str, &[u8]); 40] = files![
+static FILES: [(&str, &[u8]); 41] = files![
     "index.html",
     "icon.svg",
     "style.css",
@@ -85,6 +85,7 @@ static FILES: [(&str, &[u8]); 40] = files![
     "viewer.css",
     "settings.js",
     "history.js",
+    "live.js",
     "lanes.js",
     "marks.js",
     "sweep.js",

@@ -1,6 +1,7 @@
 //! The frame around all views: who is signed in, where one is, and whether the server answers.
 
 import { CallError, get, signIn, signOut } from "./api.js";
+import { listen } from "./live.js";
 import { icon } from "./parts.js";
 import { start as startRouter, go, words } from "./router.js";
 import { currentWho, setWho } from "./session.js";
@@ -31,6 +32,14 @@ let tries = 0;
 let loaded = false;
 /** @type {ReturnType<typeof setTimeout> | undefined} */
 let timer;
+/** Milliseconds between two questions that events cause. */
+const APART = 250;
+let asked = 0;
+/** Ends listening to events. */
+let deaf = () => {};
+/** The load that is under way. @type {{view: View, again: boolean, done: Promise<void>} | null} */
+let under = null;
+
 /** What was last done, for screen readers and eyes. */
 let said = "";
 /** @type {ReturnType<typeof setTimeout> | undefined} */
@@ -146,20 +155,48 @@ const context = {
 function showLogin(why) {
   clearTimeout(timer);
   leaving.abort();
+  deaf();
   view = null;
   setWho(null);
   login(app, why, (who) => {
     setWho(who);
-    enter();
+    begin();
   });
 }
 
-/** Loads what the view shows, again and again while somebody looks. */
+/** Loads what the view shows, again and again while somebody looks. One load follows another: a question that comes meanwhile waits. */
 async function beat() {
   clearTimeout(timer);
   const showing = view;
   if (!showing || (document.hidden && loaded)) return;
+  if (under?.view === showing) {
+    under.again = true;
+    return under.done;
+  }
+  const mine = { view: showing, again: true, done: Promise.resolve() };
+  under = mine;
+  mine.done = (async () => {
+    try {
+      while (mine.again && under === mine) {
+        mine.again = false;
+        await load(showing);
+      }
+    } finally {
+      if (under === mine) under = null;
+    }
+  })();
+  await mine.done;
+  if (view !== showing || under) return;
+  // The delay after a failure grows to five seconds.
+  const wait = tries > 0 ? Math.min(5000, 500 * 2 ** tries) : showing.every;
+  clearTimeout(timer);
+  if (wait > 0) timer = setTimeout(beat, wait);
+}
+
+/** @param {View} showing */
+async function load(showing) {
   const signal = leaving.signal;
+  asked = Date.now();
   try {
     await showing.load(signal);
     if (signal.aborted) return;
@@ -182,15 +219,28 @@ async function beat() {
     if (!loaded && !error.isAway) absent = error;
     draw();
   }
-  // The delay after a failure grows to five seconds.
-  const wait = tries > 0 ? Math.min(5000, 500 * 2 ** tries) : showing.every;
-  if (wait > 0) timer = setTimeout(beat, wait);
 }
 
 /** Asks at once, such as after a change. */
 function refresh() {
   tries = 0;
   return beat();
+}
+
+/** Shows views, and hears of events. */
+function begin() {
+  deaf();
+  deaf = listen(hear);
+  enter();
+}
+
+/** Asks at once if an event concerns what is shown. @param {HistoryRow | null} row */
+function hear(row) {
+  if (!view || !loaded || document.hidden || tries > 0 || (row && !view.hears?.(row))) return;
+  const wait = asked + APART - Date.now();
+  clearTimeout(timer);
+  if (wait > 0) timer = setTimeout(beat, wait);
+  else void beat();
 }
 
 /** Shows the view of the present address. */
@@ -238,7 +288,7 @@ async function start() {
     history.replaceState(null, "", location.pathname + location.search);
     try {
       setWho(await signIn("Key", key));
-      return enter();
+      return begin();
     } catch (error) {
       why = "This link was used already, or is too old.";
     }
@@ -246,7 +296,7 @@ async function start() {
   for (let wait = 500; ; wait = Math.min(5000, wait * 2)) {
     try {
       setWho(await get("/v1/session"));
-      return enter();
+      return begin();
     } catch (error) {
       if (!(error instanceof CallError)) throw error;
       if (!error.isAway) return showLogin(error.status === 403 ? error.message : why);

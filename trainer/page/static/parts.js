@@ -183,8 +183,9 @@ export const fact = (name, value) => (value === nothing || value === "" ? nothin
 /** A question before something that cannot be taken back. @param {string} question */
 export const sure = (question) => confirm(question);
 
-/** @param {number} workers */
-export const joinCommand = (workers) => {
-  const url = location.origin;
-  return workers > 1 ? `trainer worker join ${url}   # on ${count(workers, "machine")}, or as often on this one` : `trainer worker join ${url}`;
+/** The command that lets workers join. @param {number} workers @param {string | null} [message] names the labels that a stage requires, such as `gpu=h100` */
+export const joinCommand = (workers, message) => {
+  const labels = /labelled `([\w.,=\/-]+)`/.exec(message ?? "")?.[1]?.split(",") ?? [];
+  const join = `trainer worker join ${location.origin}${labels.map((label) => ` --label ${label}`).join("")}`;
+  return workers > 1 ? `${join}   # on ${count(workers, "machine")}, or as often on this one` : join;
 };

@@ -63,7 +63,7 @@ export function sweepView(run, sweep, context) {
   const paths = axes.slice(0, -1).map((axis) => axis.name);
   return html`<div class="sweep">
     <p class="dim">${sweep.stage}: ${sweep.search} by ${sweep.metric}, ${least} is best; ${number(sweep.spent)} of ${number(sweep.planned)} steps, where all trials in full were ${number(sweep.full)}.</p>
-    ${best ? html`<section class="card winner" aria-label="Best trial"><p class="what"><span class="star">★</span> <b>Trial ${best.trial}</b> is best so far: ${plain(sweep.metric)} <b>${number(lastResult(best))}</b></p>
+    ${best ? html`<section class="card winner" aria-label="Best trial"><p class="what"><span class="star">★</span> <b>Trial ${best.trial}</b> is best${sweep.over ? "" : " so far"}: ${plain(sweep.metric)} <b>${number(lastResult(best))}</b></p>
       <dl class="facts">${Object.entries(best.values).map(([path, value]) => html`<div class="fact"><dt>${plain(path)}</dt><dd dir="auto">${plain(short(value))}</dd></div>`)}</dl>
       <p class="actions">${trialStage(run, sweep, best)}</p></section>` : nothing}
     ${sweep.over ? nothing : bar(sweep.planned > 0 ? Math.min(1, sweep.spent / sweep.planned) : 0, `Steps of the sweep of ${sweep.stage}`)}

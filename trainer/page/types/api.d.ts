@@ -55,5 +55,7 @@ interface View {
   every: number;
   load(signal: AbortSignal): Promise<void>;
   render(): unknown;
+  /** True if an event changes the view, so that the server is asked at once. */
+  hears?(row: HistoryRow): boolean;
   close?(): void;
 }

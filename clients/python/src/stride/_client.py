@@ -22,9 +22,9 @@ from ._errors import StrideError
 from ._models import Drawing, HistoryRow, LogRow, Promotion, RunSummary, RunView, Version
 
 if TYPE_CHECKING:
-    import numpy
     import pandas
-    from numpy.typing import NDArray
+
+    from ._motions import Motions
 
 PACKED = "application/octet-stream"
 """The form of values that keeps each bit of them."""
@@ -385,10 +385,11 @@ class Model:
         guidance: float | None = None,
         steps: int | None = None,
         path: Sequence[tuple[float, float, float, float]] = (),
-    ) -> NDArray[numpy.float32]:
+    ) -> Motions:
         """Draws motions with this version: joint positions in metres, ``[n, frames, joints, 3]``. Needs numpy.
 
-        A worker of the server draws them, and the call waits for it. Motions that were drawn before come from the store.
+        A worker of the server draws them, and the call waits for it. Motions that were drawn before come from the store. A notebook plays
+        them.
 
         Args:
             sentence: Text of the motion.
@@ -404,6 +405,8 @@ class Model:
         """
         import numpy
 
+        from ._motions import motions
+
         asked = {"seconds": seconds, "guidance": guidance, "steps": steps}
         body: dict[str, object] = {"models": [self.name], "sentences": [sentence], "count": n, "seed": seed, "path": list(path)}
         body.update({name: value for name, value in asked.items() if value is not None})
@@ -414,8 +417,9 @@ class Model:
         if run.state != "finished":
             raise StrideError("failed", stage.message or f"the draw was {run.state}", f"see run `{drawing.run}`")
         files = json.loads(self._server._blob(stage.outputs["report"]))["files"]
-        motions = [self._server._blob(files[f"motion-{number:02}.npy"]["digest"]) for number in range(n)]
-        return numpy.stack([numpy.load(io.BytesIO(motion)) for motion in motions])
+        drawn = [self._server._blob(files[f"motion-{number:02}.npy"]["digest"]) for number in range(n)]
+        page = str(files["motions.html"]["digest"])
+        return motions([numpy.load(io.BytesIO(motion)) for motion in drawn], lambda: self._server._blob(page).decode())
 
     def versions(self) -> list[Version]:
         """All versions, the oldest first."""

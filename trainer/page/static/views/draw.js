@@ -90,6 +90,13 @@ export function draw(context) {
     }
     busy = false;
     context.draw();
+    if (drawn && !left) bringIntoSight(document.querySelector("main canvas.figure"));
+  }
+
+  /** On a phone the motion is below the form that asked for it. @param {Element | null} figure */
+  function bringIntoSight(figure) {
+    const { top, bottom } = figure?.getBoundingClientRect() ?? { top: 0, bottom: 0 };
+    if (top < 0 || bottom > innerHeight) figure?.scrollIntoView({ block: "center" });
   }
 
   /** @param {import("../drawing.js").Report[]} all @param {NonNullable<typeof shown>} asked */

@@ -5,6 +5,7 @@ import { ago, count, date, number, plain, short } from "../format.js";
 import { badge, prose, spark } from "../parts.js";
 import { address } from "../router.js";
 import { may, serverNow } from "../session.js";
+import { settingsOf } from "../settings.js";
 import { html, nothing } from "../vendor/lit-html.js";
 
 /** @param {Context} _ @returns {View} */
@@ -29,7 +30,7 @@ export function models(_) {
     ${list.length === 0
       ? html`<p class="card dim">No model is registered yet. A stage of kind <code>register</code> makes a version of what a pipeline trained.</p>`
       : html`<div class="card table"><table><caption class="unseen">Registered models</caption><thead><tr><th scope="col">Model</th><th scope="col">Aliases</th><th scope="col" class="num">Versions</th><th scope="col" class="num wide">Best</th><th scope="col" class="wide">By</th></tr></thead><tbody>${list.map(row)}</tbody></table></div>`}`;
-  return { title: "Models", every: 5000, load, render };
+  return { title: "Models", every: 5000, load, render, hears: (row) => row.model !== undefined };
 }
 
 /** A gate as a light, with by how much it holds or does not. @param {string} gate @param {boolean | null} holds @param {number | null} value @param {number | null} bound */
@@ -61,7 +62,7 @@ export function model(context, name) {
   let history = [];
   /** @type {{version: Version, alias: string, reason: string, gates: string, wrong: string | null, busy: boolean, back: boolean} | null} */
   let asked = null;
-  /** @type {{version: number, nodes: LineageNode[]} | null} */
+  /** @type {{version: number, nodes: LineageNode[], pipeline: string} | null} */
   let lineage = null;
 
   /** @param {AbortSignal} [signal] */
@@ -153,10 +154,22 @@ export function model(context, name) {
         ${doing.back ? nothing : html`<label for="gates">Gates, if you want some</label><input id="gates" name="gates" .value=${doing.gates} @input=${gated} placeholder="fid <= 0.5, r_precision_top1 >= prod" autocapitalize="off" spellcheck="false">
           <ul class="gates">${listed(doing.gates).map((gate) => foresee(gate, doing.version, versions))}</ul>`}
         <label for="reason">Reason</label>
-        <input id="reason" name="reason" .value=${doing.reason} required maxlength="500" autocomplete="off" placeholder="Why does it move?">
+        <input id="reason" name="reason" .value=${doing.reason} required autofocus maxlength="500" autocomplete="off" placeholder="Why does it move?">
         ${doing.wrong ? html`<p class="wrong" role="alert">${doing.wrong}</p>` : nothing}
         <p class="actions"><button type="submit" class="main" ?disabled=${doing.busy}>${doing.back ? "Roll back" : "Promote"}</button><button type="button" @click=${shut}>Leave it</button></p>
       </form></dialog>`;
+  }
+
+  /** The YAML of the run that made a version; empty if the run is not here or not to be seen. @param {Version} version */
+  async function pipelineOf(version) {
+    const run = version.source?.run;
+    if (typeof run !== "string") return "";
+    try {
+      return (await settingsOf(run)).source;
+    } catch (error) {
+      if (!(error instanceof CallError)) throw error;
+      return "";
+    }
   }
 
   /** @param {Version} version */
@@ -164,7 +177,9 @@ export function model(context, name) {
     if (lineage?.version === version.version) lineage = null;
     else {
       try {
-        lineage = { version: version.version, nodes: (await registry({ command: "lineage", reference: `${name}:${version.version}` })).nodes };
+        const { nodes } = await registry({ command: "lineage", reference: `${name}:${version.version}` });
+        lineage = { version: version.version, nodes, pipeline: "" };
+        lineage.pipeline = await pipelineOf(version);
       } catch (error) {
         if (!(error instanceof CallError)) throw error;
         context.say(error.message);
@@ -189,7 +204,7 @@ export function model(context, name) {
       <td class="wide dim" title=${date(version.created_ms)}>${ago(version.created_ms, serverNow())}</td>
       <td class="actions">${may("submit") ? html`<a class="button" href=${`/draw?model=${encodeURIComponent(`${name}:${version.version}`)}`}>Draw</a>` : nothing}<button type="button" aria-expanded=${lineage?.version === version.version ? "true" : "false"} @click=${() => trace(version)}>Lineage</button>
         ${may("promote") ? html`<button type="button" class=${version.version === model.best && !version.aliases.includes("prod") ? "main" : ""} @click=${() => ask(version, version.aliases.includes("staging") ? "prod" : "staging", false)}>Promote</button>` : nothing}</td>
-    </tr>${lineage?.version === version.version ? html`<tr><td colspan=${keys.length + 5}>${ancestry(lineage.nodes)}</td></tr>` : nothing}`;
+    </tr>${lineage?.version === version.version ? html`<tr><td colspan=${keys.length + 5}>${ancestry(lineage.nodes)}${lineage.pipeline ? html`<details class="values"><summary>The pipeline that makes it again</summary><pre class="source" tabindex="0">${plain(lineage.pipeline)}</pre></details>` : nothing}</td></tr>` : nothing}`;
   }
 
   /** @param {Promotion} move @param {boolean} newest */
@@ -223,5 +238,5 @@ export function model(context, name) {
       ${dialog()}`;
   }
 
-  return { title: name, every: 5000, load, render };
+  return { title: name, every: 5000, load, render, hears: (row) => row.model === name };
 }

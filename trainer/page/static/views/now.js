@@ -108,7 +108,7 @@ export function now(context) {
     return html`<li class="card want warn">
       <p class="what"><a href=${address("runs", run.run)}><b>${run.run}</b> waits for ${count(wants, "worker")}</a></p>
       <p class="why">${stage?.name} ${prose(firstLine(stage?.message))}.</p>
-      ${command(joinCommand(wants), context)}
+      ${command(joinCommand(wants, stage?.message), context)}
     </li>`;
   }
 
@@ -196,5 +196,12 @@ export function now(context) {
       ${over.length > 0 ? html`<section aria-labelledby="ended"><h2 id="ended">Ended last</h2><ul class="list card">${over.map(ended)}</ul><p><a href="/runs">All runs</a></p></section>` : nothing}`;
   }
 
-  return { title: "Now", every: 1000, load, render };
+  /** @param {HistoryRow} row */
+  function hears(row) {
+    if (row.kind === "checkpoint") return false;
+    beats = 0;
+    return true;
+  }
+
+  return { title: "Now", every: 1000, load, render, hears };
 }

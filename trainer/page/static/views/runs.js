@@ -117,5 +117,5 @@ export function runs(context) {
       ${next ? html`<p class="center"><button type="button" ?disabled=${fetching} @click=${older}>${fetching ? "Loading…" : "Older runs"}</button></p>` : nothing}`;
   }
 
-  return { title: "Runs", every: 3000, load, render, close: () => clearTimeout(waits) };
+  return { title: "Runs", every: 3000, load, render, hears: (row) => row.run !== undefined && row.kind !== "checkpoint" && row.kind !== "granted", close: () => clearTimeout(waits) };
 }

@@ -121,7 +121,7 @@ export function stage(context, name, stageName) {
       <p class="path"><a href="/runs">Runs</a> / <a href=${address("runs", name)}>${name}</a></p>
       <div class="row head"><h1 tabindex="-1">${it.name}</h1>${badge(it.state)}<span class="dim">${it.kind}</span></div>
       ${it.state === "failed" ? html`<section class="card cause"><p class="why" dir="auto">${prose(it.message)}</p><p>${prose(whatToDo(it.message) ?? OTHERWISE)}</p><p class="actions"><a class="button" href=${address("runs", name)}>To the run</a></p></section>` : nothing}
-      ${it.wants_workers ? html`<section class="card want warn"><p class="what">${prose(firstLine(it.message))}</p>${command(joinCommand(it.wants_workers), context)}</section>` : nothing}
+      ${it.wants_workers ? html`<section class="card want warn"><p class="what">${prose(firstLine(it.message))}</p>${command(joinCommand(it.wants_workers, it.message), context)}</section>` : nothing}
       <div class="card summary">
         ${it.state === "running" && it.progress.total > 0 ? bar(share(it.progress), it.name) : nothing}
         <dl class="facts">
@@ -145,5 +145,5 @@ export function stage(context, name, stageName) {
     thumbnails.close();
     for (const shown of charts.values()) shown.close();
   };
-  return { title: `${stageName} of ${name}`, every: 1000, load, render, close };
+  return { title: `${stageName} of ${name}`, every: 1000, load, render, hears: (row) => row.run === name, close };
 }

@@ -131,7 +131,7 @@ export function workers(context) {
     const shown = [...(withGone ? list : here)].sort((a, b) => order.indexOf(a.state) - order.indexOf(b.state) || a.worker.localeCompare(b.worker, "en", { numeric: true }));
     const working = here.filter((worker) => worker.state === "working").length;
     return html`<div class="row head"><h1 tabindex="-1">Workers</h1><span class="dim">${count(here.length, "worker")}, ${working} at work</span></div>
-      ${queue.length > 0 ? html`<section aria-labelledby="queue"><h2 id="queue">What waits</h2><ul class="cards">${queue.slice(0, 20).map(({ run, stage }) => html`<li class="card want warn"><p class="what"><a href=${address("runs", run.run, stage.name)}><b>${run.run} / ${stage.name}</b></a></p><p class="why">${prose(firstLine(stage.message))}</p>${command(joinCommand(stage.wants_workers ?? 1), context)}</li>`)}</ul>
+      ${queue.length > 0 ? html`<section aria-labelledby="queue"><h2 id="queue">What waits</h2><ul class="cards">${queue.slice(0, 20).map(({ run, stage }) => html`<li class="card want warn"><p class="what"><a href=${address("runs", run.run, stage.name)}><b>${run.run} / ${stage.name}</b></a></p><p class="why">${prose(firstLine(stage.message))}</p>${command(joinCommand(stage.wants_workers ?? 1, stage.message), context)}</li>`)}</ul>
         ${queue.length > 20 ? html`<p class="dim">and ${count(queue.length - 20, "more stage")}</p>` : nothing}</section>` : nothing}
       ${shown.length === 0
         ? html`<section class="card empty"><p>No worker is here. One joins from this machine or another:</p>${command(joinCommand(1), context)}</section>`
@@ -140,5 +140,5 @@ export function workers(context) {
       ${times()}`;
   }
 
-  return { title: "Workers", every: 1000, load, render };
+  return { title: "Workers", every: 1000, load, render, hears: (row) => row.worker !== undefined || row.run !== undefined };
 }

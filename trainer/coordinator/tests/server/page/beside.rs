@@ -99,7 +99,7 @@ async fn a_browser_compares_runs_sweeps_and_times() -> TestResult {
             sweep()
         );
         let says = with_module(&mut browser, "sweep.js", &draw);
-        assert!(says.as_str().is_some_and(|says| says.contains("Trial 2 is best so far: loss 0.5")), "{says}");
+        assert!(says.as_str().is_some_and(|says| says.contains("Trial 2 is best: loss 0.5")), "{says}");
         assert_eq!(browser.evaluate("[...document.querySelectorAll('#sweep-test .fell')].map((e) => e.textContent)"), json!(["1 stopped"]));
         browser.evaluate("document.querySelector('#sweep-test .grip[aria-label^=\"lr,\"]').focus()");
         for _ in 0..4 {
