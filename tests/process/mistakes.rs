@@ -14,10 +14,10 @@ const GOOD: &str = r#"name: p
 seed: 1
 dataset: {format: synthetic, clips: 60}
 stages:
-  vae: {kind: train.vae, steps: 100, batch: {global: 8, slices: 2}, lr: 1e-3}
+  vae: {kind: train.vae, steps: 100, batch: {global: 8, slices: 2}, warmup: 10, lr: 1e-3}
   latents: {kind: encode.latents, vae: vae}
-  mld: {kind: train.mld, steps: 100}
-  pcm: {kind: distill.pcm, teacher: mld, phases: 1}
+  mld: {kind: train.mld, warmup: 10, steps: 100}
+  pcm: {kind: distill.pcm, teacher: mld, phases: 1, guidance: [0.5, 5]}
   fid: {kind: evaluate.latent_fid, model: pcm, teacher: mld, sampler: {steps: 1, guidance: 2}}
   out: {kind: register, model: m, from: [pcm], mode: min, promote: {to: staging, require: ["latent_fid <= 3"]}}
 "#;
