@@ -47,7 +47,7 @@ fn rare(text: &str) -> Result<Rare, String> {
         "steps" | "guidance" => Err(format!("`{key}` has an option of its own: --{key} {value}")),
         other => {
             let meant = protocol::spelling::question(other, KEYS);
-            Err(format!("there is no setting `{other}`{meant}; expected one of {}", KEYS.join(", ")))
+            Err(format!("expected one of {}; there is no setting `{other}`{meant}", KEYS.join(", ")))
         }
     }
 }
