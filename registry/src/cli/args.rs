@@ -90,17 +90,20 @@ pub enum Verb {
     #[command(flatten)]
     Command(Command),
     /// Repairs a store whose blobs are missing or were moved, or whose database is older than its blobs
+    #[command(after_help = "Example:\n  registry adopt")]
     Adopt {
         /// New location of the blobs: a folder, s3://BUCKET/PREFIX, gs://BUCKET/PREFIX or az://CONTAINER/PREFIX
         #[arg(long, value_name = "PLACE")]
         blobs: Option<Place>,
     },
     /// Makes or renews a backup of the store in a folder of this machine; runs continue meanwhile
+    #[command(after_help = "Example:\n  registry backup /backups/stride")]
     Backup {
         /// The folder: empty, missing, or an older backup of this store
         dir: PathBuf,
     },
     /// Restores a store from a backup after verifying all of it
+    #[command(after_help = "Example:\n  registry restore /backups/stride --to restored")]
     Restore {
         /// The backup's folder
         backup: PathBuf,
@@ -113,6 +116,7 @@ pub enum Verb {
         blobs: Option<Place>,
     },
     /// Copies a version's files to a folder, or to one file for `import` on another machine
+    #[command(after_help = "Example:\n  registry export quickstart@best -o quickstart.tar.zst")]
     Export {
         /// MODEL@ALIAS, MODEL@best or MODEL:VERSION
         model: String,
@@ -124,6 +128,7 @@ pub enum Verb {
         layout: Option<LayoutName>,
     },
     /// Registers the version in a bundle's file that `export -o FILE.tar.zst` wrote
+    #[command(after_help = "Example:\n  registry import quickstart.tar.zst --model quickstart")]
     Import {
         /// The bundle's file
         file: PathBuf,

@@ -106,6 +106,10 @@ pub async fn import(store: &Store, file: &Path, shown: &str, model: Option<&str>
         Ok(version) => Answer::done(Data::Imported { version, file: shown.to_owned() }),
         Err(ImportError::Write(e)) => Answer::from(e),
         Err(ImportError::Query(e)) => Answer::from(e),
+        Err(ImportError::File(e)) if e.kind() == io::ErrorKind::NotFound => {
+            let hint = "`registry export MODEL@ALIAS -o FILE.tar.zst` writes a bundle";
+            Answer::refused(error("invalid", format!("`{shown}`: there is no such file"), Some(hint)))
+        }
         Err(ImportError::File(e)) => Answer::refused(error("invalid", format!("`{shown}`: {e}"), None)),
         Err(ImportError::Bundle(e)) => {
             let code = match &e {

@@ -13,14 +13,17 @@ use crate::versions::Expect;
 #[serde(tag = "command", rename_all = "kebab-case")]
 pub enum Command {
     /// Lists models with their versions and aliases
+    #[command(after_help = "Example:\n  registry list")]
     List,
     /// Shows a model with its versions, or one version with its files
+    #[command(after_help = "Example:\n  registry show quickstart@staging")]
     Show {
         /// MODEL, MODEL@ALIAS, MODEL@best or MODEL:VERSION
         #[arg(value_name = "MODEL")]
         reference: String,
     },
     /// Shows the moves of a model's aliases: who, when, why, from and to which version
+    #[command(after_help = "Example:\n  registry history quickstart")]
     History {
         /// The model
         model: String,
@@ -29,6 +32,7 @@ pub enum Command {
         alias: Option<String>,
     },
     /// Points an alias at a version, if every gate holds
+    #[command(after_help = "Example:\n  registry promote quickstart@best --to prod --require 'latent_fid <= 100' --reason 'looked at it'")]
     Promote {
         /// MODEL@best, MODEL@ALIAS or MODEL:VERSION
         #[arg(value_name = "MODEL")]
@@ -47,6 +51,7 @@ pub enum Command {
         reason: String,
     },
     /// Points an alias back at the version before its last promotion
+    #[command(after_help = "Example:\n  registry rollback quickstart --alias staging")]
     Rollback {
         /// The model
         model: String,
@@ -64,6 +69,7 @@ pub enum Command {
         reason: String,
     },
     /// Compares two versions metric by metric and marks differences beyond noise
+    #[command(after_help = "Example:\n  registry compare quickstart:1 quickstart@best")]
     Compare {
         /// MODEL (its best version), MODEL@ALIAS or MODEL:VERSION
         left: String,
@@ -74,6 +80,7 @@ pub enum Command {
         style: Style,
     },
     /// Shows the metrics of every version in the papers' order, with the papers' rows
+    #[command(after_help = "Example:\n  registry leaderboard quickstart")]
     Leaderboard {
         /// A model, or `humanml3d` or `kit` for all models of that data format
         of: String,
@@ -85,20 +92,24 @@ pub enum Command {
         style: Style,
     },
     /// Shows the artifacts that a version or an artifact was made from
+    #[command(after_help = "Example:\n  registry lineage quickstart@best")]
     Lineage {
         /// A model version or a digest
         #[arg(value_name = "ARTIFACT")]
         reference: String,
     },
     /// Shows the audit log of a server: who called what, from where, with what result; needs the scope `admin`
+    #[command(after_help = "Example:\n  registry audit --limit 20")]
     Audit {
         /// Number of newest lines to show
         #[arg(long, value_name = "LINES", default_value_t = 100)]
         limit: usize,
     },
     /// Hashes every blob again and checks every reference
+    #[command(after_help = "Example:\n  registry fsck")]
     Fsck,
     /// Removes blobs that are no longer needed
+    #[command(after_help = "Example:\n  registry gc --dry-run")]
     Gc {
         /// Only show the blobs that would be removed
         #[arg(long)]
@@ -108,6 +119,7 @@ pub enum Command {
         grace_minutes: Option<u32>,
     },
     /// Deletes ended runs, except data that models or other runs need; `gc` then frees the space
+    #[command(after_help = "Example:\n  registry forget --ended-before 30d")]
     Forget {
         /// The run
         #[arg(required_unless_present_any = ["ended_before", "leftovers_before"])]

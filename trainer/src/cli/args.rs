@@ -5,6 +5,19 @@ use std::path::PathBuf;
 use clap::Args;
 use registry::Place;
 
+/// Parses a whole number of at least `LEAST`.
+pub(super) fn whole<const LEAST: u64>(text: &str) -> Result<u64, String> {
+    match text.parse::<u64>() {
+        Ok(number) if number >= LEAST => Ok(number),
+        _ => Err(format!("expected a whole number of {LEAST} or more")),
+    }
+}
+
+/// As [`whole`], for counts.
+pub(super) fn count(text: &str) -> Result<usize, String> {
+    whole::<1>(text).and_then(|number| usize::try_from(number).map_err(|error| error.to_string()))
+}
+
 /// A pipeline file with overrides.
 #[derive(Debug, Clone, Args)]
 pub(super) struct PipelineArgs {

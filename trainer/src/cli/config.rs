@@ -12,6 +12,7 @@ use crate::report::problem::{Problem, Result, exit};
 #[derive(Debug, Subcommand)]
 pub(crate) enum ConfigVerb {
     /// Checks a pipeline and shows it with every default filled in
+    #[command(after_help = "Example:\n  trainer config show configs/quickstart.yaml --set seed=7")]
     Show {
         #[command(flatten)]
         pipeline: PipelineArgs,

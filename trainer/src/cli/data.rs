@@ -19,10 +19,13 @@ use crate::report::problem::{Problem, Result};
 #[derive(Debug, Subcommand)]
 pub(crate) enum DataVerb {
     /// Shows what a recording (.bvh, .npy, .npz) contains and how it would be read, and proposes a joint map
+    #[command(after_help = "Example:\n  trainer data inspect recordings/clip-000.bvh")]
     Inspect(InspectArgs),
     /// Writes synthetic clips as recordings with their captions
+    #[command(after_help = "Example:\n  trainer data sample recordings --format bvh --clips 4")]
     Sample(SampleArgs),
     /// Lists published sets of motion
+    #[command(after_help = "Example:\n  trainer data list")]
     List(ListArgs),
     /// Fetches a published set, checks every file, and adds captions and splits; run it again to continue
     #[command(after_help = "Example:\n  trainer data fetch bandai --accept-licence")]

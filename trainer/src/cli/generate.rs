@@ -14,6 +14,7 @@ use protocol::stage::Sampler;
 use serde_json::{Value, json};
 use stages::generate::{Generated, Generator, Timing};
 
+use super::args::count;
 use super::control::{ControlArgs, Missed, Targets};
 use super::keep::Span;
 use super::model::{self, Found};
@@ -41,37 +42,44 @@ pub(crate) struct GenerateArgs {
     #[arg(long, value_name = "STAGE")]
     stage: Option<String>,
     /// The run of --stage: its name, a unique beginning of it, or `@last`
-    #[arg(long, default_value = "@last", requires = "stage")]
+    #[arg(long, default_value = "@last", requires = "stage", conflicts_with = "model")]
     run: String,
     /// Sampling steps [default: as in the model's evaluation]
-    #[arg(long, value_name = "N", allow_negative_numbers = true)]
+    #[arg(long, value_name = "N", value_parser = count, allow_negative_numbers = true, help_heading = "Sampling")]
     steps: Option<usize>,
     #[command(flatten)]
     sampler: SamplerArgs,
-    #[command(flatten)]
+    #[command(flatten, next_help_heading = "Lengths and seeds")]
     sentences: SentenceArgs,
     /// A motion to change in part, features [frames, features] as `--out FILE.npy` writes them; for masked token models
     /// only
-    #[arg(long, value_name = "FILE.npy", requires = "keep", conflicts_with_all = ["frames", "seconds"])]
+    #[arg(long, value_name = "FILE.npy", requires = "keep", conflicts_with_all = ["frames", "seconds"], help_heading = "Editing")]
     edit: Option<PathBuf>,
     /// Spans of it to keep, FROM:TO in frames or seconds, from the end if negative: `0:1s,-1s:` keeps the first and the
     /// last second
-    #[arg(long, value_name = "SPANS", value_delimiter = ',', requires = "edit", allow_hyphen_values = true)]
+    #[arg(
+        long,
+        value_name = "SPANS",
+        value_delimiter = ',',
+        requires = "edit",
+        allow_hyphen_values = true,
+        help_heading = "Editing"
+    )]
     keep: Vec<Span>,
     /// Computing backend: flex, ndarray, wgpu or cuda [default: the first that this build and machine have]
-    #[arg(long)]
+    #[arg(long, help_heading = "Sampling")]
     backend: Option<String>,
-    #[command(flatten)]
+    #[command(flatten, next_help_heading = "Output")]
     out: OutArgs,
-    #[command(flatten)]
+    #[command(flatten, next_help_heading = "Control")]
     control: ControlArgs,
     /// Also write joint positions [frames, joints, 3]
-    #[arg(long, value_name = "FILE.npy")]
+    #[arg(long, value_name = "FILE.npy", help_heading = "Output")]
     positions: Option<PathBuf>,
     /// Also write features
-    #[arg(long, value_name = "FILE.npy")]
+    #[arg(long, value_name = "FILE.npy", help_heading = "Output")]
     features: Option<PathBuf>,
-    #[command(flatten)]
+    #[command(flatten, next_help_heading = "Store and server")]
     target: Target,
     #[command(flatten, next_help_heading = "Streaming")]
     stream: StreamArgs,

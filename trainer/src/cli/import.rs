@@ -83,7 +83,10 @@ pub(crate) async fn import(args: ImportArgs, command: String) -> Result<u8> {
         print::out(&file.source);
         return Ok(0);
     }
-    let file = Box::new(pipeline_file::with_data(file)?);
+    let file = pipeline_file::with_data(file).map_err(|problem| {
+        problem.hint("name files and folders that exist; `--print` shows the pipeline that reads them")
+    })?;
+    let file = Box::new(file);
     let options =
         run::Options { store: args.store, blobs: None, workers: Some(1), output: args.output, ui: false, command };
     run::run(run::Request::Submit { file, until: None }, options).await

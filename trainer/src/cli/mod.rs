@@ -6,6 +6,7 @@ mod config;
 mod control;
 mod data;
 mod datasets;
+mod demo;
 mod doctor;
 mod endpoint_args;
 mod export;
@@ -54,6 +55,8 @@ pub(crate) struct Cli {
 
 #[derive(Debug, Subcommand)]
 enum Verb {
+    /// Draws motions with two small models that come with the program, without data and network
+    Demo(demo::DemoArgs),
     /// Runs a pipeline on this machine; run it again to continue where it stopped
     #[command(
         after_help = "Examples:\n  trainer run configs/quickstart.yaml\n  trainer run configs/smoke.yaml --until vae --workers 2 -o json"
@@ -121,6 +124,9 @@ enum Verb {
     Doctor(doctor::DoctorArgs),
     /// Prints a script with which a shell completes commands and options
     Completions(shell::CompletionsArgs),
+    /// Prints names that may follow on a command line, for the scripts of `completions`
+    #[command(hide = true)]
+    Names(shell::NamesArgs),
     /// Writes manual pages, one for each command
     Man(shell::ManArgs),
     /// Checks and shows pipeline files
@@ -142,8 +148,10 @@ enum Verb {
 #[derive(Debug, Subcommand)]
 enum WorkerVerb {
     /// Offers this machine to a coordinator
+    #[command(after_help = "Example:\n  trainer worker join http://127.0.0.1:7700 --token-file .stride/token")]
     Join(worker::JoinArgs),
     /// Lists the workers of a coordinator
+    #[command(after_help = "Example:\n  trainer worker list")]
     List(remote::WorkersArgs),
 }
 
@@ -152,7 +160,7 @@ struct RunArgs {
     #[command(flatten)]
     pipeline: PipelineArgs,
     /// Number of worker processes [default: one per core on CPU, one on a GPU]
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", value_parser = args::count, allow_negative_numbers = true)]
     workers: Option<usize>,
     /// The store's folder
     #[arg(long, env = "STRIDE_STORE", default_value = ".stride", value_name = "DIR")]
@@ -163,8 +171,8 @@ struct RunArgs {
     #[arg(long, value_name = "STAGE")]
     until: Option<String>,
     /// Trains nothing; runs N steps of each training stage again and compares them with what is stored [default N: 20]
-    #[arg(long, value_name = "N", num_args = 0..=1, default_missing_value = "20", conflicts_with_all = ["workers", "until"])]
-    verify: Option<std::num::NonZeroU64>,
+    #[arg(long, value_name = "N", num_args = 0..=1, default_missing_value = "20", value_parser = args::whole::<1>, conflicts_with_all = ["workers", "until"])]
+    verify: Option<u64>,
     /// Print a link to a page that shows the run live
     #[arg(long)]
     ui: bool,
@@ -196,7 +204,7 @@ struct ResumeArgs {
     #[command(flatten)]
     target: Target,
     /// Number of worker processes, when no server is running
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", value_parser = args::count, allow_negative_numbers = true)]
     workers: Option<usize>,
     /// Format of the result
     #[arg(short, long, value_enum, default_value_t)]
@@ -219,9 +227,13 @@ struct RegistryArgs {
 
 /// Runs the command that the process was started with.
 pub(crate) fn main() -> ExitCode {
+    // A server's messages have many readers; those of other commands only their own user.
+    if std::env::args_os().nth(1).is_none_or(|verb| verb != "serve") {
+        protocol::show_excerpts();
+    }
     let cli = match Cli::try_parse() {
         Ok(cli) => cli,
-        Err(error) => match sentences::without_quotes(&error, std::env::args_os().skip(1)) {
+        Err(error) => match explained(&error) {
             Some(problem) => {
                 print::problem(&problem, Output::Table);
                 return ExitCode::from(problem.exit);
@@ -251,10 +263,6 @@ pub(crate) fn main() -> ExitCode {
         Verb::Launch(_) => worker::init_logging(),
         _ => init_logging(),
     }
-    // A server's messages have many readers; those of other commands only their own user.
-    if !matches!(cli.verb, Verb::Serve(_)) {
-        protocol::show_excerpts();
-    }
     cli.verb.keep_to_oneself();
     let output = cli.verb.output();
     let runtime = match tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build() {
@@ -276,6 +284,19 @@ pub(crate) fn main() -> ExitCode {
     ExitCode::from(code)
 }
 
+/// Explains a refused command line that has a more probable reading than that of its grammar.
+fn explained(error: &clap::Error) -> Option<Problem> {
+    let words = || std::env::args_os().skip(1);
+    if error.kind() == clap::error::ErrorKind::MissingRequiredArgument && words().eq(["worker", "join"]) {
+        let problem = Problem::usage("`trainer worker join` needs the address of a coordinator");
+        return Some(problem.hint(
+            "`trainer serve` starts one and prints the command with its address and token; `trainer run` starts its \
+             own workers",
+        ));
+    }
+    sentences::without_quotes(error, words())
+}
+
 /// Logs warnings to stderr, and more with `RUST_LOG`. A log line that cannot be written is dropped. Otherwise the
 /// subscriber would report that error, fail again, and panic.
 fn init_logging() {
@@ -291,7 +312,7 @@ impl Verb {
     fn coordinates(&self) -> bool {
         match self {
             Self::Run(args) => args.verify.is_none(),
-            Self::Serve(_) | Self::Resume(_) => true,
+            Self::Serve(_) | Self::Resume(_) | Self::Demo(_) => true,
             _ => false,
         }
     }
@@ -312,6 +333,7 @@ impl Verb {
 
     fn output(&self) -> Output {
         match self {
+            Self::Demo(args) => args.output,
             Self::Run(args) => args.output,
             Self::Plan(args) => args.output,
             Self::Submit(args) => args.output,
@@ -333,6 +355,7 @@ impl Verb {
             Self::Serve(_)
             | Self::Completions(_)
             | Self::Man(_)
+            | Self::Names(_)
             | Self::Launch(_)
             | Self::Config(_)
             | Self::Schema(_)
@@ -344,6 +367,7 @@ impl Verb {
 
 async fn perform(verb: Verb) -> Result<u8> {
     match verb {
+        Verb::Demo(args) => demo::demo(args, command_line()).await,
         Verb::Run(args) => run_pipeline(args).await,
         Verb::Plan(args) => show_plan(args).await,
         Verb::Submit(args) => remote::submit(args).await,
@@ -365,6 +389,7 @@ async fn perform(verb: Verb) -> Result<u8> {
         Verb::Doctor(args) => doctor::doctor(args).await,
         Verb::Completions(args) => Ok(shell::completions(&args, Cli::command())),
         Verb::Man(args) => shell::man(&args, Cli::command()),
+        Verb::Names(args) => shell::names(&args).await,
         Verb::Config(verb) => config::config(&verb),
         Verb::Schema(args) => Ok(config::schema(&args)),
         Verb::Launch(verb) => launch::launch(*verb).await,
@@ -386,7 +411,7 @@ fn command_line() -> String {
 async fn run_pipeline(args: RunArgs) -> Result<u8> {
     let file = pipeline_file::read_with_data(&args.pipeline.pipeline, &args.pipeline.set)?;
     if let Some(steps) = args.verify {
-        return verify::verify(&file.pipeline, &args.store, steps.get(), args.output).await;
+        return verify::verify(&file.pipeline, &args.store, steps, args.output).await;
     }
     let until = args.until.map(StageName::new);
     let options = run::Options {
@@ -462,21 +487,30 @@ mod tests {
         }
     }
 
-    /// The examples in the `--help` of a command and its subcommands.
-    fn examples(command: &clap::Command) -> Vec<String> {
+    /// The examples in the `--help` of a command and its subcommands. Each command that runs has one.
+    fn examples(command: &clap::Command, path: &str) -> Vec<String> {
         let help = command.get_after_help().map(ToString::to_string).unwrap_or_default();
-        let lines = help.lines().filter_map(|line| Some(line[line.find("trainer ")?..].to_owned()));
-        let own = lines.filter(|_| help.starts_with("Example")).collect::<Vec<_>>();
-        own.into_iter().chain(command.get_subcommands().flat_map(examples)).collect()
+        let own: Vec<String> = match help.split_once("Example") {
+            None => Vec::new(),
+            Some((_, listed)) => listed.lines().filter_map(|line| line.strip_prefix("  ").map(str::to_owned)).collect(),
+        };
+        let below: Vec<&clap::Command> = command.get_subcommands().filter(|command| !command.is_hide_set()).collect();
+        assert!(!below.is_empty() || !own.is_empty(), "`{path}` has no example in its help");
+        let below = below.into_iter().flat_map(|below| examples(below, &format!("{path} {}", below.get_name())));
+        own.into_iter().chain(below).collect()
     }
 
     #[test]
     fn the_examples_of_every_help_parse() {
         let command = Cli::command();
-        let examples = examples(&command);
-        assert!(examples.len() >= 20, "{examples:#?}");
+        let examples = examples(&command, "trainer");
+        assert!(examples.len() >= 60, "{examples:#?}");
         for example in examples {
-            let words = cluster_tests::documented::words(&example);
+            let mut words = cluster_tests::documented::words(&example);
+            if words[0] == "registry" {
+                words.insert(0, "trainer".to_owned());
+            }
+            assert_eq!(words[0], "trainer", "{example}");
             let words: Vec<&String> = words.iter().take_while(|word| *word != ">").collect();
             if let Err(error) = Cli::try_parse_from(words) {
                 panic!("{example}: {error}");

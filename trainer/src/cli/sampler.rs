@@ -7,17 +7,49 @@ use protocol::stage::{Sampler, Solver, measured_with};
 #[derive(Debug, Args)]
 pub(super) struct SamplerArgs {
     /// Guidance: a teacher's scale g, a student's w = g - 1 [default: as in the model's evaluation]
-    #[arg(long, value_name = "W", value_parser = guidance, allow_negative_numbers = true)]
+    #[arg(long, value_name = "W", value_parser = guidance, allow_negative_numbers = true, help_heading = "Sampling")]
     guidance: Option<f64>,
-    /// Timesteps of an LCM student, noisiest first, such as 999,499 [default: as in the model's evaluation]
-    #[arg(long, value_name = "T", value_delimiter = ',')]
+    /// A rarer setting, may be repeated: timesteps=999,499 of an LCM student, noisiest first; solver=ddpm, ddim,
+    /// dpm-solver, dpm-solver++ or sde-dpm-solver++; footing=true or false, which corrects foot sliding by moving the
+    /// root [default: as in the model's evaluation]
+    #[arg(long = "sampler", value_name = "KEY=VALUE", value_parser = rare, help_heading = "Sampling")]
+    rare: Vec<Rare>,
+    // The names that these settings had before `--sampler`.
+    #[arg(long, value_name = "T", value_delimiter = ',', hide = true)]
     timesteps: Vec<usize>,
-    /// Solver: ddpm, ddim, dpm-solver, dpm-solver++, sde-dpm-solver++ [default: as in the model's evaluation]
-    #[arg(long, value_name = "SOLVER", value_parser = solver)]
+    #[arg(long, value_name = "SOLVER", value_parser = solver, hide = true)]
     solver: Option<Solver>,
-    /// Corrects foot sliding by moving the root: true or false [default: as in the model's evaluation]
-    #[arg(long, value_name = "BOOL")]
+    #[arg(long, value_name = "BOOL", hide = true)]
     footing: Option<bool>,
+}
+
+/// A setting of `--sampler`.
+#[derive(Debug, Clone, PartialEq)]
+enum Rare {
+    Timesteps(Vec<usize>),
+    Solver(Solver),
+    Footing(bool),
+}
+
+/// Parses `KEY=VALUE`.
+fn rare(text: &str) -> Result<Rare, String> {
+    const KEYS: [&str; 3] = ["timesteps", "solver", "footing"];
+    let Some((key, value)) = text.split_once('=') else {
+        return Err("expected KEY=VALUE, such as solver=ddim".to_owned());
+    };
+    match key {
+        "timesteps" => {
+            let numbers: Result<Vec<usize>, _> = value.split(',').map(|number| number.trim().parse()).collect();
+            numbers.map(Rare::Timesteps).map_err(|_| format!("`{value}` is no list of timesteps, such as 999,499"))
+        }
+        "solver" => solver(value).map(Rare::Solver),
+        "footing" => value.parse().map(Rare::Footing).map_err(|_| format!("`{value}` is neither true nor false")),
+        "steps" | "guidance" => Err(format!("`{key}` has an option of its own: --{key} {value}")),
+        other => {
+            let meant = protocol::spelling::question(other, KEYS);
+            Err(format!("expected one of {}; there is no setting `{other}`{meant}", KEYS.join(", ")))
+        }
+    }
 }
 
 /// Parses a scale of classifier-free guidance.
@@ -46,6 +78,25 @@ impl SamplerArgs {
         own: Sampler,
         measured: &[(String, Sampler)],
     ) -> Result<Sampler, String> {
+        self.with_rare().chosen(steps, own, measured)
+    }
+
+    /// The options, with those of `--sampler` in place of the hidden ones.
+    fn with_rare(&self) -> Self {
+        let Self { guidance, timesteps, solver, footing, rare } = self;
+        let (guidance, timesteps) = (*guidance, timesteps.clone());
+        let mut all = Self { guidance, timesteps, solver: *solver, footing: *footing, rare: Vec::new() };
+        for setting in rare {
+            match setting {
+                Rare::Timesteps(timesteps) => all.timesteps.clone_from(timesteps),
+                Rare::Solver(solver) => all.solver = Some(*solver),
+                Rare::Footing(footing) => all.footing = Some(*footing),
+            }
+        }
+        all
+    }
+
+    fn chosen(&self, steps: Option<usize>, own: Sampler, measured: &[(String, Sampler)]) -> Result<Sampler, String> {
         let steps = steps.or((!self.timesteps.is_empty()).then_some(self.timesteps.len()));
         let as_asked = |sampler: &Sampler| {
             steps.is_none_or(|steps| steps == sampler.steps)
@@ -57,8 +108,8 @@ impl SamplerArgs {
         let meant = measured.iter().filter(|(_, sampler)| as_asked(sampler));
         let meant = measured_with(meant.map(|(name, sampler)| (name.as_str(), sampler))).map_err(|differ| {
             format!(
-                "it was evaluated with several samplers: {differ}; choose one with --steps, --guidance, --timesteps, \
-                 --solver or --footing"
+                "it was evaluated with several samplers: {differ}; choose one with --steps, --guidance or \
+                 --sampler"
             )
         })?;
         // If all evaluations use one sampler, the options change that one.
@@ -95,6 +146,7 @@ mod tests {
             timesteps: timesteps.to_vec(),
             solver: None,
             footing: None,
+            rare: Vec::new(),
         };
         let own = sampler(2, 6.5, &[999, 499]);
         let of = |args: SamplerArgs, steps| args.sampler(steps, own.clone(), &[]);
@@ -106,6 +158,12 @@ mod tests {
         assert_eq!(of(asked, None), Ok(Sampler { solver: Solver::Ddim, ..own.clone() }));
         let asked = SamplerArgs { footing: Some(true), ..args(None, &[]) };
         assert_eq!(of(asked, None), Ok(Sampler { footing: true, ..own.clone() }));
+        let asked = SamplerArgs { rare: vec![Rare::Solver(Solver::Ddim), Rare::Timesteps(vec![7])], ..args(None, &[]) };
+        assert_eq!(of(asked, None), Ok(Sampler { solver: Solver::Ddim, ..sampler(1, 6.5, &[7]) }));
+        assert_eq!(rare("footing=false"), Ok(Rare::Footing(false)));
+        assert!(rare("solvr=ddim").unwrap_err().contains("did you mean `solver`?"));
+        assert!(rare("guidance=3").unwrap_err().contains("--guidance 3"));
+        assert!(rare("ddim").is_err() && rare("timesteps=soon").is_err() && rare("footing=maybe").is_err());
         assert!(solver("euler").unwrap_err().contains("dpm-solver++"), "says which there are");
 
         let one = |name: &str, sampler| (name.to_owned(), sampler);

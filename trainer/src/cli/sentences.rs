@@ -7,6 +7,7 @@ use clap::Args;
 use clap::error::ErrorKind;
 use mocap::requests::{self, Length, Request};
 
+use super::args::whole;
 use crate::report::problem::{Problem, Result};
 
 /// Limit of the motions of one command.
@@ -22,17 +23,29 @@ pub(super) struct SentenceArgs {
     captions: Option<PathBuf>,
     /// Length in frames: one for all sentences, or one for each [default: the model's length estimate, 120 without an
     /// estimator]
-    #[arg(long, value_name = "N", value_delimiter = ',', value_parser = clap::value_parser!(u32).range(1..=3_600_000), allow_negative_numbers = true)]
+    #[arg(long, value_name = "N", value_delimiter = ',', value_parser = frames, allow_negative_numbers = true)]
     frames: Vec<u32>,
     /// Length in seconds, likewise
     #[arg(long, value_name = "S", value_delimiter = ',', conflicts_with = "frames", value_parser = seconds, allow_negative_numbers = true)]
     seconds: Vec<Length>,
     /// Motions per sentence, with consecutive seeds
-    #[arg(short = 'n', long = "seeds", value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=1_000), allow_negative_numbers = true)]
+    #[arg(short = 'n', long = "seeds", value_name = "N", default_value_t = 1, value_parser = seeds, allow_negative_numbers = true)]
     seeds: u16,
     /// First seed; other seeds give other motions
-    #[arg(long, default_value_t = 0, allow_negative_numbers = true)]
+    #[arg(long, default_value_t = 0, value_parser = whole::<0>, allow_negative_numbers = true)]
     seed: u64,
+}
+
+/// Parses a length in frames: at most 50 hours.
+fn frames(text: &str) -> std::result::Result<u32, String> {
+    let number = text.parse().ok().filter(|number| (1..=3_600_000).contains(number));
+    number.ok_or_else(|| "expected a whole number of frames, 1 to 3,600,000; --seconds takes seconds".to_owned())
+}
+
+/// Parses a number of motions.
+fn seeds(text: &str) -> std::result::Result<u16, String> {
+    let number = text.parse().ok().filter(|number| (1..=1_000).contains(number));
+    number.ok_or_else(|| "expected a whole number of motions, 1 to 1,000".to_owned())
 }
 
 /// Parses seconds with or without their unit: `4` and `4s`.

@@ -23,13 +23,16 @@ A token file has one line `NAME SCOPES TOKEN` per caller, such as `alice submit,
 `workers=nodes-*`, `project=NAME` and `expires=2026-12-31`. With a line `protect ALIAS=NAME,NAME`, only these callers
 may move the alias. On SIGHUP, the server reads this file and the certificate again. A single token, in a file or as
 --token, has all scopes. Without a token, the server creates one for this user at every start, in the store's folder.
-Other machines need a token.";
+Other machines need a token.
+
+Example:
+  trainer serve --bind 127.0.0.1:7700";
 
 #[derive(Debug, Args)]
 #[command(after_help = TOKENS)]
 pub(crate) struct ServeArgs {
     /// Address to listen on
-    #[arg(long, env = "STRIDE_BIND", default_value_t = SocketAddr::from((Ipv4Addr::LOCALHOST, access::PORT)), value_name = "HOST:PORT")]
+    #[arg(long, env = "STRIDE_BIND", default_value_t = SocketAddr::from((Ipv4Addr::LOCALHOST, access::PORT)), value_name = "ADDRESS:PORT", value_parser = address)]
     bind: SocketAddr,
     #[command(flatten)]
     token: TokenOptions,
@@ -49,6 +52,14 @@ pub(crate) struct ServeArgs {
     blobs: super::args::BlobArgs,
     #[command(flatten)]
     allowances: AllowanceArgs,
+}
+
+/// Parses an address of this machine with a port.
+fn address(text: &str) -> std::result::Result<SocketAddr, String> {
+    text.parse().map_err(|_| {
+        "expected an address and a port, such as 127.0.0.1:7700, or 0.0.0.0:7700 for all networks of this machine"
+            .to_owned()
+    })
 }
 
 impl ServeArgs {

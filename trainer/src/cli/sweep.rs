@@ -19,8 +19,10 @@ use crate::report::sweep_plot::{self, By};
 #[derive(Debug, Subcommand)]
 pub(crate) enum SweepVerb {
     /// Shows the trials of a sweep, best first
+    #[command(after_help = "Example:\n  trainer sweep status @last")]
     Status(StatusArgs),
     /// Shows the best trial, and how to train it alone
+    #[command(after_help = "Example:\n  trainer sweep best @last")]
     Best(BestArgs),
 }
 

@@ -7,6 +7,7 @@ pub(crate) mod fleet;
 pub(crate) mod hub_names;
 pub(crate) mod missing;
 pub(crate) mod out_of_memory;
+pub(crate) mod pack;
 pub(crate) mod pictures;
 pub(crate) mod pipeline_file;
 pub(crate) mod plan;

@@ -30,6 +30,7 @@ pub(crate) fn read(path: &Path, sets: &[String]) -> Result<PipelineFile> {
         match error.kind() {
             std::io::ErrorKind::NotFound => problem.hint(instead_of(path)),
             std::io::ErrorKind::IsADirectory => problem.hint(inside(path)),
+            _ if path.exists() && !path.is_file() => problem.hint("write it to a file, or pass it as <(COMMAND)"),
             _ => problem,
         }
     })?;
@@ -179,10 +180,9 @@ pub(crate) fn check_stage(pipeline: &Pipeline, until: Option<&StageName>) -> Res
     match until {
         Some(until) if pipeline.stage(until).is_none() => {
             let names: Vec<&str> = pipeline.stages.iter().map(|stage| stage.name.as_str()).collect();
-            Err(Problem::usage(format!(
-                "`--until {until}`: the pipeline has no such stage; expected one of {}",
-                names.join(", ")
-            )))
+            let meant = spelling::question(until.as_str(), names.iter().copied());
+            Err(Problem::usage(format!("`--until {until}`: the pipeline has no such stage{meant}"))
+                .hint(format!("its stages are {}", names.join(", "))))
         }
         _ => Ok(()),
     }

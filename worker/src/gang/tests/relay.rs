@@ -161,7 +161,9 @@ fn signs_of_life_go_out_between_the_frames_of_a_long_payload() {
         });
         let mut reader = &stream;
         while signs < 3 && large < 200_000 && begun.elapsed() < Duration::from_secs(20) {
-            match frame::read_sealed(&mut reader, MAX_PAYLOAD, &mut receives).expect("whole").kind {
+            // A panic here would wait for the sending thread.
+            let Ok(frame) = frame::read_sealed(&mut reader, MAX_PAYLOAD, &mut receives) else { break };
+            match frame.kind {
                 Kind::KeepAlive => signs += 1,
                 _ => large += 1,
             }
