@@ -95,6 +95,12 @@ async fn read(source: &impl Source, digest: protocol::Digest) -> Result<Manifest
     serde_json::from_slice(&bytes).map_err(|e| error("damaged", e, Some("`registry fsck` checks the store")))
 }
 
+/// The answer for a bundle's file that is missing.
+pub(super) fn no_such_file(shown: &str) -> Answer {
+    let hint = "`registry export MODEL@ALIAS -o FILE.tar.zst` writes a bundle";
+    Answer::refused(error("invalid", format!("`{shown}`: there is no such file"), Some(hint)))
+}
+
 /// Registers the version in a bundle's file for `owner`, under `model` or its original name. This process holds the
 /// store. Messages call the file `shown`.
 pub async fn import(store: &Store, file: &Path, shown: &str, model: Option<&str>, owner: Owner) -> Answer {
@@ -106,10 +112,7 @@ pub async fn import(store: &Store, file: &Path, shown: &str, model: Option<&str>
         Ok(version) => Answer::done(Data::Imported { version, file: shown.to_owned() }),
         Err(ImportError::Write(e)) => Answer::from(e),
         Err(ImportError::Query(e)) => Answer::from(e),
-        Err(ImportError::File(e)) if e.kind() == io::ErrorKind::NotFound => {
-            let hint = "`registry export MODEL@ALIAS -o FILE.tar.zst` writes a bundle";
-            Answer::refused(error("invalid", format!("`{shown}`: there is no such file"), Some(hint)))
-        }
+        Err(ImportError::File(e)) if e.kind() == io::ErrorKind::NotFound => no_such_file(shown),
         Err(ImportError::File(e)) => Answer::refused(error("invalid", format!("`{shown}`: {e}"), None)),
         Err(ImportError::Bundle(e)) => {
             let code = match &e {

@@ -44,6 +44,8 @@ async fn answer(operation: Operation, dir: &Path, options: &ServerOptions) -> An
             with(dir, options, Need::Read, async |place| export_to(place, &model, Destination::Bundle(&file)).await)
                 .await
         }
+        // A new store is made only for a file that is there.
+        Operation::Import { file, .. } if !file.exists() => bundles::no_such_file(&file.display().to_string()),
         Operation::Import { file, model } => {
             with(dir, options, Need::Make, async |place| import(place, &file, model.as_deref()).await).await
         }

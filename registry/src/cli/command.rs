@@ -32,7 +32,9 @@ pub enum Command {
         alias: Option<String>,
     },
     /// Points an alias at a version, if every gate holds
-    #[command(after_help = "Example:\n  registry promote quickstart@best --to prod --require 'latent_fid <= 100' --reason 'looked at it'")]
+    #[command(
+        after_help = "Example:\n  registry promote quickstart@best --to prod --require 'latent_fid <= 100' --reason 'looked at it'"
+    )]
     Promote {
         /// MODEL@best, MODEL@ALIAS or MODEL:VERSION
         #[arg(value_name = "MODEL")]

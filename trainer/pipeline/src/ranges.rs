@@ -62,10 +62,11 @@ impl Range {
                     Bound::Included(number) => format!("a number from {number}"),
                     Bound::Unbounded => "a number".to_owned(),
                 };
-                match to {
-                    Bound::Excluded(number) => format!("{from} to below {number}"),
-                    Bound::Included(number) => format!("{from} to {number}"),
-                    Bound::Unbounded => from,
+                match (from.contains("above"), to) {
+                    (_, Bound::Excluded(number)) => format!("{from} to below {number}"),
+                    (true, Bound::Included(number)) => format!("{from} and at most {number}"),
+                    (false, Bound::Included(number)) => format!("{from} to {number}"),
+                    (_, Bound::Unbounded) => from,
                 }
             }
         };

@@ -95,6 +95,10 @@ pub(crate) async fn demo(args: DemoArgs, command: String) -> Result<u8> {
     }
     let start = Instant::now();
     let store = args.dir.join("store");
+    if args.dir.exists() && !args.dir.is_dir() {
+        let message = format!("`--dir {}` is not a folder", args.dir.display());
+        return Err(Problem::usage(message).hint("name a folder, which may be a new one"));
+    }
     let written = |error| Problem::usage(format!("cannot write to `{}`: {error}", args.dir.display()));
     std::fs::create_dir_all(&args.dir).map_err(written)?;
     install(&store).await?;

@@ -267,7 +267,7 @@ mod tests {
 
     #[test]
     fn a_pack_gives_valid_bundles_of_rounded_weights() {
-        let numbers = [1.0, -0.1, 1e-20, 3.141_592_7, -2.5e8, 0.0, 0.1, -0.3];
+        let numbers = [1.0, -0.1, 1e-20, 3.592_704, -2.5e8, 0.0, 0.1, -0.3];
         let (of_vae, of_denoiser) = (weights(numbers), weights(numbers.map(|number| number * 7.0)));
         let vae = part(ArtifactKind::Vae, json!({}), &of_vae);
         let denoiser = part(ArtifactKind::Denoiser, json!({"fits": {"vae": vae.digest()}}), &of_denoiser);
