@@ -79,6 +79,8 @@ mutation no-limit-of-a-runs-lines registry/src/sqlite/usage.rs 's/bind\(int\(log
 mutation a-refused-blob-is-tried-again worker/src/blobs.rs 's/BlobError::Unfit\(message\)/BlobError::Unavailable(message)/' worker:lib:tests
 mutation name-of-another-token trainer/coordinator/src/state/worker.rs 's/if own\.caller != by\.caller/if own.caller.is_empty()/' coordinator:server:workers
 mutation name-of-a-live-process trainer/coordinator/src/state/worker.rs 's/if own\.secret == by\.secret =>/if !own.caller.is_empty() =>/' coordinator:server:workers
+mutation failed-where-it-failed trainer/coordinator/src/decide/schedule.rs 's{if task.failed_on.is_empty\(\) }{if true }' coordinator:decisions:liveness
+mutation a-name-is-waited-for-once worker/src/assignments.rs 's/begun = Instant::now\(\);\n                if said/if said/' worker:lib:restart_of_the_coordinator
 mutation name-beyond-its-pattern trainer/coordinator/src/shell/secrets.rs 's/\|names\| !names\.allow\(worker\.as_str\(\)\)/|_| false/' coordinator:server:workers
 mutation poll-without-its-secret trainer/coordinator/src/shell/secrets.rs 's/if identity\.secret == Digest::of\(self\.secret\.0\.as_bytes\(\)\)/if !self.secret.0.contains("?")/' coordinator:server:workers
 mutation grant-without-its-secret trainer/coordinator/src/shell/secrets.rs 's/if is\(secrets\.mac\(&\("grant", &self\.caller\.name, grant\)\), &self\.secret\.0\)/if !secrets.of_grant(&self.caller.name, grant).is_empty()/' coordinator:server:workers

@@ -25,7 +25,7 @@ stages:
   control: {kind: train.control, network: {width: 16, layers: 3, heads: 2, feed_forward: 32}, embedding: 16, steps: 2, batch: {global: 4, slices: 1}}
   told: {kind: evaluate.control, joints: [pelvis], percent: [100, 25], frames: [5], sampler: {steps: 1, guidance: 2}, repeats: 2, split: test, all_if_small: true, shards: 1}
   recon: {kind: evaluate.reconstruction, vae: vae_1, shards: 1}
-  fid: {kind: evaluate.latent_fid, model: lcm, teacher: mld, sampler: {steps: 1, guidance: 2}, repeats: 2, components: 4, shards: 1}
+  fid: {kind: evaluate.latent_fid, model: lcm, teacher: mld, split: all, sampler: {steps: 1, guidance: 2}, repeats: 2, components: 4, shards: 1}
   real: {kind: evaluate.t2m, real: true, pools: [8], repeats: 2, split: test, shards: 1}
   t2m_vae_1: {kind: evaluate.t2m, vae: vae_1, pools: [8], repeats: 2, split: test, shards: 1}
   t2m_vae_2: {kind: evaluate.t2m, vae: vae_2, pools: [8], repeats: 2, split: test, shards: 1}

@@ -24,7 +24,7 @@ const LONGEST: Duration = Duration::from_secs(1);
 /// Shortest time between two polls.
 const SHORTEST: Duration = Duration::from_millis(20);
 /// Time to wait for a name that another process holds. A killed process holds its name until its lease ends.
-const NAME_PATIENCE: Duration = Duration::from_secs(60);
+const NAME_PATIENCE: Duration = Duration::from_secs(if cfg!(test) { 4 } else { 60 });
 /// Time between two log lines of a worker that waits for its coordinator.
 const REMIND: Duration = Duration::from_secs(60);
 /// Consecutive refusals that end the worker.

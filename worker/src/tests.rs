@@ -277,6 +277,28 @@ fn a_name_that_another_process_has_is_waited_for() {
 }
 
 #[test]
+fn the_wait_for_a_name_begins_anew_after_a_restart_of_the_coordinator() {
+    let worker = Worker::start(Box::new(finished));
+    worker.wait("the first join", |coordinator| coordinator.joins == 1);
+    let hold = || {
+        worker.fake.name_held.store(u64::MAX, Ordering::SeqCst);
+        worker.fake.full.store(false, Ordering::SeqCst);
+    };
+    hold();
+    lock(&worker.fake.coordinator).forget = true;
+    // Both times together are longer than the worker waits for a name.
+    thread::sleep(Duration::from_millis(2500));
+    worker.fake.full.store(true, Ordering::SeqCst);
+    worker.fake.name_held.store(0, Ordering::SeqCst);
+    worker.wait("a refusal of the coordinator", |_| worker.fake.turned_down.load(Ordering::SeqCst) > 0);
+    hold();
+    thread::sleep(Duration::from_millis(2500));
+    worker.fake.name_held.store(0, Ordering::SeqCst);
+    worker.wait("the second join", |coordinator| coordinator.joins == 2);
+    worker.leave();
+}
+
+#[test]
 fn a_coordinator_that_goes_away_and_forgets_is_waited_for() {
     let worker = Worker::start(Box::new(|context| train(context, 200, Duration::from_millis(5))));
     worker.grant(1);

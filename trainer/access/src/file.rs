@@ -50,7 +50,7 @@ mod tests {
         let errors = [
             Token::from_file(&pipe).unwrap_err().to_string(),
             Tokens::read(&pipe).unwrap_err().to_string(),
-            crate::tls::server(&pipe, &pipe).unwrap_err().to_string(),
+            crate::tls::ServerTls::read(&pipe, &pipe).unwrap_err().to_string(),
             crate::tls::pinned(&pipe).unwrap_err().to_string(),
             crate::local::read(dir.path()).unwrap_err().to_string(),
         ];

@@ -1,11 +1,13 @@
 //! TLS configuration of servers and clients.
 
-use std::path::Path;
-use std::sync::Arc;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, PoisonError, RwLock};
 
 use rustls::crypto::{CryptoProvider, ring};
 use rustls::pki_types::pem::PemObject;
 use rustls::pki_types::{CertificateDer, PrivateKeyDer};
+use rustls::server::{ClientHello, ResolvesServerCert};
+use rustls::sign::CertifiedKey;
 use rustls::{ClientConfig, ConfigBuilder, RootCertStore, ServerConfig, WantsVerifier};
 
 use crate::file::read_regular;
@@ -18,19 +20,64 @@ fn provider() -> Arc<CryptoProvider> {
     Arc::new(ring::default_provider())
 }
 
-/// Creates a server's configuration from its `certificate` chain and private `key`.
-pub fn server(certificate: &Path, key: &Path) -> Result<Arc<ServerConfig>, FileError> {
+/// TLS of a server. Its certificate can be read again while it runs; open connections keep theirs.
+#[derive(Debug, Clone)]
+pub struct ServerTls {
+    config: Arc<ServerConfig>,
+    current: Arc<Current>,
+    certificate: PathBuf,
+    key: PathBuf,
+}
+
+/// The certificate of new connections.
+#[derive(Debug)]
+struct Current(RwLock<Arc<CertifiedKey>>);
+
+impl ResolvesServerCert for Current {
+    fn resolve(&self, _hello: ClientHello<'_>) -> Option<Arc<CertifiedKey>> {
+        Some(Arc::clone(&self.0.read().unwrap_or_else(PoisonError::into_inner)))
+    }
+}
+
+impl ServerTls {
+    /// Reads a `certificate` chain and its private `key`, both PEM.
+    ///
+    /// # Errors
+    /// A file cannot be read or has other content, the key is readable for other users, or the two do not match.
+    pub fn read(certificate: &Path, key: &Path) -> Result<Self, FileError> {
+        let current = Arc::new(Current(RwLock::new(certified(certificate, key)?)));
+        let config = ServerConfig::builder_with_provider(provider()).with_safe_default_protocol_versions();
+        let config = config.expect("the provider speaks the default versions").with_no_client_auth();
+        let mut config = config.with_cert_resolver(Arc::<Current>::clone(&current));
+        config.alpn_protocols = vec![b"h2".to_vec(), b"http/1.1".to_vec()];
+        Ok(Self { config: Arc::new(config), current, certificate: certificate.to_owned(), key: key.to_owned() })
+    }
+
+    /// The configuration for connections.
+    pub fn config(&self) -> Arc<ServerConfig> {
+        Arc::clone(&self.config)
+    }
+
+    /// Reads both files again, for new connections.
+    ///
+    /// # Errors
+    /// As for [`ServerTls::read`]; the server then keeps its certificate.
+    pub fn reload(&self) -> Result<(), FileError> {
+        let new = certified(&self.certificate, &self.key)?;
+        *self.current.0.write().unwrap_or_else(PoisonError::into_inner) = new;
+        Ok(())
+    }
+}
+
+fn certified(certificate: &Path, key: &Path) -> Result<Arc<CertifiedKey>, FileError> {
     let chain = certificates(certificate)?;
     let pem = read_secret(key)?;
     let secret = PrivateKeyDer::from_pem_slice(pem.as_bytes())
         .map_err(|error| FileError::new(key, format!("has no private key in PEM format: {error}")))?;
-    let config = ServerConfig::builder_with_provider(provider()).with_safe_default_protocol_versions();
-    let config = config.and_then(|config| config.with_no_client_auth().with_single_cert(chain, secret));
-    let mut config = config.map_err(|error| {
+    let certified = CertifiedKey::from_der(chain, secret, &provider()).map_err(|error| {
         FileError::new(certificate, format!("does not match the key in `{}`: {error}", key.display()))
     })?;
-    config.alpn_protocols = vec![b"h2".to_vec(), b"http/1.1".to_vec()];
-    Ok(Arc::new(config))
+    Ok(Arc::new(certified))
 }
 
 /// Creates a client's configuration that trusts only certificates signed by those in `ca`.

@@ -133,6 +133,9 @@ pub struct TaskChange {
     /// The complete list of workers without enough memory for the task.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub too_small: Option<Vec<WorkerId>>,
+    /// The complete list of workers whose attempts failed.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub failed_on: Option<Vec<WorkerId>>,
     /// Steps whose checkpoints were deleted.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub dropped: Vec<u64>,
@@ -159,6 +162,7 @@ impl TaskChange {
             fence: new(&before.fence, &after.fence),
             counts: new(&counts(before), &counts(after)),
             too_small: new(&before.too_small, &after.too_small),
+            failed_on: new(&before.failed_on, &after.failed_on),
             dropped: gone.map(|saved| saved.step).collect(),
             saved: come.cloned().collect(),
             reported: if before.reported == after.reported { None } else { after.reported.clone() },
@@ -180,6 +184,9 @@ impl TaskChange {
         (task.faults, task.losses, task.streak) = self.counts.unwrap_or((task.faults, task.losses, task.streak));
         if let Some(too_small) = &self.too_small {
             task.too_small.clone_from(too_small);
+        }
+        if let Some(failed_on) = &self.failed_on {
+            task.failed_on.clone_from(failed_on);
         }
         task.checkpoints.retain(|saved| !self.dropped.contains(&saved.step));
         task.checkpoints.extend(self.saved.iter().cloned());

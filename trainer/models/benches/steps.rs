@@ -129,7 +129,7 @@ struct Distilled {
 
 fn pcm(device: &Device) -> Distilled {
     let tracked = device.clone().autodiff();
-    let heads = Discriminator::new(5, 96, &mut Init::new(Seed(1), "heads", Positions::Uniform, &tracked));
+    let heads = Discriminator::new(5, 96, 0.01, &mut Init::new(Seed(1), "heads", Positions::Uniform, &tracked));
     Distilled {
         teacher: denoiser(96, device),
         student: Trained::new(denoiser(96, &tracked)),

@@ -13,8 +13,6 @@ use burn::tensor::{Device, Tensor, TensorData};
 
 use crate::kernels;
 
-/// Decay of a codebook's running statistics in each update.
-pub const MU: f64 = 0.99;
 /// Temperature of drawn codes, fixed in MoMask's training pass.
 pub const TEMPERATURE: f32 = 0.5;
 /// The id of "no code": it adds the zero vector.
@@ -232,6 +230,8 @@ pub struct Book<'a> {
     pub sums: &'a mut [f32],
     /// Running counts, [K].
     pub counts: &'a mut [f32],
+    /// Decay of sums and counts in each update.
+    pub decay: f64,
 }
 
 impl Book<'_> {
@@ -244,7 +244,7 @@ impl Book<'_> {
 
     /// Updates running sums and counts with those of a batch.
     fn follow(&mut self, sums: &[f32], counts: &[f32]) {
-        let (keep, take) = (MU as f32, (1.0 - MU) as f32);
+        let (keep, take) = (self.decay as f32, (1.0 - self.decay) as f32);
         // Two roundings: a count of one row in the first update must stay exactly 1.
         let follow = |kept: &mut [f32], new: &[f32]| {
             kept.iter_mut().zip(new).for_each(|(kept, new)| *kept = keep * *kept + take * new);
@@ -330,7 +330,7 @@ mod tests {
     #[test]
     fn a_code_that_nobody_takes_stays_finite() {
         let (mut codes, mut sums, mut counts) = (vec![1.0, 2.0], vec![0.0, 2.0], vec![0.0, 1.0]);
-        let mut book = Book { codes: &mut codes, sums: &mut sums, counts: &mut counts };
+        let mut book = Book { codes: &mut codes, sums: &mut sums, counts: &mut counts, decay: 0.99 };
         book.update_remembering(&[0.0, 0.0], &[0.0, 0.0], &[7.0, 7.0], &mut [0.0, 0.0], &mut 0.0);
         assert_eq!(codes[0], 1.0);
         assert!((codes[1] - 2.0).abs() < 1e-6);

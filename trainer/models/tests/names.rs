@@ -201,7 +201,7 @@ fn networks_have_the_published_numbers_of_parameters() {
         (with(|i| Denoiser::new(&denoiser_config(false, Some(256)), i)).num_params(), 8_417_792),
         (with(|i| Denoiser::new(&denoiser_config(true, None), i)).num_params(), 8_237_856),
         (with(|i| Denoiser::new(&denoiser_config(true, Some(256)), i)).num_params(), 8_434_464),
-        (with(|i| Discriminator::new(9, 256, i)).num_params(), 1_195_785),
+        (with(|i| Discriminator::new(9, 256, 0.01, i)).num_params(), 1_195_785),
         (with(|i| Denoiser::controlnet(&denoiser_config(false, Some(256)), 256, false, i)).num_params(), 9_206_784),
         (with(|i| Denoiser::controlnet(&denoiser_config(true, Some(256)), 256, true, i)).num_params(), 9_108_544),
         (with(|i| TrajectoryEncoder::new(&trajectory_config(false), i)).num_params(), 7_779_072),

@@ -152,7 +152,7 @@ fn a_fresh_student_ignores_its_guidance() {
 fn generator_gradients_pass_through_the_frozen_teacher() {
     let device = Device::flex().autodiff();
     let teacher = Denoiser::new(&denoiser_config(None), &mut draws(&device)).no_grad();
-    let heads = Discriminator::new(5, 16, &mut draws(&device));
+    let heads = Discriminator::new(5, 16, 0.01, &mut draws(&device));
     let fake = wave([2, 3, 6], 1, &device).require_grad();
     let features = teacher.features(fake.clone(), &[40, 700], wave([2, 1, 10], 2, &device), &mut Dropout::off());
     assert_eq!(features.len(), 5, "one per block");

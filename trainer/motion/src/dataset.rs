@@ -125,6 +125,14 @@ impl Dataset {
         (0..self.entries.len()).filter(|i| self.entries[*i].split.is_in(split)).collect()
     }
 
+    /// The deviations [D], those of root and contacts divided by `bias`, which increases their weight.
+    pub fn biased_std(&self, bias: f64) -> Vec<f32> {
+        let layout = self.skeleton().layout();
+        let is_biased = |i: usize| i < layout.positions.start || layout.contacts.contains(&i);
+        let divided = |(i, std): (usize, &f32)| if is_biased(i) { (f64::from(*std) / bias) as f32 } else { *std };
+        self.std.iter().enumerate().map(divided).collect()
+    }
+
     /// Computes `(x - mean) / std` on rows of D values, in place.
     pub fn normalise(&self, rows: &mut [f32]) {
         normalise(rows, &self.mean, &self.std);

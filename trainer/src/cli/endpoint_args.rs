@@ -27,7 +27,7 @@ impl EndpointArgs {
     /// machines only if `insecure`.
     pub(super) fn config(&self, listen: SocketAddr, tokens: Tokens, insecure: bool) -> Result<Config> {
         let tls = self.tls_cert.as_deref().zip(self.tls_key.as_deref());
-        let tls = tls.map(|(certificate, key)| access::tls::server(certificate, key)).transpose()?;
+        let tls = tls.map(|(certificate, key)| access::tls::ServerTls::read(certificate, key)).transpose()?;
         Ok(Config { hosts: self.host.clone(), tls, insecure, ..Config::server(listen, tokens) })
     }
 }

@@ -21,9 +21,9 @@ const TOKENS: &str = "\
 A token file has one line `NAME SCOPES TOKEN` per caller, such as `alice submit,promote` and the output of
 `openssl rand -hex 32`. Scopes: read, submit, worker, promote, launch, admin. After the token, a line may have
 `workers=nodes-*`, `project=NAME` and `expires=2026-12-31`. With a line `protect ALIAS=NAME,NAME`, only these callers
-may move the alias. On SIGHUP, the server reads the file again. A single token, in a file or as --token, has all
-scopes. Without a token, the server creates one for this user at every start, in the store's folder. Other machines
-need a token.";
+may move the alias. On SIGHUP, the server reads this file and the certificate again. A single token, in a file or as
+--token, has all scopes. Without a token, the server creates one for this user at every start, in the store's folder.
+Other machines need a token.";
 
 #[derive(Debug, Args)]
 #[command(after_help = TOKENS)]
@@ -67,8 +67,11 @@ impl ServeArgs {
         Ok(self.webhooks.as_deref().map(Hooks::read).transpose()?.unwrap_or_default())
     }
 
-    /// Reads the files of tokens and webhooks again. A file with an error changes nothing.
+    /// Reads the files of the certificate, tokens and webhooks again. A file with an error changes nothing.
     async fn reload(&self, handle: &Handle) {
+        if let Err(error) = handle.reload_certificate() {
+            print::note(&format!("keeping the earlier certificate: {error}"));
+        }
         match self.hooks() {
             Ok(hooks) => {
                 if let Err(error) = handle.replace_hooks(hooks).await {

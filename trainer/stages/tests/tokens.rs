@@ -33,6 +33,9 @@ fn training(steps: u64) -> Training {
     }
 }
 
+/// Divisor of root and contact deviations of the residual tokenizer.
+const BIAS: f64 = 25.0;
+
 /// A tokenizer with codebooks of `codes` codes. A batch has 24 rows; with 40 codes they are repeated.
 fn tokenizer(quantizers: usize, codes: usize, resets: Resets) -> StageSettings {
     StageSettings::from(TrainTokenizer {
@@ -42,6 +45,7 @@ fn tokenizer(quantizers: usize, codes: usize, resets: Resets) -> StageSettings {
         quantize_dropout: 0.5,
         drawn: quantizers > 1,
         resets,
+        feature_bias: if quantizers > 1 { BIAS } else { 1.0 },
         network: TokenizerNetwork { width: 8, depth: 2, growth: 2, dropout: 0.1 },
         window: 16,
         training: training(STEPS),
@@ -254,6 +258,24 @@ fn models_of_tokens_draw_motions_as_all_others_do() {
         }
         let wrong = Sampler { steps: 2000, ..sampler.clone() };
         assert!(model.check_sampler(&wrong).is_err(), "{name}");
+    }
+}
+
+#[test]
+fn a_tokenizer_sees_root_and_contacts_as_many_times_larger_as_its_bias_says() {
+    let world = run(1, 1);
+    let blobs = world.bench.blobs();
+    let manifest = |name| world.bench.manifest(world.outputs[name]).unwrap();
+    let dataset = stages::artifacts::dataset(&*blobs, &manifest("dataset")).unwrap();
+    let layout = dataset.skeleton().layout();
+    for (name, bias) in [("plain", 1.0), ("residual", BIAS as f32)] {
+        let tokenizer = TrainedTokenizer::read(&*blobs, &manifest(name), &burn::tensor::Device::flex()).unwrap();
+        let mut row: Vec<f32> = dataset.mean.iter().zip(&dataset.std).map(|(mean, std)| mean + std).collect();
+        tokenizer.normalise(&mut row);
+        for (i, value) in row.iter().enumerate() {
+            let wanted = if i < 4 || layout.contacts.contains(&i) { bias } else { 1.0 };
+            assert!((value - wanted).abs() < 1e-2 * wanted, "{name}: feature {i} is {value}, expected {wanted}");
+        }
     }
 }
 

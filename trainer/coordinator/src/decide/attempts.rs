@@ -58,6 +58,7 @@ impl Deciding<'_> {
         let tried = self.change(key, i, |task| {
             let drain_by = matches!(task.lease, Lease::Held { drain_by: Some(_), .. });
             task.streak += 1;
+            task.remember_failure();
             let (count, budget, what) = if fault {
                 (&mut task.faults, policy.fault_budget, "faults")
             } else {

@@ -5,7 +5,8 @@
 //! [`Queue`](crate::state::queue::Queue) stores them. Work that no idle worker can take is skipped. The order within
 //! one decision:
 //! 1. Gangs that have become too large release members.
-//! 2. Plain tasks, shards and merges that are ready get one worker each: they are short, and much waits for them.
+//! 2. Plain tasks, shards and merges that are ready get one worker each: they are short, and much waits for them. After
+//!    a failure, a worker on which fewer attempts failed comes first.
 //! 3. Running gangs admit idle workers, up to their `max`.
 //! 4. Waiting gangs start with all remaining workers.
 //!
@@ -155,10 +156,15 @@ fn fit(state: &State, execution: &StageExecution, task: &Task) -> Vec<Member> {
     welcome
 }
 
+/// The idle worker for task `i`. A worker that is too slow for a task, or dies of it, would be the first one each time.
+fn next_worker(state: &State, execution: &StageExecution, i: usize) -> Option<Member> {
+    let (task, mut idle) = (&execution.tasks[i], idle(state, execution));
+    if task.failed_on.is_empty() { idle.next() } else { idle.min_by_key(|member| task.failures_on(&member.worker)) }
+}
+
 fn small_tasks(cx: &mut Deciding<'_>, key: Digest) {
     while let Some(i) = cx.state.executions[&key].tasks.first_ready() {
-        let worker = idle(cx.state, &cx.state.executions[&key]).next();
-        let Some(worker) = worker else { return };
+        let Some(worker) = next_worker(cx.state, &cx.state.executions[&key], i) else { return };
         grant(cx, key, i, vec![worker]);
     }
 }

@@ -56,12 +56,12 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use ::webhooks::Hooks;
+use access::tls::ServerTls;
 use access::{Caller, Scope, Scopes, Token, Tokens};
 use protocol::message::{FailureClass, ReportOutcome, RunView, Submit, TaskOutcome};
 use protocol::{Owner, RunId, WorkerId};
 use registry::Store;
 use registry::audit::AuditLog;
-use rustls::ServerConfig;
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
 
@@ -103,7 +103,7 @@ pub struct Config {
     /// Host names of this server, in addition to the machine's own name and its addresses.
     pub hosts: Vec<String>,
     /// TLS for all connections from other machines.
-    pub tls: Option<Arc<ServerConfig>>,
+    pub tls: Option<ServerTls>,
     /// Allows tokens to cross a network unencrypted.
     pub insecure: bool,
     /// Limits of connections.
@@ -182,7 +182,9 @@ impl Coordinator {
         let policy = Policy { live_runs: config.allowances.runs, ..config.policy.clone() };
         let recovered = journal::recover_both(policy, &store.recovery().await?)?;
         let listen = |address| move |cause| StartError::Listen { address, cause };
-        let main = Listener::bind(config.listen, config.tls.clone()).await.map_err(listen(config.listen))?;
+        let main = Listener::bind(config.listen, config.tls.as_ref().map(ServerTls::config))
+            .await
+            .map_err(listen(config.listen))?;
         let address = main.address().map_err(listen(config.listen))?;
         let (mut listeners, mut local) = (vec![main], address);
         if config.tls.is_some() || !config.listen.ip().is_loopback() {
@@ -223,7 +225,7 @@ impl Coordinator {
         let (hooks, listed) = watch::channel(config.hooks);
         let telling = webhooks::serve(actor_handle.clone(), listed, config.hook_retry);
         let telling = actor_handle.spawn("the webhooks", telling);
-        let tls = config.tls.is_some();
+        let tls = config.tls.clone();
         let tasks = vec![clock, server, audit, quiet, telling, actor];
         Ok(Handle { address, local, tls, token, worker_token, sessions, hooks, actor_handle, stop, tasks })
     }
@@ -243,7 +245,7 @@ fn user() -> String {
 pub struct Handle {
     address: SocketAddr,
     local: SocketAddr,
-    tls: bool,
+    tls: Option<ServerTls>,
     token: Token,
     worker_token: Token,
     sessions: Arc<Sessions>,
@@ -261,7 +263,7 @@ impl Handle {
 
     /// The server's URL.
     pub fn url(&self) -> String {
-        format!("{}://{}", if self.tls { "https" } else { "http" }, self.address)
+        format!("{}://{}", if self.tls.is_some() { "https" } else { "http" }, self.address)
     }
 
     /// The server's URL for processes on this machine, never encrypted.
@@ -292,6 +294,14 @@ impl Handle {
     /// Replaces the table of tokens. Active calls with a removed token are aborted.
     pub fn replace_tokens(&self, tokens: Tokens) {
         self.actor_handle.tokens.replace(tokens);
+    }
+
+    /// Reads the files of the certificate again, for new connections. Without TLS, there is nothing to read.
+    ///
+    /// # Errors
+    /// A file has a mistake; the server keeps its certificate.
+    pub fn reload_certificate(&self) -> Result<(), access::FileError> {
+        self.tls.as_ref().map_or(Ok(()), ServerTls::reload)
     }
 
     /// Replaces the list of webhooks. A message that is on its way is sent again.

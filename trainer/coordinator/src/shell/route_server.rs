@@ -6,6 +6,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use access::Scope;
+use access::tls::ServerTls;
 use axum::Router;
 use axum::extract::DefaultBodyLimit;
 use axum::middleware;
@@ -51,7 +52,8 @@ impl RouteServer {
             return Err(StartError::NoToken(config.listen));
         }
         let failed = |cause| StartError::Listen { address: config.listen, cause };
-        let listener = Listener::bind(config.listen, config.tls.clone()).await.map_err(failed)?;
+        let listener =
+            Listener::bind(config.listen, config.tls.as_ref().map(ServerTls::config)).await.map_err(failed)?;
         let address = listener.address().map_err(failed)?;
         let tokens = Arc::new(TokenTable::new(config.tokens.clone(), Vec::new()));
         let gate = Arc::new(Gate::new(tokens, &config.hosts, config.allowances.calls));

@@ -96,6 +96,10 @@ pub struct Task {
     /// Workers without enough memory for it; they do not get it again.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub too_small: Vec<WorkerId>,
+    /// Workers of the newest failed attempts, in order, at most [`Task::REMEMBERED`]. Each counts against them when the
+    /// task is granted again. Empty for gangs, which have rules of their own.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub failed_on: Vec<WorkerId>,
     /// Kept checkpoints, oldest first.
     pub checkpoints: Vec<Saved>,
     /// The last accepted report. A repeated report gets the same answer.
@@ -103,6 +107,9 @@ pub struct Task {
 }
 
 impl Task {
+    /// Number of failed attempts whose workers are known.
+    pub const REMEMBERED: usize = 8;
+
     /// Creates a task without attempts.
     pub fn new(id: TaskId, part: Part) -> Self {
         Self {
@@ -115,6 +122,7 @@ impl Task {
             losses: 0,
             streak: 0,
             too_small: Vec::new(),
+            failed_on: Vec::new(),
             checkpoints: Vec::new(),
             reported: None,
         }
@@ -157,6 +165,20 @@ impl Task {
     /// The grant of one holder.
     pub fn grant_of(&self, worker: &WorkerId, incarnation: Incarnation) -> Grant {
         Grant { task: self.id.clone(), attempt: self.attempt, fence: self.fence, worker: worker.clone(), incarnation }
+    }
+
+    /// Remembers that an attempt of its holders failed.
+    pub fn remember_failure(&mut self) {
+        if self.part != Part::Gang {
+            let holders: Vec<WorkerId> = self.holders().iter().map(|holder| holder.worker.clone()).collect();
+            self.failed_on.extend(holders);
+            self.failed_on.drain(..self.failed_on.len().saturating_sub(Self::REMEMBERED));
+        }
+    }
+
+    /// Number of remembered attempts that failed on `worker`.
+    pub fn failures_on(&self, worker: &WorkerId) -> usize {
+        self.failed_on.iter().filter(|failed| *failed == worker).count()
     }
 
     /// Starts a new attempt with these holders.
@@ -225,6 +247,7 @@ impl Task {
     pub fn reset_budgets(&mut self) {
         (self.faults, self.losses, self.streak) = (0, 0, 0);
         self.too_small.clear();
+        self.failed_on.clear();
         if let Lease::Waiting { not_before } = &mut self.lease {
             *not_before = None;
         }

@@ -96,6 +96,31 @@ fn p15_a_task_that_makes_progress_survives_any_number_of_losses() {
     assert_eq!(coordinator.run_state(&run), RunState::Failed);
 }
 
+/// The first worker by name dies of every attempt and is back before the next one.
+#[test]
+fn a_task_that_failed_goes_to_a_worker_on_which_it_failed_less_often() {
+    let mut coordinator = PureCoordinator::new(Policy::default());
+    let run = coordinator.submit("dataset", WorkerRange { min: 1, max: 1 });
+    for name in ["a", "b", "c"] {
+        coordinator.join(name);
+    }
+    let mut holders = Vec::new();
+    for _ in 0..5 {
+        let holder = ["a", "b", "c"].into_iter().find(|name| coordinator.assignment(name).is_some());
+        let holder = holder.expect("a worker has the task");
+        holders.push(holder);
+        if holder == "c" {
+            break;
+        }
+        coordinator.happen(Event::WorkerGone { worker: holder.into(), incarnation: None }).expect("taken");
+        coordinator.join(holder);
+        coordinator.now += 2_000;
+        coordinator.tick();
+    }
+    assert_eq!(holders, ["a", "b", "c"]);
+    assert_eq!(coordinator.run_state(&run), RunState::Running);
+}
+
 /// No attempt resumes a stage whose value is stored, so its checkpoints go with the report of the value.
 #[test]
 fn an_ended_stage_keeps_no_training_state() {

@@ -46,7 +46,7 @@ pub(crate) async fn start_with(dir: &Path, files: &Files, token: &Token, change:
     let store = Store::open(dir, Holder::this_process("a test")).await.unwrap();
     let mut tokens = Tokens::default();
     tokens.add("me", Scopes::all(), token);
-    let tls = Some(tls::server(&files.certificate, &files.key).unwrap());
+    let tls = Some(tls::ServerTls::read(&files.certificate, &files.key).unwrap());
     let mut config = Config { tls, ..Config::server(SocketAddr::from((Ipv4Addr::LOCALHOST, 0)), tokens) };
     change(&mut config);
     Coordinator::start(store, config).await.unwrap()
@@ -96,16 +96,41 @@ async fn only_the_pinned_authority_is_believed() {
     handle.shutdown().await;
 }
 
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_certificate_is_replaced_without_a_restart() {
+    let dir = tempfile::tempdir().unwrap();
+    let (old, new) = (authority(dir.path(), "old"), authority(dir.path(), "new"));
+    let token = Token::random();
+    let handle = start(&dir.path().join("store"), &old, &token).await;
+    let url = format!("https://localhost:{}", handle.address().port());
+    let opened = Server::new(&url, Some(token.clone()), Some(&old.ca)).unwrap();
+    let asked = || async { opened.request(Method::GET, "/v1/runs").send().await.unwrap().status() };
+    assert_eq!(asked().await, 200);
+
+    // Only one of the two files is there: nothing changes.
+    fs::copy(&new.certificate, &old.certificate).unwrap();
+    let refused = handle.reload_certificate().unwrap_err().to_string();
+    assert!(refused.contains("does not match the key"), "{refused}");
+    assert_eq!(ask(&url, &token, Some(&old.ca)).await.unwrap().0, 200);
+
+    fs::copy(&new.key, &old.key).unwrap();
+    handle.reload_certificate().unwrap();
+    assert_eq!(ask(&url, &token, Some(&new.ca)).await.unwrap().0, 200);
+    ask(&url, &token, Some(&old.ca)).await.unwrap_err();
+    assert_eq!(asked().await, 200, "an open connection goes on");
+    handle.shutdown().await;
+}
+
 #[test]
 fn keys_that_everybody_can_read_and_files_that_do_not_fit_are_refused() {
     let dir = tempfile::tempdir().unwrap();
     let (ours, theirs) = (authority(dir.path(), "ours"), authority(dir.path(), "theirs"));
-    assert!(tls::server(&ours.certificate, &ours.key).is_ok());
-    let mixed = tls::server(&ours.certificate, &theirs.key).unwrap_err().to_string();
+    assert!(tls::ServerTls::read(&ours.certificate, &ours.key).is_ok());
+    let mixed = tls::ServerTls::read(&ours.certificate, &theirs.key).unwrap_err().to_string();
     assert!(mixed.contains("does not match the key"), "{mixed}");
-    let swapped = tls::server(&ours.key, &ours.key).unwrap_err().to_string();
+    let swapped = tls::ServerTls::read(&ours.key, &ours.key).unwrap_err().to_string();
     assert!(swapped.contains("no certificate in PEM"), "{swapped}");
     fs::set_permissions(&ours.key, fs::Permissions::from_mode(0o644)).unwrap();
-    let open = tls::server(&ours.certificate, &ours.key).unwrap_err();
+    let open = tls::ServerTls::read(&ours.certificate, &ours.key).unwrap_err();
     assert!(open.to_string().contains("open to every user") && open.advice().is_some(), "{open}");
 }

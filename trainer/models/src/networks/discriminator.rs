@@ -2,8 +2,8 @@
 //! (arXiv:2501.19083), which says "linear layers, layer norm, activation, residual" and gives no sizes, and the image
 //! repository that it follows.
 //!
-//! A head is `h1 = a(LN(W1 f))`, `h2 = h1 + a(LN(W2 h1))`, `score = W3 h2` for each latent token, with `a` a leaky ReLU
-//! of slope 0.01. There is one head per block. Our choice: width of the blocks, LayerNorm (the image heads have
+//! A head is `h1 = a(LN(W1 f))`, `h2 = h1 + a(LN(W2 h1))`, `score = W3 h2` for each latent token, with `a` a leaky ReLU,
+//! of slope 0.01 in the image repository. There is one head per block. Our choice: width of the blocks, LayerNorm (the image heads have
 //! GroupNorm), a score per token.
 
 use burn::module::Module;
@@ -29,11 +29,13 @@ pub struct Head {
 pub struct Discriminator {
     /// Heads in the order of the blocks.
     pub heads: Vec<Head>,
+    /// Slope of the leaky ReLUs below zero.
+    pub slope: f64,
 }
 
 impl Discriminator {
-    /// Creates heads for a teacher of `layers` blocks of `width`.
-    pub fn new(layers: usize, width: usize, init: &mut Init<'_>) -> Self {
+    /// Creates heads for a teacher of `layers` blocks of `width`, with leaky ReLUs of `slope`.
+    pub fn new(layers: usize, width: usize, slope: f64, init: &mut Init<'_>) -> Self {
         let head = |_| Head {
             linear1: Linear::new(init, width, width),
             norm1: Norm::new(init, width),
@@ -41,16 +43,15 @@ impl Discriminator {
             norm2: Norm::new(init, width),
             score: Linear::new(init, width, 1),
         };
-        Self { heads: (0..layers).map(head).collect() }
+        Self { heads: (0..layers).map(head).collect(), slope }
     }
 
     /// Scores [B, N, 1] of each head on its features [B, N, H].
     pub fn forward(&self, features: Vec<Tensor<3>>) -> Vec<Tensor<3>> {
-        const SLOPE: f64 = 0.01;
         const EPS: f64 = 1e-5;
         let one = |(head, f): (&Head, Tensor<3>)| {
-            let h1 = head.norm1.leaky(head.linear1.forward(f), None, EPS, SLOPE);
-            let h2 = head.norm2.leaky(head.linear2.forward(h1.clone()), Some(h1), EPS, SLOPE);
+            let h1 = head.norm1.leaky(head.linear1.forward(f), None, EPS, self.slope);
+            let h2 = head.norm2.leaky(head.linear2.forward(h1.clone()), Some(h1), EPS, self.slope);
             head.score.forward(h2)
         };
         self.heads.iter().zip(features).map(one).collect()

@@ -49,15 +49,16 @@ struct State {
     codes: Vec<f32>,
     sums: Vec<f32>,
     counts: Vec<f32>,
+    decay: f64,
 }
 
 impl State {
-    fn start(codes: Vec<f32>, count: usize) -> Self {
-        Self { sums: codes.clone(), counts: vec![1.0; count], codes }
+    fn start(codes: Vec<f32>, count: usize, decay: f64) -> Self {
+        Self { sums: codes.clone(), counts: vec![1.0; count], codes, decay }
     }
 
     fn book(&mut self) -> Book<'_> {
-        Book { codes: &mut self.codes, sums: &mut self.sums, counts: &mut self.counts }
+        Book { codes: &mut self.codes, sums: &mut self.sums, counts: &mut self.counts, decay: self.decay }
     }
 }
 
@@ -79,7 +80,7 @@ fn alone(case: &str, config: &Value, expected: &Value, io: &Arrays, gates: &mut 
     let stored = |part: &str| io.get(&format!("{case}/{part}"));
     let start = |part: &str| io.find(&format!("{case}/start_{part}")).map(Array::f32s);
     let mut state = match (start("codebook"), start("sum"), start("count")) {
-        (Some(codes), Some(sums), Some(counts)) => Some(State { codes, sums, counts }),
+        (Some(codes), Some(sums), Some(counts)) => Some(State { codes, sums, counts, decay: number(&config["mu"]) }),
         _ => None,
     };
     let (mut used, mut since) = (vec![0.0; count], 0.0);
@@ -96,7 +97,7 @@ fn alone(case: &str, config: &Value, expected: &Value, io: &Arrays, gates: &mut 
                 noise
             });
             gates.check("after", format!("{case} start"), error(&first, &stored("codebook_after_init").values), EMA);
-            State::start(first, count)
+            State::start(first, count, number(&config["mu"]))
         });
         let codes = assign(&rows, &state.codes, dim, &device(), None);
         let taken: Vec<i64> = codes.iter().map(|code| *code as i64).collect();
@@ -153,7 +154,7 @@ fn stack(config: &Value, expected: &Value, io: &Arrays, gates: &mut Gates) {
                 let first = candidates(rows, count, dim, |_| unreachable!("enough rows"));
                 let wanted = stored(&format!("codebook_after_init/{layer}"));
                 gates.check("after", format!("rvq start {layer}"), error(&first, &wanted.values), EMA);
-                State::start(first, count)
+                State::start(first, count, number(&config["mu"]))
             });
             Cow::<[f32]>::Owned(state.codes.clone())
         };

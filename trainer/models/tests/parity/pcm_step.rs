@@ -101,6 +101,7 @@ fn heads(config: &Value, weights: &Path, device: &Device) -> Discriminator {
     let blank = Discriminator::new(
         size("num_layers"),
         size("hidden_dim"),
+        config["discriminator"]["leaky_relu_slope"].as_f64().expect("a slope"),
         &mut Init::new(Seed(1), "parity", Positions::Uniform, device),
     );
     assert_eq!(config["discriminator"]["heads"].as_u64(), Some(blank.heads.len() as u64), "one head a block");
@@ -346,7 +347,7 @@ impl<'a> Step<'a> {
                 / batch;
         loss("discriminator", &critic, &stored["discriminator"], gates);
         for (i, (fake, real)) in fakes.into_iter().zip(reals).enumerate() {
-            let head = Discriminator { heads: vec![fixture.heads.heads[i].clone()] };
+            let head = Discriminator { heads: vec![fixture.heads.heads[i].clone()], ..fixture.heads.clone() };
             let one = losses::hinge_generator(head.forward(vec![fake.clone()])) / batch;
             loss("head, generator", &one, &stored["head_generator_terms"][i], gates);
             let one = losses::hinge_discriminator(head.forward(vec![real]), head.forward(vec![fake])) / batch;

@@ -59,6 +59,7 @@ struct Loaded {
     books: Vec<Vec<f32>>,
     dim: usize,
     codes: usize,
+    decay: f64,
     format: DataFormat,
 }
 
@@ -66,6 +67,7 @@ fn load(config: &Value, weights: &Arrays, prefix: &str, device: &Device) -> Load
     let features = weights.get(&format!("{prefix}encoder.model.0.weight")).shape[1];
     let format = [DataFormat::Humanml3d, DataFormat::Kit].into_iter().find(|f| Skeleton::of(*f).features == features);
     let or = |key: &str, other: usize| config[key].as_u64().map_or(other, |v| v as usize);
+    let decay = config["mu"].as_f64().unwrap_or(0.99);
     let config = TokenizerConfig {
         features,
         dim: size(config, "code_dim"),
@@ -80,7 +82,7 @@ fn load(config: &Value, weights: &Arrays, prefix: &str, device: &Device) -> Load
     let layers = (0..).map_while(|q| weights.find(&format!("{prefix}quantizer.layers.{q}.codebook")));
     let books: Vec<Vec<f32>> = single.into_iter().chain(layers).map(Array::f32s).collect();
     let codes = books[0].len() / config.dim;
-    Loaded { network, codes, books, dim: config.dim, format: format.expect("a format with these features") }
+    Loaded { network, codes, decay, books, dim: config.dim, format: format.expect("a format with these features") }
 }
 
 /// Converts rows [B n, d] to [B, d, n].
@@ -257,7 +259,7 @@ fn train(loaded: &Loaded, prefix: &str, case: &str, expected: &Value, io: &Array
         };
         let (new_counts, new_sums) = layer.statistics(codes, dim);
         let rows = candidates(&layer.rows, codes, dim, |_| noise(2 * q + 1).expect("noise on tiled rows"));
-        let mut book = Book { codes: &mut books[q], sums: &mut sums, counts: &mut counts };
+        let mut book = Book { codes: &mut books[q], sums: &mut sums, counts: &mut counts, decay: loaded.decay };
         book.update(&new_sums, &new_counts, &rows);
         for (name, found) in [("codebook", &books[q]), ("code_sum", &sums), ("code_count", &counts)] {
             let wanted = of(&format!("after/{name}"), q).expect("the state after the step");

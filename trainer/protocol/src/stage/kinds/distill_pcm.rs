@@ -21,6 +21,9 @@ pub struct DistillPcm {
     pub discriminator_lr: f64,
     /// AdamW constants of the discriminator.
     pub discriminator_optimizer: Optimizer,
+    /// Slope below zero of the discriminator's leaky ReLUs, 0.01 in the image repository.
+    #[schemars(range(min = 0.0, max = 1.0))]
+    pub discriminator_slope: f64,
     /// Updates student and discriminator in alternate steps, as in the image repository; otherwise both in every step.
     /// The learning rate of each counts its own updates.
     pub alternate: bool,
@@ -36,6 +39,7 @@ impl Default for DistillPcm {
             adversarial: 0.1,
             discriminator_lr: 0.0,
             discriminator_optimizer: Optimizer::default(),
+            discriminator_slope: 0.01,
             alternate: false,
             distillation: Distillation::published(384_000, 128),
         }
@@ -65,6 +69,7 @@ impl StageSpec for DistillPcm {
         }
         p.not_negative("adversarial", self.adversarial);
         p.not_negative("discriminator_lr", self.discriminator_lr);
+        p.fraction("discriminator_slope", self.discriminator_slope, true);
         self.discriminator_optimizer.check(p, "discriminator_optimizer");
         if self.alternate && self.adversarial == 0.0 {
             let message = "`alternate` is true, but without `adversarial` there is no discriminator to alternate with";

@@ -31,9 +31,9 @@ pub struct EvaluateLatentFid {
     /// Number of principal components of the train latents in which distances are computed.
     #[schemars(range(min = 1, max = 4_096), extend("x-unit" = "components"))]
     pub components: usize,
-    /// Split of the real clips. Use `all` on small sets, where the distance of real to real is large; each split then
-    /// also has its own values (`latent_fid_test`). The distance of real latents to real ones accompanies each value:
-    /// `_floor`, `_halves`.
+    /// Split of the real clips. With `all`, each split also has its own values (`latent_fid_val`), if it has enough
+    /// entries. The distance of real latents to real ones accompanies each value: `_floor`, `_halves`. It is large on
+    /// small sets.
     pub split: Split,
     /// Number of shards.
     #[schemars(range(min = 1, max = crate::limits::SHARDS), extend("x-unit" = "shards"))]
@@ -51,7 +51,7 @@ impl Default for EvaluateLatentFid {
             repeats: 5,
             samples: 2,
             components: 32,
-            split: Split::All,
+            split: Split::Val,
             shards: 5,
         }
     }

@@ -101,6 +101,13 @@ pub struct TrainTokenizer {
     pub drawn: bool,
     /// Codes that are replaced by rows of the batch.
     pub resets: Resets,
+    /// Decay of the codebooks' running statistics in each update ("mu" upstream).
+    #[schemars(range(min = 0.0, max = 1.0))]
+    pub codebook_decay: f64,
+    /// Divisor of the deviations of root and contact features, which increases their weight. 25 in MoMask, T2M-GPT and
+    /// MMM, whose code divides the stored deviations by 5 twice.
+    #[schemars(range(min = 1e-3, max = 1e3))]
+    pub feature_bias: f64,
     /// Size of encoder and decoder.
     pub network: TokenizerNetwork,
     /// Weights of the loss terms.
@@ -130,6 +137,8 @@ impl Default for TrainTokenizer {
             quantize_dropout: 0.2,
             drawn: true,
             resets: Resets::Always,
+            codebook_decay: 0.99,
+            feature_bias: 1.0,
             network: TokenizerNetwork::default(),
             loss: TokenizerLoss::default(),
             window: 64,
@@ -192,7 +201,9 @@ impl StageSpec for TrainTokenizer {
                 format!("the largest dilation is `network.growth` to the power of `network.depth`, {growth}^{depth}");
             p.add("network.growth", message, "expected at most 10000 frames");
         }
+        p.above_zero("feature_bias", self.feature_bias);
         p.fraction("network.dropout", self.network.dropout, true);
+        p.fraction("codebook_decay", self.codebook_decay, true);
         p.fraction("quantize_dropout", self.quantize_dropout, false);
         if self.window < UNIT || !self.window.is_multiple_of(UNIT) {
             let message = format!("`window` is {}; expected a multiple of {UNIT}", self.window);

@@ -140,7 +140,7 @@ impl Gang for DistillPcm {
             let purpose = format!("{}/heads", cx.task().name);
             let network = &distiller.teacher_meta.network;
             let mut init = Init::new(cx.task().seed, &purpose, network.positions, &device);
-            Discriminator::new(network.layers, network.width, &mut init)
+            Discriminator::new(network.layers, network.width, self.discriminator_slope, &mut init)
         });
         let mut objective = Pcm { distiller, settings: self.clone(), phases, heads };
         train(&mut objective, &self.distillation.training, cx)?.publish(|state| {

@@ -257,14 +257,6 @@ impl Objective for EvaluatorObjective {
     }
 }
 
-/// The dataset's deviations; those of root and contacts are divided by `emphasis`.
-fn emphasised(dataset: &Dataset, emphasis: f64) -> Vec<f32> {
-    let layout = dataset.skeleton().layout();
-    let close = |i: usize| i < layout.positions.start || layout.contacts.contains(&i);
-    let scale = |(i, std): (usize, &f32)| if close(i) { (f64::from(*std) / emphasis) as f32 } else { *std };
-    dataset.std.iter().enumerate().map(scale).collect()
-}
-
 impl Gang for TrainEvaluator {
     fn run(&self, cx: &mut dyn GangContext) -> Result<Outcome, StageError> {
         let dataset = artifacts::input_dataset(cx)?;
@@ -286,7 +278,7 @@ impl Gang for TrainEvaluator {
             format: dataset.format,
             config: evaluator::config(&self.network, dataset.skeleton()),
             mean: dataset.mean.clone(),
-            std: emphasised(&dataset, self.emphasis),
+            std: dataset.biased_std(self.emphasis),
             words: words.meta(),
             origin: "trained".into(),
         };

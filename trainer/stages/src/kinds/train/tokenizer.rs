@@ -269,7 +269,8 @@ impl Objective for VqObjective {
             let take = |after: &AfterStep<'_>, what: &str| after.buffers.get(&of(what, q)).to_vec();
             let (mut book, mut sums, mut counts) =
                 (take(&*after, "codebook"), take(&*after, "sums"), take(&*after, "counts"));
-            let mut state = Book { codes: &mut book, sums: &mut sums, counts: &mut counts };
+            let decay = self.settings.codebook_decay;
+            let mut state = Book { codes: &mut book, sums: &mut sums, counts: &mut counts, decay };
             if let Some(first) = &first {
                 state.start(&first[q]);
             }
@@ -298,7 +299,8 @@ impl Objective for VqObjective {
 
 impl Gang for TrainTokenizer {
     fn run(&self, cx: &mut dyn GangContext) -> Result<Outcome, StageError> {
-        let windows = TokenWindows::read(cx, self.window, self.windows_of)?;
+        let mut windows = TokenWindows::read(cx, self.window, self.windows_of)?;
+        windows.dataset.std = windows.dataset.biased_std(self.feature_bias);
         let dataset = &windows.dataset;
         let meta = TokenizerMeta {
             format: dataset.format,

@@ -107,16 +107,10 @@ impl FeatureData {
         if train.is_empty() {
             return Err(no_clips());
         }
-        let layout = dataset.skeleton().layout();
-        let biased = |i: usize| i < layout.positions.start || layout.contacts.contains(&i);
-        let std = dataset.std.iter().enumerate().map(|(i, std)| match biased(i) {
-            true => *std / rules.bias as f32,
-            false => *std,
-        });
         let (seed, stage, global) = (cx.task().seed, cx.task().name.clone(), training.batch.global);
         let pool = if rules.whole { 1 } else { POOL };
         Ok(Self {
-            std: std.collect(),
+            std: dataset.biased_std(rules.bias),
             order: RefCell::new(Order::new(seed, stage.as_str(), train.len(), global, pool)),
             dataset,
             words,
