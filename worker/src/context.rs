@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use burn::tensor::Device;
 use checkpoint::{BlobError, Blobs};
-use protocol::message::{CommitCheckpoint, Progress, StageTask};
+use protocol::message::{CommitCheckpoint, Progress, StageTask, TaskOutcome};
 use protocol::proof::Vouched;
 use protocol::{ArtifactKind, Digest, Manifest};
 use stages::context::{Adopted, AttemptContext, ContextError, Exchange, GangContext, Rendezvous};
@@ -25,6 +25,7 @@ use crate::gang::tree;
 use crate::process;
 use crate::receipts::Receipts;
 use crate::retry::{self, GaveUp};
+use crate::stage_log::{self, Pace};
 use crate::telemetry_buffer::{Sender, TelemetryBuffer};
 
 /// Access of one attempt to the coordinator and, in a gang, to its peers.
@@ -42,6 +43,10 @@ pub(crate) struct HttpContext {
     /// End of the last exchange or rendezvous.
     computes_since: Instant,
     gang: bool,
+    /// True once this attempt has met a gang.
+    has_met: bool,
+    begun: Instant,
+    pace: Pace,
     _sender: Sender,
 }
 
@@ -75,13 +80,53 @@ impl HttpContext {
         });
         let (telemetry, sender) = TelemetryBuffer::open(held.clone(), client.clone());
         let task = assignment.stage;
-        let (mesh, behind, computes_since) = (None, None, Instant::now());
-        Self { task, device, data, held, client, blobs, telemetry, mesh, behind, computes_since, gang, _sender: sender }
+        let (mesh, behind, now) = (None, None, Instant::now());
+        let (computes_since, has_met, begun, pace) = (now, false, now, Pace::new(now));
+        let _sender = sender;
+        Self {
+            task,
+            device,
+            data,
+            held,
+            client,
+            blobs,
+            telemetry,
+            mesh,
+            behind,
+            computes_since,
+            gang,
+            has_met,
+            begun,
+            pace,
+            _sender,
+        }
     }
 
     /// Waits until all recorded metrics and log lines are stored.
     pub(crate) fn flush(&self) -> Result<(), ContextError> {
         self.telemetry.flush().map_err(given_up)
+    }
+
+    /// Logs the attempt's settings and inputs.
+    pub(crate) fn log_opening(&mut self) {
+        if !self.held.leads() {
+            return;
+        }
+        let assignment = self.held.assignment();
+        self.log(&stage_log::opening(&assignment));
+        if !stage_log::tells_settings(&assignment.role) {
+            return;
+        }
+        for (field, digest) in &assignment.stage.inputs {
+            // An input that cannot be read is the stage's to report.
+            self.log(&stage_log::input(field, *digest, self.manifest(*digest).ok().as_ref()));
+        }
+    }
+
+    /// Logs the end of the attempt.
+    pub(crate) fn log_end(&mut self, outcome: &TaskOutcome) {
+        let line = stage_log::end(outcome, self.begun.elapsed());
+        self.log(&line);
     }
 
     /// Receipts that prove the uploads of a manifest by this attempt.
@@ -147,8 +192,13 @@ impl HttpContext {
     }
 
     /// Logs that the members agree on a state. `adopted` holds the bytes and the seconds of a transfer to this member.
-    fn met(&mut self, mesh: &Mesh, adopted: Option<(usize, f64)>) {
+    fn met(&mut self, mesh: &Mesh, step: Option<u64>, adopted: Option<(usize, f64)>) {
         self.computes_since = Instant::now();
+        self.pace.begins_at(step.unwrap_or_default(), self.computes_since);
+        if self.has_met && mesh.config.rank == 0 {
+            self.log(&stage_log::regrouped(mesh.config.generation, mesh.size(), step));
+        }
+        self.has_met = true;
         tracing::info!(
             task = %mesh.config.task,
             generation = %mesh.config.generation,
@@ -219,7 +269,11 @@ impl AttemptContext for HttpContext {
 
     fn progress(&mut self, done: u64, total: u64, unit: &str, metrics: &[(&str, f64)]) {
         let metrics = metrics.iter().filter(|(_, v)| v.is_finite()).map(|(k, v)| ((*k).to_owned(), *v)).collect();
-        self.held.set_progress(Progress { done, total, unit: unit.to_owned(), metrics });
+        let progress = Progress { done, total, unit: unit.to_owned(), metrics };
+        if let Some(line) = self.pace.line(&progress, Instant::now()).filter(|_| self.held.leads()) {
+            self.log(&line);
+        }
+        self.held.set_progress(progress);
     }
 
     fn record(&mut self, step: u64, metrics: &[(&str, f64)]) {
@@ -272,7 +326,7 @@ impl GangContext for HttpContext {
                     return Ok(Rendezvous::Behind);
                 }
                 Ok(Met::Keep) => {
-                    self.met(&mesh, None);
+                    self.met(&mesh, applied, None);
                     return Ok(Rendezvous::Keep);
                 }
                 Err(halt) => self.halted(&mesh, halt)?,
@@ -293,7 +347,7 @@ impl GangContext for HttpContext {
                 taken.map_err(|why| ContextError::Fault(format!("a peer's list of recorded values {why}")))?;
                 self.held.set_holds(Some(step));
                 let bytes = state.iter().map(|piece| piece.len()).sum::<usize>() + rest.len();
-                self.met(&mesh, Some((bytes, begun.elapsed().as_secs_f64())));
+                self.met(&mesh, Some(step), Some((bytes, begun.elapsed().as_secs_f64())));
                 Ok(Adopted::Whole)
             }
             Err(halt) => {
@@ -405,6 +459,7 @@ impl GangContext for HttpContext {
         })?;
         failpoints::hit("checkpoint::after_commit");
         self.held.committed(digest);
+        self.log(&stage_log::checkpoint(step, manifest, &metrics));
         Ok(())
     }
 }

@@ -30,6 +30,7 @@ mod receipts;
 mod retry;
 mod sandbox;
 mod stage_limits;
+mod stage_log;
 mod stage_thread;
 mod telemetry_buffer;
 #[cfg(test)]

@@ -71,6 +71,7 @@ fn attempt(held: &Arc<ActiveAssignment>, bench: &Bench) {
         bench.data.clone(),
         bench.device.clone(),
     );
+    context.log_opening();
     let part = |part, context: &mut HttpContext| bench.kinds.part(context, part).map(Done::Stage);
     let stage = AssertUnwindSafe(|| match assignment.role {
         Role::Alone => bench.kinds.alone(&mut context).map(Done::Stage),
@@ -84,7 +85,7 @@ fn attempt(held: &Arc<ActiveAssignment>, bench: &Bench) {
     });
     let caught = stage_limits::within(&bench.limits, held, &bench.client, || panic::catch_unwind(stage));
     let result = caught.unwrap_or_else(|payload| Err(StageError::Fault(panic_message(&*payload))));
-    let Some(outcome) = outcome(result, held, &context) else { return };
+    let Some(outcome) = outcome(result, held, &mut context) else { return };
 
     failpoints::hit("outcome::before_report");
     let receipts = match &outcome {
@@ -136,45 +137,68 @@ enum Done {
 }
 
 /// The outcome to report. `None` if the grant has ended, or if rank 0 reports it.
-fn outcome(result: Result<Done, StageError>, held: &ActiveAssignment, context: &HttpContext) -> Option<TaskOutcome> {
+fn outcome(
+    result: Result<Done, StageError>,
+    held: &ActiveAssignment,
+    context: &mut HttpContext,
+) -> Option<TaskOutcome> {
     let task = held.grant().task;
-    let result = match result {
-        // Recorded values belong to the outcome; without them the outcome is not reported.
-        Ok(outcome) => context.flush().map(|()| outcome).map_err(StageError::from),
-        Err(error) => Err(error),
+    let outcome = match told(result) {
+        Ok(outcome) => outcome,
+        Err(reason) => {
+            tracing::info!(%task, "dropped: {reason}");
+            return None;
+        }
     };
-    if let Some(reason) = held.ended() {
-        tracing::info!(%task, "dropped: {reason}");
-        return None;
+    let has_failed = matches!(outcome, TaskOutcome::Failed { .. });
+    if let TaskOutcome::Failed { message, .. } = &outcome {
+        tracing::error!(%task, "{message}");
     }
-    match result {
+    if has_failed || held.leads() {
+        context.log_end(&outcome);
+    }
+    // Recorded values belong to the outcome; without them the outcome is not reported. A failure is reported anyway, after the
+    // lines before it, so that they can be read.
+    let outcome = match context.flush() {
+        Err(error) if has_failed => {
+            tracing::warn!(%task, "the last lines of a failed attempt are lost: {error}");
+            Ok(outcome)
+        }
+        Err(error) => told(Err(error.into())),
+        Ok(()) => Ok(outcome),
+    };
+    let outcome = held.ended().map_or(outcome, Err);
+    match outcome {
+        Err(reason) => {
+            tracing::info!(%task, "dropped: {reason}");
+            None
+        }
+        Ok(outcome @ TaskOutcome::Failed { .. }) => Some(outcome),
         Ok(_) if !held.leads() => {
             tracing::info!(%task, "end; rank 0 reports");
             None
         }
-        Ok(Done::Resolved(digests)) => Some(TaskOutcome::Resolved { digests }),
+        Ok(outcome) => Some(outcome),
+    }
+}
+
+/// The outcome that a result means, or why the grant has ended.
+fn told(result: Result<Done, StageError>) -> Result<TaskOutcome, String> {
+    match result {
+        Ok(Done::Resolved(digests)) => Ok(TaskOutcome::Resolved { digests }),
         Ok(Done::Stage(Outcome::Finished { output, metrics })) => {
             let metrics = metrics.into_iter().filter(|(_, value)| value.is_finite()).collect();
-            Some(TaskOutcome::Finished { output, metrics })
+            Ok(TaskOutcome::Finished { output, metrics })
         }
-        Ok(Done::Stage(Outcome::Yielded { at })) => Some(TaskOutcome::Yielded { at }),
-        Err(StageError::Context(ContextError::GrantEnded(reason))) => {
-            tracing::info!(%task, "dropped: {reason}");
-            None
-        }
+        Ok(Done::Stage(Outcome::Yielded { at })) => Ok(TaskOutcome::Yielded { at }),
+        Err(StageError::Context(ContextError::GrantEnded(reason))) => Err(reason),
         Err(error) => {
             let message = error.to_string();
-            tracing::error!(%task, "{message}");
-            // Store the lines before the failure first, so that they can be read. If that fails, the failure is still
-            // reported.
-            if let Err(error) = context.flush() {
-                tracing::warn!(%task, "the last lines of a failed attempt are lost: {error}");
-            }
             let class = match error.class() {
                 FailureClass::Fault if is_out_of_memory(&message) => FailureClass::OutOfMemory,
                 class => class,
             };
-            Some(TaskOutcome::Failed { class, message })
+            Ok(TaskOutcome::Failed { class, message })
         }
     }
 }

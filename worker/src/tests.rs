@@ -255,10 +255,12 @@ fn p9_everything_arrives_once_though_answers_are_lost() {
     assert_eq!(steps, (1..=100).collect::<Vec<_>>());
     assert_eq!(coordinator.metrics.len(), 100);
     assert_eq!(coordinator.odd.len(), 100, "what is not a number comes as such");
-    assert_eq!(
-        coordinator.logs.values().cloned().collect::<Vec<_>>(),
-        (1..=10).map(|i| format!("saving at {}", i * 10)).collect::<Vec<_>>()
-    );
+    let logs: Vec<&str> = coordinator.logs.values().map(String::as_str).collect();
+    let saved = |i: u64| [format!("saving at {}", i * 10), format!("checkpoint after step {}, 0 bytes", i * 10)];
+    assert_eq!(logs[1..21], (1..=10).flat_map(saved).collect::<Vec<_>>());
+    assert!(logs[0].starts_with("attempt 1: ") && logs[0].contains("generation 1 of 1 member, seed "), "{logs:#?}");
+    assert!(logs[21].starts_with("finished in ") && logs[21].ends_with(", loss 0.500000"), "{logs:#?}");
+    assert_eq!(logs.len(), 22);
     assert!(matches!(coordinator.outcomes[..], [ReportOutcome { outcome: TaskOutcome::Finished { .. }, .. }]));
     assert_eq!(coordinator.joins, 1);
 }
@@ -426,7 +428,9 @@ fn a_panic_is_a_fault_with_its_place() {
     };
     assert_eq!(*class, FailureClass::Fault);
     assert!(message.contains("tests.rs") && message.ends_with("the tensor 3 is upside down"), "{message}");
-    assert_eq!(coordinator.logs.values().collect::<Vec<_>>(), ["about to fail"]);
+    let logs: Vec<&String> = coordinator.logs.values().collect();
+    assert!(logs.len() == 3 && logs[1] == "about to fail", "{logs:#?}");
+    assert!(logs[2].starts_with("failed after ") && logs[2].ends_with(message), "{logs:#?}");
 }
 
 #[test]

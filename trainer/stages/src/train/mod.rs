@@ -28,6 +28,7 @@ use std::collections::BTreeMap;
 use burn::tensor::Device;
 use protocol::message::StageTask;
 use protocol::stage::Training;
+use protocol::units::grouped;
 use protocol::{ArtifactKind, Digest};
 use serde_json::json;
 
@@ -162,7 +163,11 @@ pub fn train(
     let config = cx.task().settings.digest();
     let accelerator = Some(cx.device()).filter(models::device::is_accelerator);
     let (groups, buffers) = (objective.groups(), objective.buffers());
-    check_size(TrainState::bytes_of(&groups, &buffers), cx.most_blob_bytes())?;
+    let bytes = TrainState::bytes_of(&groups, &buffers);
+    check_size(bytes, cx.most_blob_bytes())?;
+    if cx.leads() {
+        cx.log(&parameters(&groups, bytes));
+    }
     let mut state = TrainState::new(groups, buffers);
     let mut saved_at = begin(objective, &mut state, cx)?;
     let mut save_is_due = false;
@@ -266,6 +271,14 @@ pub fn train(
 
 /// An upper estimate of the size of a saved state's header; ours have some hundred bytes.
 const HEADER_BYTES: u64 = 1 << 20;
+
+/// Tells the parameters by group, and the size of the whole state.
+fn parameters(groups: &[GroupPlan], bytes: u64) -> String {
+    let count = |group: &GroupPlan| grouped(group.params.len() as u64);
+    let each: Vec<String> = groups.iter().map(|group| format!("{} {}", group.name, count(group))).collect();
+    let all = grouped(groups.iter().map(|group| group.params.len() as u64).sum());
+    format!("trains {all} parameters ({}), with a state of {} bytes", each.join(", "), grouped(bytes))
+}
 
 /// Refuses a state that the store would not take at the first checkpoint.
 fn check_size(bytes: u64, most: u64) -> Result<(), StageError> {

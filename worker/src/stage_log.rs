@@ -1,0 +1,153 @@
+//! The lines that every stage has in its log, of whatever kind it is: its settings, its inputs, its pace, its end.
+//!
+//! Kinds add lines of their own through [`AttemptContext::log`](stages::context::AttemptContext::log).
+
+use std::collections::BTreeMap;
+use std::time::{Duration, Instant};
+
+use protocol::message::{Assignment, Progress, Role, TaskOutcome};
+use protocol::units::grouped;
+use protocol::{Digest, Manifest};
+
+/// Time between two lines on the progress of a stage.
+const BETWEEN_LINES: Duration = Duration::from_secs(60);
+
+/// False for all shards of a stage but the first: their settings and inputs are the same.
+pub(crate) fn tells_settings(role: &Role) -> bool {
+    !matches!(role, Role::Shard { index: 1.., .. } | Role::Merge { .. })
+}
+
+/// The first line of an attempt: the stage's kind, this worker's part in it, and once a stage the settings with all defaults.
+pub(crate) fn opening(assignment: &Assignment) -> String {
+    let Assignment { grant, stage, role, .. } = assignment;
+    let part = match role {
+        Role::Alone => String::new(),
+        Role::Shard { index, of } => format!(", shard {} of {of}", index + 1),
+        Role::Merge { shards } => format!(", merge of {} shards", shards.len()),
+        Role::Resolve => ", digests of its files".to_owned(),
+        Role::Member { members, generation, .. } => {
+            format!(", generation {generation} of {}", counted(members.len() as u64, "member"))
+        }
+    };
+    let mut line = format!("attempt {}: {}{part}", grant.attempt, stage.settings.kind());
+    if tells_settings(role) {
+        let settings = serde_json::to_string(&stage.settings).unwrap_or_default();
+        line = format!("{line}, seed {}, {settings}", stage.seed);
+    }
+    line
+}
+
+/// A line on an input. Of its meta only counts are told, since texts in it may come from files.
+pub(crate) fn input(field: &str, digest: Digest, manifest: Option<&Manifest>) -> String {
+    let Some(manifest) = manifest else { return format!("reads `{field}` {}", digest.short()) };
+    let counts = manifest.meta.as_object().into_iter().flatten();
+    let counts = counts.filter_map(|(name, value)| Some(format!(", {name} {}", grouped(value.as_u64()?))));
+    let counts: String = counts.collect();
+    let bytes = grouped(manifest.files.values().map(|file| file.bytes).sum());
+    format!("reads `{field}` {}: {}{counts}, {bytes} bytes", digest.short(), manifest.kind.noun())
+}
+
+/// A line on a committed checkpoint.
+pub(crate) fn checkpoint(step: u64, manifest: &Manifest, metrics: &BTreeMap<String, f64>) -> String {
+    let bytes = grouped(manifest.files.values().map(|file| file.bytes).sum());
+    format!("checkpoint after step {}, {bytes} bytes{}", grouped(step), values(metrics))
+}
+
+/// A line on a gang whose members have met again.
+pub(crate) fn regrouped(generation: impl std::fmt::Display, members: usize, step: Option<u64>) -> String {
+    let from = step.map(|step| format!(" after step {}", grouped(step))).unwrap_or_default();
+    format!("regrouped{from}: generation {generation} of {}", counted(members as u64, "member"))
+}
+
+/// The last line of an attempt.
+pub(crate) fn end(outcome: &TaskOutcome, took: Duration) -> String {
+    let seconds = took.as_secs_f64();
+    match outcome {
+        TaskOutcome::Finished { output, metrics } => {
+            let values = values(metrics);
+            format!("finished in {seconds:.1} s: {}{values}", output.short())
+        }
+        TaskOutcome::Resolved { digests } => {
+            format!("digested {} in {seconds:.1} s", counted(digests.len() as u64, "input"))
+        }
+        TaskOutcome::Yielded { at } => format!("stopped after {seconds:.1} s, at {}", grouped(*at)),
+        TaskOutcome::Failed { message, .. } => format!("failed after {seconds:.1} s: {message}"),
+    }
+}
+
+/// Chooses the moments for lines on the progress of a stage: one a minute.
+#[derive(Debug)]
+pub(crate) struct Pace {
+    since: Instant,
+    done: u64,
+}
+
+impl Pace {
+    pub(crate) fn new(now: Instant) -> Self {
+        Self { since: now, done: 0 }
+    }
+
+    /// Counts work of an earlier attempt or of a peer, which says nothing on the pace of this one.
+    pub(crate) fn begins_at(&mut self, done: u64, now: Instant) {
+        *self = Self { since: now, done };
+    }
+
+    /// The line on `progress`, if it is due.
+    pub(crate) fn line(&mut self, progress: &Progress, now: Instant) -> Option<String> {
+        let took = now.saturating_duration_since(self.since);
+        if took < BETWEEN_LINES {
+            return None;
+        }
+        let Progress { done, total, unit, metrics } = progress;
+        let rate = done.saturating_sub(self.done) as f64 / took.as_secs_f64();
+        *self = Self { since: now, done: *done };
+        let values = values(metrics);
+        Some(format!("{} of {} {unit}, {rate:.3} a second{values}", grouped(*done), grouped(*total)))
+    }
+}
+
+fn counted(count: u64, noun: &str) -> String {
+    format!("{} {noun}{}", grouped(count), if count == 1 { "" } else { "s" })
+}
+
+fn values(metrics: &BTreeMap<String, f64>) -> String {
+    metrics.iter().map(|(key, value)| format!(", {key} {value:.6}")).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_stage_tells_its_pace_once_a_minute() {
+        let begun = Instant::now();
+        let mut pace = Pace::new(begun);
+        let mut lines = Vec::new();
+        for second in 0..150 {
+            let metrics = BTreeMap::from([("loss".to_owned(), 0.25)]);
+            let progress = Progress { done: 20 * second, total: 6000, unit: "steps".to_owned(), metrics };
+            lines.extend(pace.line(&progress, begun + Duration::from_secs(second)));
+        }
+        assert_eq!(
+            lines,
+            [
+                "1,200 of 6,000 steps, 20.000 a second, loss 0.250000",
+                "2,400 of 6,000 steps, 20.000 a second, loss 0.250000"
+            ]
+        );
+        pace.begins_at(5000, begun + Duration::from_secs(200));
+        let progress = Progress { done: 5060, total: 6000, unit: "steps".to_owned(), metrics: BTreeMap::new() };
+        let line = pace.line(&progress, begun + Duration::from_secs(260));
+        assert_eq!(line.as_deref(), Some("5,060 of 6,000 steps, 1.000 a second"), "work of others is not its pace");
+    }
+
+    #[test]
+    fn an_input_tells_counts_and_no_texts() {
+        let digest = Digest::of(b"a manifest");
+        let meta = serde_json::json!({"clips": 1204, "secret": "a text of a file", "format": {"deep": 3}});
+        let manifest = Manifest::new(protocol::ArtifactKind::Dataset, meta);
+        let line = input("dataset", digest, Some(&manifest));
+        assert_eq!(line, format!("reads `dataset` {}: dataset, clips 1,204, 0 bytes", digest.short()));
+        assert_eq!(input("dataset", digest, None), format!("reads `dataset` {}", digest.short()));
+    }
+}
