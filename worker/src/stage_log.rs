@@ -147,7 +147,7 @@ mod tests {
         let meta = serde_json::json!({"clips": 1204, "secret": "a text of a file", "format": {"deep": 3}});
         let manifest = Manifest::new(protocol::ArtifactKind::Dataset, meta);
         let line = input("dataset", digest, Some(&manifest));
-        assert_eq!(line, format!("reads `dataset` {}: dataset, clips 1,204, 0 bytes", digest.short()));
+        assert_eq!(line, format!("reads `dataset` {}: a dataset, clips 1,204, 0 bytes", digest.short()));
         assert_eq!(input("dataset", digest, None), format!("reads `dataset` {}", digest.short()));
     }
 }
