@@ -227,8 +227,9 @@ struct RegistryArgs {
 
 /// Runs the command that the process was started with.
 pub(crate) fn main() -> ExitCode {
-    // A server's messages have many readers; those of other commands only their own user.
-    if std::env::args_os().nth(1).is_none_or(|verb| verb != "serve") {
+    // Messages of servers and workers have many readers; those of other commands only their own user. Messages about
+    // arguments quote files too, so this comes before the arguments are read.
+    if std::env::args_os().nth(1).is_none_or(|verb| !["serve", "worker", "demo"].iter().any(|other| verb == *other)) {
         protocol::show_excerpts();
     }
     let cli = match Cli::try_parse() {

@@ -170,6 +170,7 @@ fn latent_fid(shards: usize, sampler: Sampler, teacher: bool) -> StageSettings {
         sampler,
         repeats: 2,
         components: 4,
+        split: Split::All,
         shards,
         ..EvaluateLatentFid::default()
     })
