@@ -26,10 +26,13 @@ def cells(nbformat: Any) -> list[Any]:
     return found
 
 
-def kinds(notebook: Any) -> list[tuple[str, list[list[str]]]]:
-    """Source of each cell, and the forms of its outputs."""
-    outputs = [[sorted(output.get("data", {"text": ""})) for output in cell.get("outputs", [])] for cell in notebook.cells]
-    return [(cell.source, forms) for cell, forms in zip(notebook.cells, outputs)]
+def kinds(notebook: Any) -> list[tuple[str, list[str]]]:
+    """Source of each cell, and the forms of its outputs: printed lines come in one output or in several."""
+
+    def forms(cell: Any) -> list[str]:
+        return sorted({" ".join(sorted(output.get("data", {"text": ""}))) for output in cell.get("outputs", [])})
+
+    return [(cell.source, forms(cell)) for cell in notebook.cells]
 
 
 def test_the_notebook_runs_and_is_as_it_was_run(
