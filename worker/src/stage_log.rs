@@ -1,4 +1,4 @@
-//! The lines that every stage has in its log, of whatever kind it is: its settings, its inputs, its pace, its end.
+//! The lines that every stage writes to its log: settings, inputs, pace and end.
 //!
 //! Kinds add lines of their own through [`AttemptContext::log`](stages::context::AttemptContext::log).
 
@@ -37,7 +37,7 @@ pub(crate) fn opening(assignment: &Assignment) -> String {
     line
 }
 
-/// A line on an input. Of its meta only counts are told, since texts in it may come from files.
+/// A line about an input. It gives only counts of its meta, because texts in it may come from files.
 pub(crate) fn input(field: &str, digest: Digest, manifest: Option<&Manifest>) -> String {
     let Some(manifest) = manifest else { return format!("reads `{field}` {}", digest.short()) };
     let counts = manifest.meta.as_object().into_iter().flatten();

@@ -1,5 +1,5 @@
-//! `trainer demo`: a teacher and its one-step student, which come with the program, draw the same sentences; then, if
-//! asked, a page on which they draw, or the training that made them.
+//! `trainer demo`: a teacher and its one-step student, which come with the program, draw the same sentences. Options serve
+//! a page on which they draw, or repeat their training.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};

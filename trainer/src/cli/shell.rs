@@ -38,7 +38,7 @@ complete -F _trainer_with_names -o nosort -o bashdefault -o default trainer
 const FISH: &str = r#"
 complete -c trainer -f -n "test -n \"(trainer names -- (commandline -cp) 2>/dev/null)\"" -a "(trainer names -- (commandline -cp) 2>/dev/null)"
 "#;
-/// What the script for zsh completes runs and models by, and what replaces it.
+/// Parts of the script for zsh that name runs and models, each with its replacement.
 const ZSH: [(&str, &str); 3] = [
     (":run -- ", r#"{compadd -- ${(f)"$(trainer names -- "status ")"}}"#),
     (":MODEL:", r#"{compadd -- ${(f)"$(trainer names -- "time ")"}}"#),
