@@ -21,10 +21,10 @@
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// Numbers of deleted rows.
+/// Counts of deleted rows, and the stages that were kept.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct Forgotten {
-    /// Number of values by step.
+    /// Number of metric values.
     pub values: u64,
     /// Number of log lines.
     pub lines: u64,

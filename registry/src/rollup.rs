@@ -1,5 +1,5 @@
-//! Roll-ups: what consecutive values of a series come to. They are kept beside the values, so that a curve of a million values is read in
-//! the time of some thousand rows, and every value counts in what is read.
+//! Roll-ups: aggregates of consecutive values of a series. They are stored beside the values, so a curve of a million
+//! values is read in the time of some thousand rows, and every value counts.
 //!
 //! A bucket counts values, not steps: a value that is recorded every fifty steps would fill no bucket of steps.
 

@@ -18,9 +18,10 @@ use crate::blobs::HttpBlobs;
 use crate::cache::Cache;
 use crate::client::{CallError, Client};
 use crate::failpoints;
-use crate::gang::exchange::{self, Contribution, Met};
+use crate::gang::exchange::{self, Contribution};
 use crate::gang::member::Phase;
 use crate::gang::mesh::{Halt, Mesh};
+use crate::gang::rendezvous::{self, Met};
 use crate::gang::tree;
 use crate::process;
 use crate::receipts::Receipts;
@@ -320,7 +321,7 @@ impl GangContext for HttpContext {
             let kept = self.telemetry.kept();
             let length = (kept.len() as u64).to_le_bytes();
             let offered: Vec<&[u8]> = state.iter().copied().chain([&kept[..], &length[..]]).collect();
-            match exchange::rendezvous(&mesh, applied, &offered, &|| held.halt(generation)) {
+            match rendezvous::rendezvous(&mesh, applied, &offered, &|| held.halt(generation)) {
                 Ok(Met::Behind(source, step)) => {
                     self.behind = Some(Behind { mesh, source, step, applied, begun: Instant::now() });
                     return Ok(Rendezvous::Behind);
@@ -339,7 +340,7 @@ impl GangContext for HttpContext {
         let held = self.held.clone();
         let generation = mesh.config.generation;
         let directly = applied.is_none();
-        match exchange::adopt(&mesh, source, state, directly, &|| held.halt(generation)) {
+        match rendezvous::adopt(&mesh, source, state, directly, &|| held.halt(generation)) {
             Ok(rest) => {
                 let rows = rows(&rest).ok_or_else(|| "is truncated".to_owned());
                 let taken = rows.and_then(|rows| self.telemetry.take_over(rows, applied).map_err(|e| e.to_string()));

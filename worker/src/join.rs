@@ -88,9 +88,9 @@ pub enum JoinError {
     #[error("{0}")]
     Refused(String),
     /// The system lacks something that a worker needs.
-    #[error("{what}: {source}")]
+    #[error("cannot start {what}: {source}")]
     System {
-        /// The operation that failed.
+        /// The part of the worker that failed to start.
         what: &'static str,
         /// The system's error.
         source: std::io::Error,
@@ -154,13 +154,7 @@ pub fn join(options: Options) -> Result<(), JoinError> {
 
 fn work(options: Options, device: Device, kinds: Arc<dyn Kinds>, timing: Timing) -> Result<(), JoinError> {
     let system = |what| move |source| JoinError::System { what, source };
-    let name = options.name.clone().unwrap_or_else(|| WorkerId::new(process::default_name()));
-    if !protocol::id::is_name(name.as_str()) {
-        return Err(JoinError::Usage(format!(
-            "`{name}` is not a valid worker name; expected a letter or digit, then letters, digits, `.`, `_` or `-`, \
-             at most 64 characters"
-        )));
-    }
+    let name = name(&options)?;
     if !options.server.is_encrypted() && !options.server.is_local() {
         tracing::warn!(
             "`{}` has no TLS: others on the network can read the token, the gangs' secrets and all data, and with a \
@@ -173,18 +167,18 @@ fn work(options: Options, device: Device, kinds: Arc<dyn Kinds>, timing: Timing)
     let runtime = runtime.map_err(system("the HTTP thread"))?;
     let client = Client::new(options.server.clone(), runtime.handle().clone());
     let (bind, advertised) = peer_address(&options)?;
-    let endpoint = Endpoint::open(bind, timing).map_err(system("the listener for peers"))?;
+    let endpoint = Endpoint::open(bind, timing).map_err(system("the peer listener"))?;
     let cache = Cache::new(options.cache.clone(), options.store.clone(), Bounds::default())
         .map_err(system("the blob cache"))?;
     let shared = Shared::new(endpoint.clone());
     let watch = async { watch_signals(shared.clone(), options.die_with_parent, options.leave_within) };
-    runtime.block_on(watch).map_err(system("signals"))?;
+    runtime.block_on(watch).map_err(system("signal handling"))?;
 
     let cache = Arc::new(cache);
     let preparer = {
         let (shared, client, cache) = (shared.clone(), client.clone(), cache.clone());
         let run = move || shared.preparation.run(&client, &cache);
-        thread::Builder::new().name("prepare".to_owned()).spawn(run).map_err(system("the thread that fetches ahead"))?
+        thread::Builder::new().name("prepare".to_owned()).spawn(run).map_err(system("the prefetch thread"))?
     };
     let bench = Bench { kinds, client: client.clone(), cache, data, device, limits: options.limits.clone() };
     let stage = {
@@ -213,17 +207,27 @@ fn work(options: Options, device: Device, kinds: Arc<dyn Kinds>, timing: Timing)
     shared.end("this worker leaves");
     stage.join().map_err(|_| JoinError::Fault)?;
     preparer.join().map_err(|_| JoinError::Fault)?;
-    match end {
-        End::Left => {
-            // Spares the coordinator the wait for the end of our lease. If this call is lost, the lease simply expires.
-            let left = runtime.block_on(async { tokio::time::timeout(FAREWELL, client.leave(&offer.worker)).await });
-            if !matches!(left, Ok(Ok(()))) {
-                tracing::debug!("cannot tell the coordinator that this worker leaves; its lease will expire");
-            }
-            Ok(())
-        }
-        End::Refused(reason) => Err(JoinError::Refused(reason)),
+    if let End::Refused(reason) = end {
+        return Err(JoinError::Refused(reason));
     }
+    // Spares the coordinator the wait for the end of our lease. If this call is lost, the lease simply expires.
+    let left = runtime.block_on(async { tokio::time::timeout(FAREWELL, client.leave(&offer.worker)).await });
+    if !matches!(left, Ok(Ok(()))) {
+        tracing::debug!("cannot tell the coordinator that this worker leaves; its lease will expire");
+    }
+    Ok(())
+}
+
+/// The worker's name, which defaults to one made of host and process.
+fn name(options: &Options) -> Result<WorkerId, JoinError> {
+    let name = options.name.clone().unwrap_or_else(|| WorkerId::new(process::default_name()));
+    if protocol::id::is_name(name.as_str()) {
+        return Ok(name);
+    }
+    Err(JoinError::Usage(format!(
+        "`{name}` is not a valid worker name; expected a letter or digit, then letters, digits, `.`, `_` or `-`, at \
+         most 64 characters"
+    )))
 }
 
 /// The address to listen on for peers, and the address to announce if it is another one.

@@ -135,11 +135,11 @@ impl Preparation {
         let prepared = match known.map_or_else(|| prepare(task, client, cache, news), Ok) {
             // The attempt that reads the blob reports the damage; prefetching cannot.
             Err(Stopped::Call(CallError::Damaged(why))) => {
-                tracing::warn!(task = %task.task, "cannot fetch all inputs ahead: {why}");
+                tracing::warn!(task = %task.task, "cannot prefetch all inputs: {why}");
                 Ok(Vec::new())
             }
             Err(Stopped::Call(CallError::NotFound(why))) if *missed >= MISSED => {
-                tracing::warn!(task = %task.task, "cannot fetch all inputs ahead: {why}");
+                tracing::warn!(task = %task.task, "cannot prefetch all inputs: {why}");
                 Ok(Vec::new())
             }
             prepared => prepared,

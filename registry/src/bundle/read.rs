@@ -325,7 +325,7 @@ fn check_files(manifest: &Manifest, model: &Model) -> std::result::Result<(), St
     }
     let mut total = 0u64;
     for (name, entry) in &manifest.files {
-        check_name(name).map_err(|why| format!("it lists `{}`: {why}", printable(name)))?;
+        check_name(name).map_err(|why| format!("invalid file name `{}` in the manifest: {why}", printable(name)))?;
         if [HEAD, MANIFEST, CARD].contains(&name.as_str()) {
             return Err(format!("it lists `{name}`, which is reserved for the bundle"));
         }

@@ -324,7 +324,7 @@ async fn lineage(store: &ReadStore, reference: &str) -> Result<Data, Refused> {
 async fn audit(store: &ReadStore, limit: usize) -> Result<Data, Refused> {
     let dir = store.dir().to_owned();
     let read = tokio::task::spawn_blocking(move || audit::read(&dir, limit.min(MOST_LINES))).await;
-    let failed = |e: &dyn std::fmt::Display| QueryError::Storage(format!("the audit log cannot be read: {e}"));
+    let failed = |e: &dyn std::fmt::Display| QueryError::Storage(format!("cannot read the audit log: {e}"));
     Ok(Data::Audit { entries: read.map_err(|e| failed(&e))?.map_err(|e| failed(&e))? })
 }
 

@@ -129,8 +129,8 @@ pub(super) async fn proven(conn: &mut SqliteConnection, proofs: &Proofs, digest:
     Ok(artifact)
 }
 
-/// What `select` says of those of `tasks` that it finds, by task. `select` gives two columns, the task first, and ends in an open
-/// list: `... WHERE task IN (`.
+/// Runs `select` for `tasks` and returns the values by task. `select` has two columns, the task first, and ends in an
+/// open list: `... WHERE task IN (`.
 async fn by_task<T>(conn: &mut SqliteConnection, select: &'static str, tasks: &[&TaskId]) -> Result<BTreeMap<TaskId, T>>
 where
     T: for<'r> sqlx::Decode<'r, Sqlite> + sqlx::Type<Sqlite>,

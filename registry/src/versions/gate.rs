@@ -151,7 +151,11 @@ impl Gate {
                 Err(why) => return result(Some(value), None, false, format!("the version at `{alias}` has {why}")),
             },
             (Bound::Alias { alias, .. }, None) => {
-                let message = format!("{} is {}; `{alias}` does not exist yet", self.metric, digits(value));
+                let message = format!(
+                    "{} is {}; nothing to compare with: `{alias}` does not exist yet",
+                    self.metric,
+                    digits(value)
+                );
                 return result(Some(value), None, value.is_finite(), message);
             }
         };

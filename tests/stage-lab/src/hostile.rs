@@ -9,7 +9,7 @@ use protocol::stage::{DataFormat, ImportEvaluator, StageSettings};
 
 use super::Bench;
 use stages::context::StageError;
-use stages::parts::words::{WORD_WIDTH, Words};
+use stages::parts::word_vectors::{WORD_WIDTH, Words};
 
 /// Runs the function `name`, and returns true if it accepted the bytes.
 ///

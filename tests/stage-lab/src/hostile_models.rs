@@ -35,7 +35,7 @@ use stages::artifacts::{EmbeddingsMeta, to_meta};
 use stages::context::StageError;
 use stages::generate::Generator;
 use stages::parts::flow_decoder::FlowDecoder;
-use stages::parts::networks::Autoencoder;
+use stages::parts::latent_networks::Autoencoder;
 use stages::parts::text;
 use stages::parts::tokenizer::{TokenizerMeta, TrainedTokenizer};
 

@@ -1,6 +1,6 @@
 //! Entries of the store's history: facts, worded for later readers.
 //!
-//! An entry follows from a fact and the state before it, so that whatever changes the state is in the history, whoever decided it.
+//! An entry follows from a fact and the state before it, so every state change has an entry.
 
 use std::collections::BTreeSet;
 

@@ -30,7 +30,7 @@ use crate::decide::schedule;
 use crate::state::State;
 use crate::state::evidence;
 use crate::state::execution::{ExecutionState, StageExecution};
-use crate::state::run::Status;
+use crate::state::run::{Run, Status};
 use crate::state::shared::Map;
 use crate::state::task::{Lease, Part, Task};
 use crate::state::worker::{Presence, Worker};
@@ -66,41 +66,44 @@ pub fn check(state: &State) -> Vec<String> {
         }
     }
     for run in state.runs.values() {
-        if run.state.is_final() {
-            broken.push(format!("C15: `{}` is {:?} and still in memory", run.id, run.state));
-        }
-        for (i, status) in run.stages.iter().enumerate() {
-            if matches!(status, Status::Active { .. } | Status::Done { .. }) && run.inputs(i).is_none() {
-                broken.push(format!("C9: stage {i} of `{}` runs without its inputs", run.id));
-            }
-            if let Status::Active { key } = status
-                && state.executions.get(key).is_none_or(|execution| execution.is_over())
-            {
-                broken.push(format!("C9: stage {i} of `{}` is active and its execution is over", run.id));
-            }
-        }
-        let failed = run.failed().is_some();
-        let open = |status: &Status| matches!(status, Status::Waiting | Status::Sweeping | Status::Active { .. });
-        let open = run.stages.iter().any(open);
-        for (i, status) in run.stages.iter().enumerate().filter(|(_, status)| **status == Status::Sweeping) {
-            if run
-                .sweep(i)
-                .is_none_or(|sweep| sweep.search.is_over() || sweep.places.len() != sweep.search.tickets().len())
-            {
-                broken.push(format!("C13: stage {i} of `{}` is {status:?}, and its searcher is not", run.id));
-            }
-        }
-        let fits = match run.state {
-            RunState::Running | RunState::Paused => !failed && open,
-            RunState::Finished => !failed && !open,
-            RunState::Failed => failed && !open,
-            RunState::Cancelled => !open,
-        };
-        if !fits {
-            broken.push(format!("C10: `{}` is {:?} with stages {:?}", run.id, run.state, run.stages));
-        }
+        check_run(state, run, &mut broken);
     }
     broken
+}
+
+/// Checks a run and its stages: C9, C10, C13 and C15.
+fn check_run(state: &State, run: &Run, broken: &mut Vec<String>) {
+    if run.state.is_final() {
+        broken.push(format!("C15: `{}` is {:?} and still in memory", run.id, run.state));
+    }
+    for (i, status) in run.stages.iter().enumerate() {
+        if matches!(status, Status::Active { .. } | Status::Done { .. }) && run.inputs(i).is_none() {
+            broken.push(format!("C9: stage {i} of `{}` runs without its inputs", run.id));
+        }
+        if let Status::Active { key } = status
+            && state.executions.get(key).is_none_or(|execution| execution.is_over())
+        {
+            broken.push(format!("C9: stage {i} of `{}` is active and its execution is over", run.id));
+        }
+    }
+    let failed = run.failed().is_some();
+    let open = |status: &Status| matches!(status, Status::Waiting | Status::Sweeping | Status::Active { .. });
+    let open = run.stages.iter().any(open);
+    for (i, status) in run.stages.iter().enumerate().filter(|(_, status)| **status == Status::Sweeping) {
+        if run.sweep(i).is_none_or(|sweep| sweep.search.is_over() || sweep.places.len() != sweep.search.tickets().len())
+        {
+            broken.push(format!("C13: stage {i} of `{}` is {status:?}, and its searcher is not", run.id));
+        }
+    }
+    let fits = match run.state {
+        RunState::Running | RunState::Paused => !failed && open,
+        RunState::Finished => !failed && !open,
+        RunState::Failed => failed && !open,
+        RunState::Cancelled => !open,
+    };
+    if !fits {
+        broken.push(format!("C10: `{}` is {:?} with stages {:?}", run.id, run.state, run.stages));
+    }
 }
 
 /// Checks C14.

@@ -45,7 +45,7 @@ pub enum EngineError {
     Refused { program: String, said: String },
     #[error("cannot read the answer of `{program}`: {why}")]
     Answer { program: String, why: String },
-    #[error("no machine has a free slot or answers: {0}")]
+    #[error("no reachable machine has a free slot: {0}")]
     NoSlot(String),
 }
 

@@ -127,7 +127,7 @@ impl Launcher for Hosts {
             (free > 0).then_some((free, *i))
         };
         let most = self.counts().iter().filter_map(free).max_by_key(|(free, i)| (*free, std::cmp::Reverse(*i)));
-        let Some((_, i)) = most else { return Err(EngineError::NoSlot(format!("{} named", self.hosts.len()))) };
+        let Some((_, i)) = most else { return Err(EngineError::NoSlot(format!("{} hosts tried", self.hosts.len()))) };
         let log = format!("\"${{TMPDIR:-/tmp}}\"/{}.log", quoted(worker));
         let line = self.worker.line(worker);
         let script = format!("{WITHOUT_TOKEN}; nohup setsid {line} </dev/null >>{log} 2>&1 &");

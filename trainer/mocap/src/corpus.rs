@@ -8,7 +8,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 
-use motion::dataset::{Clip, Entry, Split, statistics};
+use motion::dataset::{Clip, Split, Unusable, statistics};
 use motion::features::{extract, mirror_joints};
 use motion::quaternion::{self as quat, Vec3};
 use motion::random::Stream;
@@ -67,11 +67,11 @@ pub struct FromFile {
     pub left_out: Vec<String>,
 }
 
-/// Reads the joints of a file, `[T, J, 3]` of the format's skeleton at its rate. Also returns the interpretation of the
-/// file, and its upward axis.
+/// Reads the joints of `file` as `[T, J, 3]`, mapped to the skeleton of the recipe's format and resampled to its frame
+/// rate. Also returns a description of how the file was read, and its up axis.
 ///
 /// # Errors
-/// A message that names the file.
+/// If the file cannot be read or mapped. The message names the file.
 pub fn joints(file: &DataPath, recipe: &Recipe) -> Result<(Vec<f32>, String, Up), String> {
     let skeleton = Skeleton::of(recipe.format);
     let is_bvh = file.shown().extension().is_some_and(|e| e.eq_ignore_ascii_case("bvh"));
@@ -294,50 +294,25 @@ pub fn assemble(
             continue;
         };
         let clip = dataset.clips.len();
-        let (mut whole, mut parts) = (vec![], vec![]);
-        for (i, caption) in made.captions.into_iter().enumerate() {
-            let index = dataset.captions.len();
-            let range = caption.frames(skeleton.fps).map(|(from, to)| (from.min(made.frames), to.min(made.frames)));
-            match range {
-                None => whole.push(index),
-                Some((from, to)) if (skeleton.min_frames..skeleton.max_frames).contains(&to.saturating_sub(from)) => {
-                    let mut id = format!("{}@{from}-{to}", made.id);
-                    if parts.iter().any(|part: &Entry| part.id == id) {
-                        id = format!("{id}.{}", i + 1);
-                    }
-                    parts.push(Entry { id, clip, start: from, len: to - from, captions: vec![index], split });
-                }
-                Some((from, to)) => {
-                    let what =
-                        format!("{}: caption {} describes frames {from} to {to}, too few or too many", made.id, i + 1);
-                    report.left_out.push(what);
-                    continue;
-                }
-            }
-            dataset.captions.push(caption);
+        let lines = (1..=made.captions.len()).zip(dataset.captions.len()..).collect::<Vec<_>>();
+        dataset.captions.extend(made.captions);
+        dataset.clips.push(Clip { id: made.id.clone(), frames: made.frames, features: made.features.into() });
+        let before = dataset.entries.len();
+        for Unusable { line, start, end } in dataset.add_entries(clip, split, &lines) {
+            let what = format!("{}: caption {line} describes frames {start} to {end}, too few or too many", made.id);
+            report.left_out.push(what);
         }
-        if whole.is_empty() && parts.is_empty() {
+        if dataset.entries.len() == before {
             report.left_out.push(format!("{}: no usable caption", made.id));
             continue;
         }
-        if !whole.is_empty() {
-            dataset.entries.push(Entry {
-                id: made.id.clone(),
-                clip,
-                start: 0,
-                len: made.frames,
-                captions: whole,
-                split,
-            });
-        }
-        dataset.entries.extend(parts);
         sources.entry(split).or_default().insert(made.source);
-        dataset.clips.push(Clip { id: made.id, frames: made.frames, features: made.features.into() });
         report.splits.entry(split).or_default().1 += 1;
     }
     for (split, sources) in sources {
         report.splits.entry(split).or_default().0 = sources.len();
     }
+    dataset.drop_unused();
     dataset.entries.sort_by_key(|entry| entry.split);
     if dataset.entries.first().is_none_or(|entry| entry.split != Split::Train) {
         return Err(format!("no usable training clip\n{report}"));

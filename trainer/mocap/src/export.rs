@@ -22,7 +22,7 @@ use crate::glb::{self, GlbError};
 use crate::html::{MOST_PANELS, Page, PageError, Panel, Section};
 use crate::joint_map::MapError;
 use crate::plant::plant;
-use crate::rotations::{Rig, RigError};
+use crate::rig::{Rig, RigError};
 use crate::take::{self, Reading, Take};
 
 /// Number of poses of one motion on a sheet.

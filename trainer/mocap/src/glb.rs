@@ -17,7 +17,7 @@ use protocol::printable;
 use serde_json::{Value, json};
 
 use crate::body::Side;
-use crate::rotations::{Rig, RigNode};
+use crate::rig::{Rig, RigNode};
 
 const FLOAT: u32 = 5126;
 const UNSIGNED_SHORT: u32 = 5123;

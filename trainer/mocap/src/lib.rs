@@ -14,7 +14,7 @@ pub mod joint_map;
 pub mod listing;
 pub mod plant;
 pub mod requests;
-pub mod rotations;
+pub mod rig;
 pub mod sample;
 pub mod take;
 

@@ -9,7 +9,7 @@ use motion::synthetic;
 use protocol::Seed;
 use protocol::stage::DataSynthetic;
 
-use crate::rotations::Rig;
+use crate::rig::Rig;
 
 /// Writes `clips` synthetic clips as `000000.bvh` (centimetres, 20 fps, joints named as HumanML3D's) with their
 /// sentences in `000000.txt`. Returns the largest distance of a joint in a file's motion from the clip's, in metres.

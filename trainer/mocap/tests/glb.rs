@@ -4,7 +4,7 @@
 use std::collections::BTreeSet;
 
 use mocap::glb::{self, GlbError};
-use mocap::rotations::Rig;
+use mocap::rig::Rig;
 use motion::quaternion as quat;
 use motion::{Skeleton, features, synthetic};
 use protocol::Seed;

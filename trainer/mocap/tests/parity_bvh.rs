@@ -111,7 +111,7 @@ fn our_files_give_the_joints_back() {
     let (mut worst_rig, mut worst_file) = (0.0_f64, 0.0_f64);
     for file in entries(&folder, |name| name.ends_with(".npy")) {
         let joints = load(&file).data;
-        let rig = mocap::rotations::Rig::fit(&joints, skeleton).unwrap();
+        let rig = mocap::rig::Rig::fit(&joints, skeleton).unwrap();
         let text = rig.to_bvh(skeleton.fps, 100.0).to_text();
         let bvh = Bvh::parse(&file, text.as_bytes()).unwrap();
         let columns: Vec<usize> =

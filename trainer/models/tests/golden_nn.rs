@@ -8,7 +8,7 @@ mod common;
 use std::path::Path;
 
 use burn::tensor::{Device, Tensor};
-use common::{Array, Arrays, Gates, json, name, row, shared, values};
+use common::{Array, Arrays, Gates, golden, json, name, row, values};
 use models::kernels::{Dropout, KeyMask};
 use models::names;
 use models::networks::{
@@ -22,10 +22,15 @@ const GATE: f64 = 3e-6;
 
 #[test]
 fn golden_nn() {
-    let Some(root) = shared("golden/nn") else { return };
+    for root in golden("nn") {
+        check_layers(&root);
+    }
+}
+
+fn check_layers(root: &Path) {
     let info = json(&root.join("info.json"));
     let mut seen = 0;
-    let mut files: Vec<_> = std::fs::read_dir(&root).unwrap().map(|entry| entry.unwrap().path()).collect();
+    let mut files: Vec<_> = std::fs::read_dir(root).unwrap().map(|entry| entry.unwrap().path()).collect();
     files.sort();
     for file in files {
         let file_name = name(&file);

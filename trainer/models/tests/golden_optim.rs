@@ -2,7 +2,9 @@
 
 mod common;
 
-use common::{Gates, json, relative, shared};
+use std::path::Path;
+
+use common::{Gates, golden, json, relative};
 use models::optim::{AdamW, LrSchedule, clip_factor, ema, global_norm};
 use protocol::stage::Decay;
 use serde_json::Value;
@@ -35,7 +37,12 @@ fn setting(name: &str, stored: &[f64]) -> (AdamW, Option<LrSchedule>, f64) {
 
 #[test]
 fn golden_optim() {
-    let Some(root) = shared("golden/optim") else { return };
+    for root in golden("optim") {
+        check_trajectories(&root);
+    }
+}
+
+fn check_trajectories(root: &Path) {
     let file = json(&root.join("trajectories.json"));
     let (a, target, start) = (singles(&file["a"]), singles(&file["target"]), singles(&file["p0"]));
     let mut gates = Gates::default();

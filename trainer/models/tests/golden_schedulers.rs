@@ -2,7 +2,9 @@
 
 mod common;
 
-use common::{Arrays, Gates, json, shared};
+use std::path::Path;
+
+use common::{Arrays, Gates, golden, json};
 use models::diffusion::{Schedule, TIMESTEPS, affine, affine_one, boundary, consistency, ddim_timesteps, unzip};
 use protocol::stage::{Diffusion, Prediction};
 
@@ -10,7 +12,12 @@ const GATE: f64 = 1e-5;
 
 #[test]
 fn golden_schedulers() {
-    let Some(root) = shared("golden/schedulers") else { return };
+    for root in golden("schedulers") {
+        check_schedulers(&root);
+    }
+}
+
+fn check_schedulers(root: &Path) {
     let info = json(&root.join("info.json"));
     let steps = Arrays::read(&root.join("steps.safetensors"));
     let (device, schedule, mut gates) = (common::device(), Schedule::published(), Gates::default());
@@ -121,7 +128,7 @@ fn lcm(info: &serde_json::Value, steps: &Arrays, gates: &mut Gates) {
     assert!(entries > 0, "info.json describes LCM samplers");
 }
 
-fn npy_f32(path: &std::path::Path) -> Vec<f32> {
+fn npy_f32(path: &Path) -> Vec<f32> {
     let bytes = std::fs::read(path).expect("as the README says");
     let header = 10 + u16::from_le_bytes([bytes[8], bytes[9]]) as usize;
     assert!(String::from_utf8_lossy(&bytes[..header]).contains("'<f4'"), "{} is f32", path.display());

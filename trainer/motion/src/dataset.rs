@@ -5,6 +5,7 @@
 //!
 //! [`open`](Dataset::open) reads a folder, and [`Dataset::to_files`] writes the artifact's files.
 
+mod entries;
 mod open;
 mod pack;
 mod statistics;
@@ -14,6 +15,7 @@ use std::fmt;
 use protocol::stage::DataFormat;
 use serde::{Deserialize, Serialize};
 
+pub use entries::Unusable;
 pub(crate) use open::MANY_PROBLEMS;
 pub use open::{OpenError, OpenReport, Problem, ProblemKind, Skip, SkipReason, is_clip_id};
 pub use pack::PackError;

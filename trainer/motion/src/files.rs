@@ -193,8 +193,8 @@ impl DataPath {
         Ok(names)
     }
 
-    /// The files in this folder and below it, sorted. A symbolic link counts as what it leads to; what is neither file nor folder is an error,
-    /// and so is a folder that is met twice, for a circle of links has no end and a fan of them no useful one.
+    /// The files in this folder and below it, sorted. Follows symbolic links. Other file types, and folders met twice (link
+    /// cycles), are errors.
     ///
     /// # Errors
     /// What stands in the way, with its path.

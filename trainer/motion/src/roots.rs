@@ -17,7 +17,7 @@ use nix::sys::stat::Mode;
 /// Tries of an open that the kernel could not finish because something was renamed meanwhile.
 const TRIES: usize = 64;
 
-/// A folder that stays the same one whatever its path leads to later.
+/// An open folder; later changes of its path do not affect it.
 #[derive(Debug)]
 pub struct Root {
     /// As it was given, absolute.

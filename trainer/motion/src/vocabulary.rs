@@ -1,7 +1,7 @@
-//! The words of the captions that a model learned from: which words of a prompt it never saw, and what it could be told instead.
+//! The words of a model's training captions. Finds words of a prompt that no caption has, and suggests captions.
 //!
-//! Not its job: what an encoder makes of a word. A hashed encoder gives every word a vector, so that only the captions tell a word
-//! that means something to the model from one that does not.
+//! Not its job: embedding words. A hashed encoder has a vector for every word, so only the captions show which words mean
+//! something to the model.
 
 use std::collections::{BTreeMap, BTreeSet};
 

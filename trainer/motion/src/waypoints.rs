@@ -267,30 +267,40 @@ fn waypoints(lines: &[Line], skeleton: &Skeleton, told: &[usize]) -> Result<Vec<
     for (joint, own) in &mut by_joint {
         own.sort_by_key(|(_, waypoint)| waypoint.frame);
         for pair in own.windows(2) {
-            let [(before, first), (line, second)] = pair else { continue };
-            let name = skeleton.names[*joint];
-            if first.frame == second.frame {
-                return Err(format!(
-                    "{} and {} are both waypoints of `{name}` at frame {}, {:.2} s; a frame lasts {} s",
-                    before.place,
-                    line.place,
-                    first.frame,
-                    first.frame as f64 / skeleton.fps,
-                    1.0 / skeleton.fps
-                ));
-            }
-            let seconds = (second.frame - first.frame) as f64 / skeleton.fps;
-            let squares = first.position.iter().zip(second.position).map(|(a, b)| f64::from(a - b).powi(2));
-            let speed = squares.sum::<f64>().sqrt() / seconds;
-            if speed > FASTEST {
-                return Err(format!(
-                    "{}: `{name}` would need {speed:.1} m/s from {}; expected at most {FASTEST} m/s",
-                    line.place, before.place
-                ));
-            }
+            let [before, after] = pair else { continue };
+            check_pair(before, after, skeleton, skeleton.names[*joint])?;
         }
     }
     Ok(by_joint.into_values().flatten().map(|(_, waypoint)| waypoint).collect())
+}
+
+/// Refuses two successive waypoints of joint `name` at one frame, or too far apart for the time between them.
+fn check_pair(
+    (before, first): &(&Line, Waypoint),
+    (after, second): &(&Line, Waypoint),
+    skeleton: &Skeleton,
+    name: &str,
+) -> Result<(), String> {
+    if first.frame == second.frame {
+        return Err(format!(
+            "{} and {} are both waypoints of `{name}` at frame {}, {:.2} s; a frame lasts {} s",
+            before.place,
+            after.place,
+            first.frame,
+            first.frame as f64 / skeleton.fps,
+            1.0 / skeleton.fps
+        ));
+    }
+    let seconds = (second.frame - first.frame) as f64 / skeleton.fps;
+    let squares = first.position.iter().zip(second.position).map(|(a, b)| f64::from(a - b).powi(2));
+    let speed = squares.sum::<f64>().sqrt() / seconds;
+    if speed <= FASTEST {
+        return Ok(());
+    }
+    Err(format!(
+        "{}: `{name}` would need {speed:.1} m/s from {}; expected at most {FASTEST} m/s",
+        after.place, before.place
+    ))
 }
 
 #[cfg(test)]

@@ -2,6 +2,8 @@
 
 mod shared;
 
+use std::path::Path;
+
 use motion::features::gaussian_filter;
 use motion::quaternion as quat;
 use safetensors::tensor::{Dtype, SafeTensors};
@@ -32,7 +34,12 @@ impl Tensors<'_> {
 
 #[test]
 fn golden_primitives() {
-    let Some(folder) = shared::data("golden/primitives") else { return };
+    for folder in shared::golden("primitives") {
+        check_primitives(&folder);
+    }
+}
+
+fn check_primitives(folder: &Path) {
     let bytes = std::fs::read(folder.join("quaternions.safetensors")).unwrap();
     let given = Tensors(SafeTensors::deserialize(&bytes).unwrap());
     let (q, p, v, w) = (given.rows::<4>("q"), given.rows::<4>("p"), given.rows::<3>("v"), given.rows::<3>("w"));

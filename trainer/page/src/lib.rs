@@ -39,7 +39,7 @@ pub const VIEWER: &str = include_str!("../static/viewer.js");
 /// Its style.
 pub const VIEWER_STYLE: &str = include_str!("../static/viewer.css");
 
-/// The addresses at which the page itself is shown: each is a view. What stands behind the last slash is the page's to read.
+/// The addresses at which the page itself is shown: each is a view. The page itself parses the part after the last slash.
 pub const VIEWS: [&str; 11] = [
     "/",
     "/runs",
@@ -122,7 +122,7 @@ static PAGE: LazyLock<Page> = LazyLock::new(|| {
 
 fn file(name: &'static str, bytes: Vec<u8>) -> File {
     let mut encoder = GzEncoder::new(Vec::new(), Compression::best());
-    // Memory takes whatever is written to it.
+    // Writing to memory cannot fail.
     let gzip = encoder.write_all(&bytes).and_then(|()| encoder.finish()).unwrap_or_default();
     let tag = format!("\"{}\"", &Digest::of(&bytes).hex()[..32]);
     File { name, kind: kind(name), bytes, gzip, tag }

@@ -92,57 +92,45 @@ impl Reader {
             return None;
         }
         let head = self.typed::<Head>(node, &owner, &path, &["space", "evaluate"]);
-        let mut space = BTreeMap::new();
-        match node.entry("space") {
-            None => {
-                let help = "for example `space: {lr: {log_uniform: [1e-4, 1e-3]}}`";
-                self.mistake(
-                    entry.key_at,
-                    &format!("{path}.space"),
-                    format!("{owner} has no `space`"),
-                    Some(help.into()),
-                );
-                return None;
-            }
-            Some(entry) => {
-                let before = self.mistakes.len();
-                let example = serde_json::to_value(default).ok()?;
-                let walk = Space { default, example: &example, owner: format!("stage `{name}`"), of_stage: true };
-                self.space(&walk, &entry.value, &mut Vec::new(), &format!("{path}.space"), &mut space);
-                if self.mistakes.len() > before {
-                    return None;
-                }
-            }
-        }
-        let evaluate = match node.entry("evaluate") {
-            None => {
-                let help = "write a stage without a name, such as `evaluate: {kind: evaluate.latent_fid, sampler: \
-                    {steps: 1}}`";
-                self.mistake(
-                    entry.key_at,
-                    &format!("{path}.evaluate"),
-                    format!("{owner} has no `evaluate`"),
-                    Some(help.into()),
-                );
-                return None;
-            }
-            Some(entry) => self.evaluation(entry, name, default, &format!("{path}.evaluate"))?,
+        let Some(space_entry) = node.entry("space") else {
+            let help = "for example `space: {lr: {log_uniform: [1e-4, 1e-3]}}`".to_owned();
+            self.mistake(entry.key_at, &format!("{path}.space"), format!("{owner} has no `space`"), Some(help));
+            return None;
         };
-        let of_evaluation = node.entry("space").and_then(|space| space.value.entry(EVALUATE));
-        if let Some(entry) = of_evaluation {
-            let before = self.mistakes.len();
-            let example = serde_json::to_value(&evaluate).ok()?;
+        let walk_owner = format!("stage `{name}`");
+        let mut space = self.whole_space(default, walk_owner, true, &space_entry.value, &format!("{path}.space"))?;
+        let path_of_evaluate = format!("{path}.evaluate");
+        let Some(evaluate_entry) = node.entry(EVALUATE) else {
+            let help = "write a stage without a name, such as `evaluate: {kind: evaluate.latent_fid, sampler: {steps: \
+                1}}`";
+            self.mistake(entry.key_at, &path_of_evaluate, format!("{owner} has no `evaluate`"), Some(help.into()));
+            return None;
+        };
+        let evaluate = self.evaluation(evaluate_entry, name, default, &path_of_evaluate)?;
+        if let Some(entry) = space_entry.value.entry(EVALUATE) {
             let owner = format!("`evaluate` of the sweep of stage `{name}`");
-            let walk = Space { default: &evaluate, example: &example, owner, of_stage: false };
-            let mut found = BTreeMap::new();
-            self.space(&walk, &entry.value, &mut Vec::new(), &format!("{path}.space.{EVALUATE}"), &mut found);
-            if self.mistakes.len() > before {
-                return None;
-            }
+            let found = self.whole_space(&evaluate, owner, false, &entry.value, &format!("{path}.space.{EVALUATE}"))?;
             space.extend(found.into_iter().map(|(path, domain)| (format!("{EVALUATE}.{path}"), domain)));
         }
         let Head { search, metric, mode, trials, parallel, rungs } = head?;
         Some(Sweep { search, metric, mode, trials, parallel, rungs, space, evaluate: Box::new(evaluate) })
+    }
+
+    /// Reads the space of a stage whose kind has the settings `default`; `None` if it has a mistake.
+    fn whole_space(
+        &mut self,
+        default: &StageSettings,
+        owner: String,
+        of_stage: bool,
+        node: &Node,
+        path: &str,
+    ) -> Option<BTreeMap<String, Domain>> {
+        let before = self.mistakes.len();
+        let example = serde_json::to_value(default).ok()?;
+        let walk = Space { default, example: &example, owner, of_stage };
+        let mut space = BTreeMap::new();
+        self.space(&walk, node, &mut Vec::new(), path, &mut space);
+        (self.mistakes.len() == before).then_some(space)
     }
 
     /// Reads the stage that evaluates trials, and fills in its reference to the evaluated stage.
@@ -282,18 +270,19 @@ impl Reader {
             }
             values.push(value);
         }
-        if entry.key == "choice" {
-            if values.is_empty() {
-                self.mistake(
-                    entry.value.at,
-                    &path,
-                    format!("`choice` of {label} is empty; expected at least one value"),
-                    None,
-                );
-                return None;
-            }
-            return Some(Domain::Choice(values));
+        if entry.key != "choice" {
+            return self.interval(entry, &values, &label, &path);
         }
+        if values.is_empty() {
+            let message = format!("`choice` of {label} is empty; expected at least one value");
+            self.mistake(entry.value.at, &path, message, None);
+            return None;
+        }
+        Some(Domain::Choice(values))
+    }
+
+    /// Makes a domain of `values`, the two ends of `uniform` or `log_uniform`.
+    fn interval(&mut self, entry: &Entry, values: &[Value], label: &str, path: &str) -> Option<Domain> {
         let ends: Vec<f64> = values.iter().filter_map(Value::as_f64).collect();
         match ends[..] {
             [low, high] if low < high && values.len() == 2 => {
@@ -303,13 +292,17 @@ impl Reader {
                 if low > 0.0 {
                     return Some(Domain::LogUniform(low, high));
                 }
+                let at = match &entry.value.value {
+                    Content::List(items) => items[0].at,
+                    _ => entry.value.at,
+                };
                 let message = format!("`log_uniform` of {label} starts at {low}; expected a number above 0");
-                self.mistake(items[0].at, &path, message, None);
+                self.mistake(at, path, message, None);
             }
             _ => {
                 let message =
                     format!("`{}` of {label} is not a range; expected two numbers, the smaller one first", entry.key);
-                self.mistake(entry.value.at, &path, message, Some("use `choice` for values without an order".into()));
+                self.mistake(entry.value.at, path, message, Some("use `choice` for values without an order".into()));
             }
         }
         None

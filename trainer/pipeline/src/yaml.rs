@@ -321,15 +321,7 @@ impl Builder<'_> {
             }
             Event::SequenceStart(anchor, _) => {
                 self.take(span, Size { values: 1, bytes: 0 })?;
-                let mut items = Vec::new();
-                loop {
-                    let (event, span) = Self::next(parser)?;
-                    match event {
-                        Event::SequenceEnd | Event::StreamEnd => break,
-                        event => items.push(self.node(event, span, parser, depth + 1)?),
-                    }
-                }
-                (Content::List(items), anchor)
+                (Content::List(self.items(parser, depth)?), anchor)
             }
             Event::MappingStart(anchor, _) => {
                 self.take(span, Size { values: 1, bytes: 0 })?;
@@ -347,6 +339,21 @@ impl Builder<'_> {
             self.anchors.insert(anchor, (node.clone(), size));
         }
         Ok(node)
+    }
+
+    fn items<'a>(
+        &mut self,
+        parser: &mut Parser<'a, saphyr_parser::StrInput<'a>>,
+        depth: usize,
+    ) -> Result<Vec<Node>, Stop> {
+        let mut items = Vec::new();
+        loop {
+            let (event, span) = Self::next(parser)?;
+            match event {
+                Event::SequenceEnd | Event::StreamEnd => return Ok(items),
+                event => items.push(self.node(event, span, parser, depth + 1)?),
+            }
+        }
     }
 
     fn entries<'a>(

@@ -392,7 +392,7 @@ pub struct RunView {
     /// Sweeps that have started.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub sweeps: Vec<SweepView>,
-    /// What keeps the coordinator from storing or reading what the run needs.
+    /// The storage problem that blocks the run.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub storage: Option<StorageProblem>,
     #[serde(default, skip_serializing_if = "Times::are_unknown")]
@@ -507,7 +507,7 @@ fn json_length(value: &impl Serialize) -> usize {
 pub struct StorageProblem {
     /// Since when, in milliseconds since 1970.
     pub since_ms: i64,
-    /// What is wrong, in words.
+    /// Description of the problem.
     pub what: String,
 }
 

@@ -16,10 +16,10 @@ pub struct Owner {
     /// The token's project.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub project: Option<String>,
-    /// Whether its pipelines may move aliases.
+    /// True if its pipelines may move aliases.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub promotes: bool,
-    /// Whether it controls everything, whomever it belongs to.
+    /// True if it may control objects of all owners.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub admin: bool,
 }
@@ -35,7 +35,7 @@ impl Owner {
         Group::of(&self.name, self.project.as_deref())
     }
 
-    /// Whether runs and models of `group` are its own to control.
+    /// True if it may control runs and models of `group`.
     pub fn controls(&self, group: &Group) -> bool {
         self.admin || self.group() == *group
     }
@@ -51,7 +51,7 @@ impl fmt::Display for Owner {
     }
 }
 
-/// What owners share: `@PROJECT`, or a token's name. A name never begins with `@`.
+/// The group of an owner: `@PROJECT`, or a token's name. A name never begins with `@`.
 #[derive(Debug, Clone, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, JsonSchema)]
 #[serde(transparent)]
 pub struct Group(String);

@@ -23,7 +23,7 @@ use super::remote::check_parent;
 use super::sampler::SamplerArgs;
 use super::sentences::SentenceArgs;
 use super::stream::{self, Opening, StreamArgs};
-use super::words::{self, Compared};
+use super::unknown_words::{self, Compared};
 use crate::client::Target;
 use crate::reader::Reader;
 use crate::report::print::{self, Output};
@@ -152,7 +152,7 @@ async fn found(args: &GenerateArgs) -> Result<(Found, Option<Vocabulary>)> {
         (Some(stage), _) => model::stage(&reader, &reader.find(&args.run).await?, stage).await?,
         (None, model) => model::version(&reader, model.as_deref().unwrap_or_default()).await?,
     };
-    let vocabulary = words::vocabulary(&reader, found.artifact).await?;
+    let vocabulary = unknown_words::vocabulary(&reader, found.artifact).await?;
     let found = args.control.completed(&reader, found).await?;
     reader.close().await;
     Ok((found, vocabulary))
@@ -211,7 +211,7 @@ pub(crate) async fn generate(args: GenerateArgs) -> Result<u8> {
     for request in &requests {
         let mut known = is_known(&generator, &shared.label, &request.caption)?;
         let known_to_encoder = vocabulary.as_ref().filter(|_| known);
-        let compared = words::compare(known_to_encoder, &shared.label, &request.caption);
+        let compared = unknown_words::compare(known_to_encoder, &shared.label, &request.caption);
         known &= compared.as_ref().is_none_or(|words| words.unknown.is_empty() || words.has_known);
         let mut drawn = Vec::new();
         for seed in &seeds {

@@ -27,7 +27,7 @@ mod spectrum;
 mod stream;
 pub(crate) mod sweep;
 mod time;
-mod words;
+mod unknown_words;
 
 use std::path::PathBuf;
 use std::process::ExitCode;

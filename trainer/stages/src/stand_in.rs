@@ -10,7 +10,7 @@ use protocol::{ArtifactKind, Digest};
 use crate::artifacts::{DatasetMeta, Draft, to_meta};
 use crate::context::{AttemptContext, StageError};
 use crate::parts::evaluator::{self, EvaluatorMeta};
-use crate::parts::words::Words;
+use crate::parts::word_vectors::Words;
 
 /// Frames of each clip: 142 on average, as in HumanML3D.
 const FRAMES: [usize; 6] = [196, 160, 144, 144, 120, 88];

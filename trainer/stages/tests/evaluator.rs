@@ -25,7 +25,7 @@ use stages::context::Outcome;
 use stages::evaluation::REPORT_FILE;
 use stages::parts::evaluator::{EvaluatorMeta, TrainedEvaluator};
 use stages::parts::text;
-use stages::parts::words::WordsMeta;
+use stages::parts::word_vectors::WordsMeta;
 
 const LATENT: LatentShape = LatentShape { tokens: 2, dim: 4 };
 

@@ -27,7 +27,12 @@ fn worst(pairs: &[(f64, f64)]) -> f64 {
 
 #[test]
 fn golden_metrics() {
-    let Some(folder) = fixtures::data("golden/metrics") else { return };
+    for folder in fixtures::golden("metrics") {
+        check_metrics(&folder);
+    }
+}
+
+fn check_metrics(folder: &Path) {
     let text = std::fs::read_to_string(folder.join("expected.json")).expect("expected.json");
     let expected: serde_json::Map<String, Value> = serde_json::from_str(&text).expect("expected.json");
     let mut checked = 0;

@@ -24,7 +24,7 @@ use stages::context::{Outcome, Part};
 use stages::kinds;
 use stages::metrics::retrieval::in_groups;
 use stages::parts::evaluator::TrainedEvaluator;
-use stages::parts::words::Words;
+use stages::parts::word_vectors::Words;
 
 #[path = "../../models/tests/common/mod.rs"]
 mod fixtures;

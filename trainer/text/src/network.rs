@@ -41,7 +41,7 @@ pub struct ClipSizes {
     pub projection_dim: usize,
     /// Activation of the feed-forward, `quick_gelu` or `gelu`.
     pub hidden_act: String,
-    /// Added to variances in layer norms.
+    /// Epsilon that layer norms add to the variance.
     pub layer_norm_eps: f64,
     /// The end token; in published files 2 means the largest id of a caption.
     pub eos_token_id: usize,

@@ -160,7 +160,7 @@ pub(crate) enum FrameError {
     TooLong { found: u32, limit: usize },
     #[error("a frame has {0} bytes, which is not a whole number of f32 values")]
     Misaligned(u32),
-    #[error("frame {0} of the connection was changed on the way: its tag does not match")]
+    #[error("frame {0} failed authentication: its tag does not match")]
     Forged(u64),
 }
 

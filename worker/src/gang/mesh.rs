@@ -453,7 +453,6 @@ impl Mesh {
                 awake = now;
             }
             looked = now;
-            // The end of the wait, with the reason to give the peer up if it is not lost already.
             let verdict = {
                 let peer = &mut lock(&self.peers)[rank];
                 if let Some(taken) = take(peer) {
@@ -462,43 +461,57 @@ impl Mesh {
                 if patience == Patience::WhileItLives || peer.phase == Phase::Saving {
                     begun = now;
                 }
-                let (silent, waited) = (now.duration_since(peer.pulse.last().max(awake)), now.duration_since(begun));
-                let too_late = |limit: Duration, how: &str| {
-                    (waited > limit).then(|| Some(format!("{barrier}: {how} after {} s", limit.as_secs_f32())))
-                };
-                match &peer.standing {
-                    Standing::Lost(..) | Standing::Moved => Some(None),
-                    Standing::Left if patience == Patience::WhileItLives => None,
-                    Standing::Left => Some(Some(format!("{barrier}: it has left"))),
-                    Standing::Unmet(why) if silent > self.timing.patience => {
-                        let why = why.as_deref().unwrap_or("it did not connect");
-                        Some(Some(format!(
-                            "{barrier}: no connection within {} s: {why}",
-                            self.timing.patience.as_secs_f32()
-                        )))
-                    }
-                    Standing::Up if silent > self.timing.patience => {
-                        Some(Some(format!("{barrier}: no heartbeat for {} s", self.timing.patience.as_secs_f32())))
-                    }
-                    Standing::Up if peer.phase == Phase::Starting => {
-                        too_late(self.timing.start, "it is alive, but has not started")
-                    }
-                    Standing::Up => too_late(self.timing.stall, "it is alive, but has not reached this barrier"),
-                    Standing::Unmet(_) => None,
-                }
+                let silent = now.duration_since(peer.pulse.last().max(awake));
+                verdict(peer, &self.timing, patience, silent, now.duration_since(begun))
             };
             // Never under the lock: an interrupt looks at the peers too.
             if let Some(halt) = interrupt() {
                 return Err(halt);
             }
-            if let Some(reason) = verdict {
-                let Some(reason) = reason else { return Err(Halt::Peer) };
-                self.lose(rank, LossCause::Unreachable, reason);
-                self.lose_the_silent(barrier, awake);
-                return Err(Halt::Peer);
+            match verdict {
+                Verdict::Waits => {}
+                Verdict::Lost => return Err(Halt::Peer),
+                Verdict::GiveUp(reason) => {
+                    self.lose(rank, LossCause::Unreachable, format!("{barrier}: {reason}"));
+                    self.lose_the_silent(barrier, awake);
+                    return Err(Halt::Peer);
+                }
             }
             self.event_count.wait(ticket, CHECK_INTERVAL);
         }
+    }
+}
+
+/// Result of a look at a peer that a stage waits for.
+enum Verdict {
+    Waits,
+    /// The peer is lost already, or has moved to another gang.
+    Lost,
+    /// The peer must be given up, for this reason.
+    GiveUp(String),
+}
+
+/// Judges a peer that has not sent a sign for `silent` and that a stage has awaited for `waited`.
+fn verdict(peer: &Peer, timing: &Timing, patience: Patience, silent: Duration, waited: Duration) -> Verdict {
+    let limit = timing.patience.as_secs_f32();
+    let too_late = |limit: Duration, how: &str| {
+        if waited <= limit {
+            return Verdict::Waits;
+        }
+        Verdict::GiveUp(format!("it is alive, but {how} after {} s", limit.as_secs_f32()))
+    };
+    match &peer.standing {
+        Standing::Lost(..) | Standing::Moved => Verdict::Lost,
+        Standing::Left if patience == Patience::WhileItLives => Verdict::Waits,
+        Standing::Left => Verdict::GiveUp("it has left".to_owned()),
+        Standing::Unmet(why) if silent > timing.patience => {
+            let why = why.as_deref().unwrap_or("it did not connect");
+            Verdict::GiveUp(format!("no connection within {limit} s: {why}"))
+        }
+        Standing::Up if silent > timing.patience => Verdict::GiveUp(format!("no heartbeat for {limit} s")),
+        Standing::Up if peer.phase == Phase::Starting => too_late(timing.start, "has not started"),
+        Standing::Up => too_late(timing.stall, "has not reached this barrier"),
+        Standing::Unmet(_) => Verdict::Waits,
     }
 }
 

@@ -8,6 +8,7 @@ mod link;
 pub(crate) mod member;
 pub(crate) mod mesh;
 mod pace;
+pub(crate) mod rendezvous;
 mod seal;
 pub(crate) mod tree;
 

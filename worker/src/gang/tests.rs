@@ -21,11 +21,11 @@ use stages::context::{Adopted, ContextError, Exchange, GangContext, Rendezvous};
 use tokio::runtime::Runtime;
 
 use super::endpoint::Endpoint;
-use super::exchange;
 use super::frame::{self, Head, Kind};
 use super::member::{Busy, MeshConfig, Phase, Timing};
 use super::mesh::{Halt, Mesh};
 use super::tree;
+use super::{exchange, rendezvous};
 use crate::active_assignment::ActiveAssignment;
 use crate::cache::{Bounds, Cache};
 use crate::client::Client;

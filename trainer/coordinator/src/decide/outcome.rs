@@ -22,7 +22,7 @@ use std::sync::Arc;
 use protocol::message::{CommitCheckpoint, FailureClass, Grant, LossCause, ReportOutcome, TaskOutcome};
 use protocol::stage::StageSettings;
 use protocol::sweep::STATE_OUTPUT;
-use protocol::{Digest, canonical};
+use protocol::{Digest, WorkerId, canonical};
 use registry::{Write, WriteError};
 
 use crate::decide::attempts::Loss;
@@ -88,11 +88,11 @@ impl Deciding<'_> {
                 let task = &grant.task;
                 return Err(Rejected::Conflict(format!("task `{task}` digests files; it has no artifact")));
             }
-            // Whoever led the gang when it published the value: all members compute the same one.
+            // From any member that led the gang when it published the value: all compute the same one.
             TaskOutcome::Finished { output, metrics } => {
                 self.finished(&report, key, i, *output, metrics.clone())?;
             }
-            // It led the gang when it saved and stopped. The others go on with their own state.
+            // It led the gang when it saved and stopped. The others continue with their own state.
             TaskOutcome::Yielded { .. } if rank != 0 => {
                 self.take_from(key, i, std::slice::from_ref(&worker), Loss::Lost);
             }
@@ -104,51 +104,42 @@ impl Deciding<'_> {
                     task.give_back((!asked).then_some(soon));
                 });
             }
-            TaskOutcome::Failed { class, message } => {
-                let task = &self.state.executions[&key].tasks[i];
-                if *class != FailureClass::OutOfMemory
-                    && self.goes_on_without(task, &worker)
-                    && !(class.is_final() && self.has_state(task, &worker))
-                {
-                    self.leave(key, i, &worker, LossCause::Unreachable);
-                    self.accepted(key, i, &report);
-                    return Ok(true);
-                }
-                let fault = match class {
-                    FailureClass::Fault => true,
-                    FailureClass::Infrastructure => false,
-                    // The others have the same weights but perhaps more memory, so they continue without this member.
-                    FailureClass::OutOfMemory if self.state.executions[&key].tasks[i].holders().len() > 1 => {
-                        self.change(key, i, |task| task.too_small.push(worker.clone()));
-                        self.take_from(key, i, std::slice::from_ref(&worker), Loss::Lost);
-                        self.accepted(key, i, &report);
-                        return Ok(true);
-                    }
-                    FailureClass::Damaged => {
-                        self.mend(key, i, message);
-                        self.accepted(key, i, &report);
-                        return Ok(true);
-                    }
-                    FailureClass::Input
-                    | FailureClass::Diverged
-                    | FailureClass::OutOfMemory
-                    | FailureClass::Refused
-                    | FailureClass::Storage => {
-                        let own = *class != FailureClass::Storage;
-                        self.fail_execution(key, message.clone(), own);
-                        self.accepted(key, i, &report);
-                        return Ok(true);
-                    }
-                };
-                if rank != 0 && !fault {
-                    self.leave(key, i, &worker, LossCause::Unreachable);
-                } else {
-                    self.try_again(key, i, message, fault);
-                }
-            }
+            TaskOutcome::Failed { class, message } => self.failed(key, i, &worker, *class, message, rank),
         }
         self.accepted(key, i, &report);
         Ok(true)
+    }
+
+    /// Handles the failure of a member: the gang continues without it, the task is tried again, or the stage fails.
+    fn failed(&mut self, key: Digest, i: usize, worker: &WorkerId, class: FailureClass, message: &str, rank: usize) {
+        let task = &self.state.executions[&key].tasks[i];
+        if class != FailureClass::OutOfMemory
+            && self.goes_on_without(task, worker)
+            && !(class.is_final() && self.has_state(task, worker))
+        {
+            self.leave(key, i, worker, LossCause::Unreachable);
+            return;
+        }
+        match class {
+            FailureClass::Infrastructure if rank != 0 => self.leave(key, i, worker, LossCause::Unreachable),
+            FailureClass::Infrastructure | FailureClass::Fault => {
+                self.try_again(key, i, message, class == FailureClass::Fault);
+            }
+            // The others have the same weights but perhaps more memory, so they continue without this member.
+            FailureClass::OutOfMemory if task.holders().len() > 1 => {
+                self.change(key, i, |task| task.too_small.push(worker.clone()));
+                self.take_from(key, i, std::slice::from_ref(worker), Loss::Lost);
+            }
+            FailureClass::Damaged => self.mend(key, i, message),
+            FailureClass::Input
+            | FailureClass::Diverged
+            | FailureClass::OutOfMemory
+            | FailureClass::Refused
+            | FailureClass::Storage => {
+                let own = class != FailureClass::Storage;
+                self.fail_execution(key, message.to_owned(), own);
+            }
+        }
     }
 
     fn accepted(&mut self, key: Digest, i: usize, report: &ReportOutcome) {

@@ -115,8 +115,7 @@ pub struct Config {
     /// Time before the first repetition of a message to a hook; each further one takes six times as long.
     pub hook_retry: Duration,
     pub policy: Policy,
-    /// No worker of an earlier coordinator can reach this one, because `trainer run` starts its own; all of them count
-    /// as gone.
+    /// Treats all workers of an earlier coordinator as gone. `trainer run` sets it, because it starts its own workers.
     pub alone: bool,
     /// Pauses runs of an earlier coordinator until a client resumes them.
     pub park: bool,

@@ -1,4 +1,4 @@
-//! The files of the page (crate `page`), which need no token: they say nothing but that somebody listens.
+//! The files of the page (crate `page`), which need no token, because they contain no data.
 
 use std::sync::Arc;
 
@@ -15,7 +15,7 @@ use super::failure::Failure;
 const FOR_EVER: &str = "public, max-age=31536000, immutable";
 /// The document names the build, so a browser asks for it each time.
 const ASK_AGAIN: &str = "no-cache";
-/// For answers of calls: what a worker or another user stored is data, whatever it looks like.
+/// Content policy of API answers: browsers must not execute stored content.
 const DATA_POLICY: &str = "default-src 'none'; frame-ancestors 'none'; sandbox";
 
 pub(super) fn router() -> Router<Arc<ActorHandle>> {

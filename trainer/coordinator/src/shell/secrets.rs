@@ -61,7 +61,7 @@ impl Secrets {
         is(self.mac(&upload(caller, grant, digest)), shown)
     }
 
-    /// Proof that a session was given to whoever holds `token` (`None`: this store's user), until a time, under a name of its own.
+    /// MAC of a session: its token (`None` for this store's user), expiry and nonce.
     pub(crate) fn of_session(&self, token: Option<Digest>, until_ms: u64, nonce: &str) -> String {
         text(self.mac(&("session", token, until_ms, nonce)))
     }

@@ -24,7 +24,7 @@ pub enum StartError {
     #[error("cannot read the key that authenticates workers: {0}")]
     Key(std::io::Error),
     /// The stored facts cannot be read.
-    #[error("cannot read the stored decisions: {0}")]
+    #[error("cannot read the stored facts: {0}")]
     Read(#[from] QueryError),
     /// The stored facts were written in a format that this build does not support.
     #[error("cannot recover: {0}")]

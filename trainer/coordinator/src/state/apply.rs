@@ -76,6 +76,34 @@ impl State {
 
     fn apply_alone(&mut self, fact: &Fact) -> Result {
         match fact {
+            Fact::Run { .. }
+            | Fact::RunState { .. }
+            | Fact::Stages { .. }
+            | Fact::Resolved { .. }
+            | Fact::StagesAdded { .. }
+            | Fact::SweepBegun { .. }
+            | Fact::SweepMoved { .. }
+            | Fact::RunForgotten { .. } => self.apply_to_run(fact),
+            Fact::Execution { .. }
+            | Fact::ExecutionState { .. }
+            | Fact::ExecutionPlacement { .. }
+            | Fact::ExecutionSource { .. }
+            | Fact::ExecutionTime { .. }
+            | Fact::ExecutionResumed { .. }
+            | Fact::ExecutionInstructions { .. }
+            | Fact::Tasks { .. }
+            | Fact::Task { .. }
+            | Fact::ExecutionForgotten { .. } => self.apply_to_execution(fact),
+            Fact::Worker { .. } | Fact::WorkerForgotten { .. } => self.apply_to_worker(fact),
+            Fact::Draining { draining } => {
+                self.draining = *draining;
+                Ok(())
+            }
+        }
+    }
+
+    fn apply_to_run(&mut self, fact: &Fact) -> Result {
+        match fact {
             Fact::Run { run } => {
                 self.submitted = self.submitted.max(run.number);
                 let run = Arc::new(Run::clone(run));
@@ -122,27 +150,27 @@ impl State {
                 sweep.places.extend(places);
                 sweep.failures.extend(failures.iter().cloned());
             }
-            Fact::RunForgotten { run: number } => {
-                let run = self.runs.get(number).cloned().ok_or_else(|| UnknownObject(format!("run {number}")))?;
-                self.runs.remove_mut(number);
-                for (i, status) in run.stages.iter().enumerate() {
-                    self.use_execution(*number, i, status, false);
-                }
-                if let Some(key) = &run.idempotency_key {
-                    self.idempotent.remove_mut(key);
-                }
-                self.note_parked(*number, false);
-            }
-            Fact::Execution { .. }
-            | Fact::ExecutionState { .. }
-            | Fact::ExecutionPlacement { .. }
-            | Fact::ExecutionSource { .. }
-            | Fact::ExecutionTime { .. }
-            | Fact::ExecutionResumed { .. }
-            | Fact::ExecutionInstructions { .. }
-            | Fact::Tasks { .. }
-            | Fact::Task { .. }
-            | Fact::ExecutionForgotten { .. } => self.apply_to_execution(fact)?,
+            Fact::RunForgotten { run: number } => self.forget_run(*number)?,
+            other => unreachable!("{other:?} is not about a run"),
+        }
+        Ok(())
+    }
+
+    fn forget_run(&mut self, number: u64) -> Result {
+        let run = self.runs.get(&number).cloned().ok_or_else(|| UnknownObject(format!("run {number}")))?;
+        self.runs.remove_mut(&number);
+        for (i, status) in run.stages.iter().enumerate() {
+            self.use_execution(number, i, status, false);
+        }
+        if let Some(key) = &run.idempotency_key {
+            self.idempotent.remove_mut(key);
+        }
+        self.note_parked(number, false);
+        Ok(())
+    }
+
+    fn apply_to_worker(&mut self, fact: &Fact) -> Result {
+        match fact {
             Fact::Worker { worker: name, process } => {
                 self.incarnation = self.incarnation.max(process.incarnation);
                 let holds = self.workers.get(name).and_then(|worker| worker.holds);
@@ -161,7 +189,7 @@ impl State {
                 self.unused.remove_mut(name);
                 self.heard.workers.remove_mut(name);
             }
-            Fact::Draining { draining } => self.draining = *draining,
+            other => unreachable!("{other:?} is not about a worker"),
         }
         Ok(())
     }

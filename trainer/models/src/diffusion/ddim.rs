@@ -1,4 +1,4 @@
-//! DDIM with classifier-free guidance, the teacher's sampler.
+//! DDIM, the teacher's sampler: the loop over [`Schedule::jump`], which is the update. Predictions arrive guided.
 //!
 //! Source: Song, Meng, Ermon, arXiv:2010.02502, eq. 12 with eta = 0. Timesteps have "leading" spacing with offset 1
 //! (981, 961, ..., 1 for 50 steps). As in MLD, the last move ends at `ab_0` and not at 1.

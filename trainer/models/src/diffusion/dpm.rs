@@ -69,7 +69,8 @@ fn ratio(schedule: &Schedule, t: usize) -> f64 {
     schedule.sigma(t) / schedule.alpha(t)
 }
 
-/// The timestep whose level is nearest to `log` in the logarithm.
+/// The timestep whose level is nearest to `log` in the logarithm. A level beyond the table, which only rounding can
+/// cause, gives its first or last timestep.
 fn nearest(logs: &[f64], log: f64) -> usize {
     let low = logs.iter().filter(|known| **known <= log).count().clamp(1, logs.len() - 1) - 1;
     let share = ((logs[low] - log) / (logs[low] - logs[low + 1])).clamp(0.0, 1.0);

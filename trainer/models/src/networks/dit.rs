@@ -164,7 +164,7 @@ pub struct TimeEmbedder {
 pub struct DitOut {
     /// H -> features.
     pub linear: Linear,
-    /// Time -> shift and scale, after a SiLU.
+    /// SiLU, then a linear map from the time embedding to shift and scale.
     pub adaLN_modulation: (Gap, Linear),
 }
 

@@ -181,17 +181,18 @@ fn leading(layer: &Linear, x_bc: Tensor<2>) -> Tensor<3> {
 /// Generator of the tokens of layer j, given those of the layers below it.
 #[derive(Module, Debug)]
 pub struct ResidualTransformer {
-    /// Shared: the tables between the first input and the last output, [Q - 2, K + 1, d]. The output of layer k is the input of layer k.
+    /// Tables between the first input and the last output, if tables are shared: `[Q - 2, K + 1, d]`. The output table of
+    /// layer k is the input table of layer k.
     pub embed_proj_shared_weight: Option<Param<Tensor<3>>>,
-    /// Shared: input of layer 0, [1, K + 1, d].
+    /// Input table of layer 0, if tables are shared: `[1, K + 1, d]`.
     pub token_embed_weight_: Option<Param<Tensor<3>>>,
-    /// Shared: output of the last layer, [1, K + 1, d].
+    /// Output table of the last layer, if tables are shared: `[1, K + 1, d]`.
     pub output_proj_weight_: Option<Param<Tensor<3>>>,
-    /// Unshared: outputs of the layers from 1 on, [Q - 1, K + 1, d].
+    /// Output tables of layers 1 to Q - 1, if tables are not shared: `[Q - 1, K + 1, d]`.
     pub output_proj_weight: Option<Param<Tensor<3>>>,
-    /// Unshared: [Q, K + 1], the last row unused.
+    /// Output biases, if tables are not shared: `[Q, K + 1]`. The last row is unused.
     pub output_proj_bias: Option<Param<Tensor<2>>>,
-    /// Unshared: inputs of the layers below the last, [Q - 1, K + 1, d].
+    /// Input tables of layers 0 to Q - 2, if tables are not shared: `[Q - 1, K + 1, d]`.
     pub token_embed_weight: Option<Param<Tensor<3>>>,
     /// Embedding -> H.
     pub input_process: InputProcess,

@@ -9,7 +9,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-pub use fixtures::{data as shared, folders};
+pub use fixtures::{data as shared, folders, golden};
 
 use burn::tensor::{Device, Tensor, TensorData};
 use protocol::stage::Backend;

@@ -23,7 +23,8 @@ use std::path::{Path, PathBuf};
 use protocol::stage::DataFormat;
 use protocol::{excerpt, limits};
 
-use super::{Clip, Dataset, Entry, Split};
+use super::entries::Unusable;
+use super::{Clip, Dataset, Split};
 use crate::files::DataPath;
 use crate::npy::{self, NpyError};
 use crate::skeleton::Skeleton;
@@ -291,38 +292,7 @@ impl Dataset {
                 format!("{}: {what}; set dataset.path to the folder with new_joint_vecs/ and texts/", path.display()),
             )]));
         }
-        let skeleton = Skeleton::of(format);
-        let mut problems = vec![];
-        let mut lists = vec![];
-        for split in Split::ALL {
-            match read_list(&path.join(format!("{split}.txt"))) {
-                Ok(ids) => lists.push((split, ids)),
-                Err(found) => problems.extend(found),
-            }
-        }
-        for folder in ["new_joint_vecs", "texts"] {
-            if !path.join(folder).is_folder() {
-                let file = path.join(folder);
-                problems.push(Problem::new(ProblemKind::Missing, format!("{}: no such folder", file.display())));
-            }
-        }
-        let mean = read_statistic(&path.join("Mean.npy"), skeleton, false).unwrap_or_else(|p| {
-            problems.push(p);
-            vec![]
-        });
-        let std = read_statistic(&path.join("Std.npy"), skeleton, true).unwrap_or_else(|p| {
-            problems.push(p);
-            vec![]
-        });
-        let listed: usize = lists.iter().map(|(_, ids)| ids.len()).sum();
-        if listed > limits::CLIPS {
-            let what = format!("{}: its lists have {listed} clips; expected at most {}", path.display(), limits::CLIPS);
-            problems.push(Problem::new(ProblemKind::Text, what));
-        }
-        if !problems.is_empty() {
-            return Err(fail(problems));
-        }
-
+        let Parts { lists, mean, std } = Parts::read(path, format).map_err(fail)?;
         let mut ids: Vec<&str> = vec![];
         let mut seen = HashSet::new();
         for id in lists.iter().flat_map(|(_, ids)| ids) {
@@ -335,8 +305,9 @@ impl Dataset {
             if !go_on(part * AT_ONCE) {
                 return Ok(None);
             }
-            loaded.extend(ids.iter().copied().zip(load_all(path, ids, skeleton)));
+            loaded.extend(ids.iter().copied().zip(load_all(path, ids, Skeleton::of(format))));
         }
+        let mut problems = vec![];
         for id in &ids {
             if let Loaded::Bad(found) = &loaded[id] {
                 problems.extend(found.iter().cloned());
@@ -356,8 +327,6 @@ impl Dataset {
 
     /// Converts loaded clips to entries by the load rules, and records those left out.
     fn collect(&mut self, lists: &[(Split, Vec<String>)], mut loaded: HashMap<&str, Loaded>) -> OpenReport {
-        let skeleton = self.skeleton();
-        let usable = |frames: usize| (skeleton.min_frames..skeleton.max_frames).contains(&frames);
         let mut skips = vec![];
         let mut shared = vec![];
         // Indices of a stored clip and of its captions by line.
@@ -387,40 +356,13 @@ impl Dataset {
                 }
                 let Some((clip, lines)) = stored.get(id) else { continue };
                 odd.get(id).into_iter().flatten().cloned().for_each(&mut skip);
-                let frames = self.clips[*clip].frames;
-                let mut whole = vec![];
-                let mut parts: Vec<Entry> = vec![];
-                for (line, index) in lines {
-                    let Some((from, to)) = self.captions[*index].frames(skeleton.fps) else {
-                        whole.push(*index);
-                        continue;
-                    };
-                    let (start, end) = (from.min(frames), to.min(frames));
-                    if !usable(end - start) {
-                        skip(SkipReason::CaptionRange { line: *line, frames: end - start });
-                        continue;
-                    }
-                    let mut name = format!("{id}@{start}-{end}");
-                    if parts.iter().any(|p| p.id == name) {
-                        name = format!("{name}.{line}");
-                    }
-                    parts.push(Entry {
-                        id: name,
-                        clip: *clip,
-                        start,
-                        len: end - start,
-                        captions: vec![*index],
-                        split: *split,
-                    });
+                let before = self.entries.len();
+                for Unusable { line, start, end } in self.add_entries(*clip, *split, lines) {
+                    skip(SkipReason::CaptionRange { line, frames: end.saturating_sub(start) });
                 }
-                if whole.is_empty() && parts.is_empty() {
+                if self.entries.len() == before {
                     skip(SkipReason::NoCaption);
                 }
-                if !whole.is_empty() {
-                    let (id, clip) = (id.clone(), *clip);
-                    self.entries.push(Entry { id, clip, start: 0, len: frames, captions: whole, split: *split });
-                }
-                self.entries.extend(parts);
             }
         }
         self.drop_unused();
@@ -436,27 +378,46 @@ impl Dataset {
             shared,
         }
     }
+}
 
-    /// Drops clips and captions that no entry uses, so that they do not change the dataset's digest.
-    fn drop_unused(&mut self) {
-        let mut clip_used = vec![false; self.clips.len()];
-        let mut caption_used = vec![false; self.captions.len()];
-        for entry in &self.entries {
-            clip_used[entry.clip] = true;
-            entry.captions.iter().for_each(|c| caption_used[*c] = true);
+/// The parts of a folder besides its clips.
+struct Parts {
+    /// The ids of each split.
+    lists: Vec<(Split, Vec<String>)>,
+    mean: Vec<f32>,
+    std: Vec<f32>,
+}
+
+impl Parts {
+    fn read(path: &DataPath, format: DataFormat) -> Result<Self, Vec<Problem>> {
+        let mut problems = vec![];
+        let mut lists = vec![];
+        for split in Split::ALL {
+            match read_list(&path.join(format!("{split}.txt"))) {
+                Ok(ids) => lists.push((split, ids)),
+                Err(found) => problems.extend(found),
+            }
         }
-        let renumber = |used: &[bool]| -> Vec<usize> {
-            used.iter().scan(0, |next, used| Some(std::mem::replace(next, *next + usize::from(*used)))).collect()
+        for folder in ["new_joint_vecs", "texts"] {
+            let file = path.join(folder);
+            if !file.is_folder() {
+                problems.push(Problem::new(ProblemKind::Missing, format!("{}: no such folder", file.display())));
+            }
+        }
+        let mut statistic = |name: &str, positive: bool| {
+            read_statistic(&path.join(name), Skeleton::of(format), positive).unwrap_or_else(|problem| {
+                problems.push(problem);
+                vec![]
+            })
         };
-        let (clip_at, caption_at) = (renumber(&clip_used), renumber(&caption_used));
-        let mut keep = clip_used.iter();
-        self.clips.retain(|_| keep.next().copied().unwrap_or(true));
-        let mut keep = caption_used.iter();
-        self.captions.retain(|_| keep.next().copied().unwrap_or(true));
-        for entry in &mut self.entries {
-            entry.clip = clip_at[entry.clip];
-            entry.captions.iter_mut().for_each(|c| *c = caption_at[*c]);
+        let mean = statistic("Mean.npy", false);
+        let std = statistic("Std.npy", true);
+        let listed: usize = lists.iter().map(|(_, ids)| ids.len()).sum();
+        if listed > limits::CLIPS {
+            let what = format!("{}: its lists have {listed} clips; expected at most {}", path.display(), limits::CLIPS);
+            problems.push(Problem::new(ProblemKind::Text, what));
         }
+        if problems.is_empty() { Ok(Self { lists, mean, std }) } else { Err(problems) }
     }
 }
 

@@ -8,7 +8,7 @@ use protocol::stage::DataFormat;
 use crate::artifacts;
 use crate::context::{AttemptContext, StageError};
 use crate::parts::flow_decoder::FlowDecoder;
-use crate::parts::networks::Autoencoder;
+use crate::parts::latent_networks::Autoencoder;
 use crate::parts::tokenizer::TrainedTokenizer;
 
 /// Encodes and decodes clips.

@@ -15,7 +15,7 @@ use models::optim::AdamW;
 use motion::Skeleton;
 
 use crate::parts::hint::{Hint, NormalisedHints};
-use crate::parts::networks::Autoencoder;
+use crate::parts::latent_networks::Autoencoder;
 
 /// Initial learning rate, in a latent's own unit.
 const RATE: f64 = 0.1;

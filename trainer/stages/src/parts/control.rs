@@ -11,7 +11,7 @@ use protocol::{Manifest, limits};
 use serde::{Deserialize, Serialize};
 
 use super::hint::{AXES, Hint, NormalisedHints};
-use super::networks::Autoencoder;
+use super::latent_networks::Autoencoder;
 use super::steering::Steering;
 use super::{feedback, weights};
 use crate::artifacts::{self, DenoiserMeta};

@@ -19,7 +19,7 @@ use protocol::{ArtifactKind, Digest, Manifest};
 use serde::{Deserialize, Serialize};
 
 use super::weights;
-use super::words::{CLASSES, WORD_WIDTH, WORDS, Words, WordsMeta};
+use super::word_vectors::{CLASSES, WORD_WIDTH, WORDS, Words, WordsMeta};
 use crate::artifacts::{self, Draft, to_meta, word};
 use crate::context::{AttemptContext, StageError};
 

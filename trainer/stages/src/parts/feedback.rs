@@ -18,7 +18,7 @@ use motion::features::{recover_joints_wide, root_path};
 use motion::quaternion::{self as quat, Vec3};
 
 use super::hint::Hint;
-use super::networks::Autoencoder;
+use super::latent_networks::Autoencoder;
 
 /// Inputs of the root: height, place, facing direction, and the logarithm of the motion's mean distance.
 const ROOT: usize = 6;

@@ -21,7 +21,7 @@ use protocol::stage::{DataFormat, FlowBackbone, FlowNetwork, FlowPrediction, Flo
 use protocol::{Digest, Manifest};
 use serde::{Deserialize, Serialize};
 
-use super::networks::Autoencoder;
+use super::latent_networks::Autoencoder;
 use super::tokenizer::TrainedTokenizer;
 use super::warm_start::WarmStart;
 use super::weights;

@@ -5,15 +5,15 @@ pub mod evaluator;
 pub(crate) mod feedback;
 pub mod flow_decoder;
 pub mod hint;
+pub mod latent_networks;
 pub mod length;
 pub mod motion_networks;
-pub mod networks;
 pub mod steering;
 pub mod text;
 pub mod tokenizer;
 pub(crate) mod warm_start;
 pub mod weights;
-pub mod words;
+pub mod word_vectors;
 
 use std::collections::BTreeMap;
 

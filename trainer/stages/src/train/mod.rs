@@ -151,121 +151,219 @@ pub fn train(
     training: &Training,
     cx: &mut dyn GangContext,
 ) -> Result<Trained, StageError> {
-    let (steps, slices) = (training.end().0, training.batch.slices);
-    // Checked before anything is computed: the content of a save is known from the start.
-    let (terms, sums) = (objective.terms(), objective.sums());
-    cx.task()
-        .checkpoint
-        .keep
-        .check(terms.iter().copied().chain([GRADIENT_NORM, LEARNING_RATE]))
-        .map_err(StageError::Input)?;
-    // The digest excludes names of other stages, which do not affect a state; the key of the next rung depends on it.
-    let config = cx.task().settings.digest();
-    let accelerator = Some(cx.device()).filter(models::device::is_accelerator);
-    let (groups, buffers) = (objective.groups(), objective.buffers());
-    let bytes = TrainState::bytes_of(&groups, &buffers);
-    check_size(bytes, cx.most_blob_bytes())?;
-    if cx.leads() {
-        cx.log(&parameters(&groups, bytes));
-    }
-    let mut state = TrainState::new(groups, buffers);
-    let mut saved_at = begin(objective, &mut state, cx)?;
-    let mut save_is_due = false;
-    let mut stop = false;
-    let mut recent = Recent::default();
-    keep(&mut state, accelerator.as_ref());
-    objective.load(&state);
-    let mut done: BTreeMap<usize, Vec<f32>> = BTreeMap::new();
+    let mut run = TrainingLoop::begin(objective, training, cx)?;
     loop {
-        if stop || state.step >= steps {
-            if cx.leads() {
-                if saved_at != Some(state.step) {
-                    // Publishing may fail or be interrupted; the last step should not have to be recomputed.
-                    match save(&mut state, config, &recent, cx) {
-                        Err(StageError::Context(ContextError::NoLongerLeads(_))) => {
-                            // The next leader makes the last save from its own copy of the state.
-                            let applied = Some(state.step);
-                            if meet(&mut state, applied, cx)? == Met::Adopted {
-                                keep(&mut state, accelerator.as_ref());
-                                objective.load(&state);
-                            }
-                            continue;
-                        }
-                        saved => saved?,
-                    }
-                }
-                state.fetch();
-                return Ok(if state.step < steps {
-                    Trained::Yielded { at: state.step }
-                } else {
-                    Trained::Finished { state, metrics: recent.means() }
-                });
-            }
-            // Until rank 0 has stored the last step, it exists only in the members' memory.
-            cx.hold()?;
-            stop = false;
-            let applied = Some(state.step);
-            if meet(&mut state, applied, cx)? == Met::Adopted {
-                keep(&mut state, accelerator.as_ref());
-                objective.load(&state);
+        if run.stop || run.state.step >= run.steps {
+            if !run.cx.leads() {
+                // Until rank 0 has stored the last step, it exists only in the members' memory.
+                run.cx.hold()?;
+                run.stop = false;
+                run.meet()?;
+            } else if run.save_last()? {
+                return Ok(run.end());
             }
             continue;
         }
-        // A regroup may assign other slices of the same step; computed slices are kept.
-        let layout = Layout::of(&state, terms.len(), &sums);
-        let share = cx.share(slices);
-        let missing: Vec<usize> = share.clone().filter(|slice| !done.contains_key(slice)).collect();
-        let results = objective.slices(state.step, &missing)?;
-        for (slice, result) in missing.iter().zip(results) {
-            done.insert(*slice, layout.pack(result)?);
-        }
-        let parts: Vec<_> = share.map(|slice| (slice, done.remove(&slice).expect("a result for each slice"))).collect();
-        let (sum, drain) = match cx.exchange(state.step, slices, &parts)? {
-            Exchange::Sum { sum, drain } => (sum, drain),
-            Exchange::Regroup => {
-                let applied = Some(state.step);
-                if meet(&mut state, applied, cx)? == Met::Adopted {
-                    // A peer was ahead: these slices belong to a finished step.
-                    done.clear();
-                    keep(&mut state, accelerator.as_ref());
-                    objective.load(&state);
-                } else {
-                    done.extend(parts);
-                }
-                continue;
-            }
-        };
-        done.clear();
-        let report = apply(&mut state, &layout, &sum)?;
-        hook(objective, &mut state, layout.sums(&sum, &sums), cx.task())?;
-        objective.load(&state);
+        let layout = Layout::of(&run.state, run.terms.len(), &run.sums);
+        let Some(sum) = run.sum_of_slices(&layout)? else { continue };
+        run.update(&layout, &sum)?;
+        run.save_if_due()?;
+    }
+}
 
-        let values = terms.iter().copied().zip(layout.terms(&sum).iter().map(|t| f64::from(*t)));
+/// A member's training between two steps.
+struct TrainingLoop<'a> {
+    objective: &'a mut dyn Objective,
+    cx: &'a mut dyn GangContext,
+    state: TrainState,
+    /// The step that ends the training.
+    steps: u64,
+    /// Slices of a step.
+    slices: usize,
+    terms: Vec<&'static str>,
+    sums: Vec<SumPlan>,
+    /// The digest of the settings.
+    config: Digest,
+    /// The device that keeps the groups, if it is an accelerator.
+    accelerator: Option<Device>,
+    /// The packed results of this member's slices of the next step.
+    done: BTreeMap<usize, Vec<f32>>,
+    /// The newest step in a committed checkpoint, if this member knows it.
+    saved_at: Option<u64>,
+    save_is_due: bool,
+    stop: bool,
+    recent: Recent,
+}
+
+impl<'a> TrainingLoop<'a> {
+    /// Initialises the state, or continues from the gang's position or the task's last checkpoint.
+    fn begin(
+        objective: &'a mut dyn Objective,
+        training: &Training,
+        cx: &'a mut dyn GangContext,
+    ) -> Result<Self, StageError> {
+        // Checked before anything is computed: the content of a save is known from the start.
+        let terms = objective.terms();
+        cx.task()
+            .checkpoint
+            .keep
+            .check(terms.iter().copied().chain([GRADIENT_NORM, LEARNING_RATE]))
+            .map_err(StageError::Input)?;
+        let groups = objective.groups();
+        let buffers = objective.buffers();
+        let bytes = TrainState::bytes_of(&groups, &buffers);
+        check_size(bytes, cx.most_blob_bytes())?;
+        if cx.leads() {
+            cx.log(&parameters(&groups, bytes));
+        }
+        let mut state = TrainState::new(groups, buffers);
+        let saved_at = begin(objective, &mut state, cx)?;
+        let mut run = Self {
+            steps: training.end().0,
+            slices: training.batch.slices,
+            sums: objective.sums(),
+            // It excludes names of other stages, which do not affect a state; the key of the next rung depends on it.
+            config: cx.task().settings.digest(),
+            accelerator: Some(cx.device()).filter(models::device::is_accelerator),
+            objective,
+            cx,
+            state,
+            terms,
+            done: BTreeMap::new(),
+            saved_at,
+            save_is_due: false,
+            stop: false,
+            recent: Recent::default(),
+        };
+        run.load();
+        Ok(run)
+    }
+
+    /// Copies a state that came from elsewhere to the accelerator, if there is one, and gives it to the objective.
+    /// Parameters, moments and averages return from the accelerator only for a checkpoint, a peer or the end.
+    fn load(&mut self) {
+        if let Some(device) = &self.accelerator {
+            self.state.keep_on(device);
+        }
+        self.objective.load(&self.state);
+    }
+
+    /// Meets the other members. Returns true if a peer was ahead and this member took over its state.
+    fn meet(&mut self) -> Result<bool, StageError> {
+        let applied = Some(self.state.step);
+        let adopted = meet(&mut self.state, applied, self.cx)? == Met::Adopted;
+        if adopted {
+            // Computed slices belong to a finished step.
+            self.done.clear();
+            self.load();
+        }
+        Ok(adopted)
+    }
+
+    /// Computes this member's slices of the next step and exchanges them with the others. Returns the packed sum over
+    /// all slices, or `None` if the gang was regrouped instead.
+    fn sum_of_slices(&mut self, layout: &Layout) -> Result<Option<Vec<f32>>, StageError> {
+        // A regroup may assign other slices of the same step; computed slices are kept.
+        let share = self.cx.share(self.slices);
+        let missing: Vec<usize> = share.clone().filter(|slice| !self.done.contains_key(slice)).collect();
+        let results = self.objective.slices(self.state.step, &missing)?;
+        for (slice, result) in missing.iter().zip(results) {
+            self.done.insert(*slice, layout.pack(result)?);
+        }
+        let parts: Vec<_> =
+            share.map(|slice| (slice, self.done.remove(&slice).expect("a result for each slice"))).collect();
+        match self.cx.exchange(self.state.step, self.slices, &parts)? {
+            Exchange::Sum { sum, drain } => {
+                self.done.clear();
+                self.stop = drain;
+                Ok(Some(sum))
+            }
+            Exchange::Regroup => {
+                if !self.meet()? {
+                    self.done.extend(parts);
+                }
+                Ok(None)
+            }
+        }
+    }
+
+    /// Applies the sum over all slices and records the step's values.
+    fn update(&mut self, layout: &Layout, sum: &[f32]) -> Result<(), StageError> {
+        let report = apply(&mut self.state, layout, sum)?;
+        hook(self.objective, &mut self.state, layout.sums(sum, &self.sums), self.cx.task())?;
+        self.objective.load(&self.state);
+
+        let values = self.terms.iter().copied().zip(layout.terms(sum).iter().map(|t| f64::from(*t)));
         let mut values: Vec<(&str, f64)> = values.collect();
-        recent.push(&values);
+        self.recent.push(&values);
         values.push((GRADIENT_NORM, report.norm));
         values.push((LEARNING_RATE, report.lr));
-        if due(state.step, steps) {
-            cx.record(state.step, &values);
+        let step = self.state.step;
+        if due(step, self.steps) {
+            self.cx.record(step, &values);
         }
-        cx.progress(state.step, steps, "steps", &values[..1]);
-        let every = cx.task().checkpoint.every.0;
-        save_is_due |= every > 0 && state.step.is_multiple_of(every);
-        stop = drain;
-        if cx.leads() && state.step < steps && save_is_due && !stop && cx.can_save() {
-            cx.may_postpone(true);
-            let saved = save(&mut state, config, &recent, cx);
-            cx.may_postpone(false);
-            match saved {
-                Ok(()) => (saved_at, save_is_due) = (Some(state.step), false),
-                Err(StageError::Context(ContextError::Unavailable(why))) if !cx.can_save() => {
-                    cx.log(&format!("the checkpoint after step {} is delayed: {why}", state.step));
-                }
-                // The next exchange meets the others, and the next leader saves.
-                Err(StageError::Context(ContextError::NoLongerLeads(_))) => {}
-                Err(error) => return Err(error),
+        self.cx.progress(step, self.steps, "steps", &values[..1]);
+        let every = self.cx.task().checkpoint.every.0;
+        self.save_is_due |= every > 0 && step.is_multiple_of(every);
+        Ok(())
+    }
+
+    /// Saves a checkpoint if one is due and this member leads the gang.
+    fn save_if_due(&mut self) -> Result<(), StageError> {
+        let ends = self.stop || self.state.step >= self.steps;
+        if ends || !self.save_is_due || !self.cx.leads() || !self.cx.can_save() {
+            return Ok(());
+        }
+        self.cx.may_postpone(true);
+        let saved = self.save();
+        self.cx.may_postpone(false);
+        match saved {
+            Ok(()) => self.save_is_due = false,
+            Err(StageError::Context(ContextError::Unavailable(why))) if !self.cx.can_save() => {
+                let step = self.state.step;
+                self.cx.log(&format!("the checkpoint after step {step} is delayed: {why}"));
             }
+            // The next exchange meets the others, and the next leader saves.
+            Err(StageError::Context(ContextError::NoLongerLeads(_))) => {}
+            Err(error) => return Err(error),
         }
+        Ok(())
+    }
+
+    /// Saves the last step as rank 0, because publishing may fail or be interrupted. Returns false if another member
+    /// leads the gang meanwhile; it makes this save from its own copy of the state.
+    fn save_last(&mut self) -> Result<bool, StageError> {
+        if self.saved_at == Some(self.state.step) {
+            return Ok(true);
+        }
+        match self.save() {
+            Ok(()) => Ok(true),
+            Err(StageError::Context(ContextError::NoLongerLeads(_))) => {
+                self.meet()?;
+                Ok(false)
+            }
+            Err(error) => Err(error),
+        }
+    }
+
+    fn save(&mut self) -> Result<(), StageError> {
+        self.state.fetch();
+        let meta = meta(&self.state, self.config, self.cx.task().seed);
+        let mut draft = Draft::new(self.cx, ArtifactKind::Checkpoint, meta);
+        self.state.saved(|pieces| draft.add_pieces(STATE_FILE, pieces))?;
+        let digest = draft.finish(self.cx)?;
+        let manifest = self.cx.manifest(digest)?;
+        self.cx.commit_checkpoint(self.state.step, &manifest, &self.recent.means())?;
+        self.saved_at = Some(self.state.step);
+        Ok(())
+    }
+
+    fn end(mut self) -> Trained {
+        self.state.fetch();
+        if self.state.step < self.steps {
+            return Trained::Yielded { at: self.state.step };
+        }
+        Trained::Finished { state: self.state, metrics: self.recent.means() }
     }
 }
 
@@ -469,15 +567,7 @@ fn hook(
     objective.after(&mut AfterStep { step, buffers, sums, seed: task.seed, stage: &task.name })
 }
 
-/// Copies the groups to the accelerator, if there is one. Parameters, moments and averages return from there only for a
-/// checkpoint, a peer or the end.
-fn keep(state: &mut TrainState, accelerator: Option<&Device>) {
-    if let Some(device) = accelerator {
-        state.keep_on(device);
-    }
-}
-
-/// What a checkpoint's manifest says. Workers of two builds may save one step, so it names none of them.
+/// The meta of a checkpoint's manifest. Workers of two builds may save one step, so it names no build.
 fn meta(state: &TrainState, config: Digest, seed: protocol::Seed) -> serde_json::Value {
     json!({
         "step": state.step,
@@ -486,17 +576,6 @@ fn meta(state: &TrainState, config: Digest, seed: protocol::Seed) -> serde_json:
         "groups": state.groups.iter().map(|g| json!({"name": g.name, "parameters": g.params.len()})).collect::<Vec<_>>(),
         "buffers": state.buffers.iter().map(|(name, v)| json!({"name": name, "values": v.len()})).collect::<Vec<_>>(),
     })
-}
-
-fn save(state: &mut TrainState, config: Digest, recent: &Recent, cx: &mut dyn GangContext) -> Result<(), StageError> {
-    state.fetch();
-    let meta = meta(state, config, cx.task().seed);
-    let mut draft = Draft::new(cx, ArtifactKind::Checkpoint, meta);
-    state.saved(|pieces| draft.add_pieces(STATE_FILE, pieces))?;
-    let digest = draft.finish(cx)?;
-    let manifest = cx.manifest(digest)?;
-    cx.commit_checkpoint(state.step, &manifest, &recent.means())?;
-    Ok(())
 }
 
 /// Running means of the newest values.
@@ -539,7 +618,7 @@ mod tests {
         assert!(check_size(7 << 30, 8 << 30).is_ok());
     }
 
-    /// In a rolling upgrade a member of one build may save a step again that one of another build has saved: those are not two states.
+    /// In a rolling upgrade, members of two builds may save one step; both saves are the same state.
     #[test]
     fn a_checkpoint_says_nothing_of_the_build_that_saved_it() {
         let state = TrainState::new(Vec::new(), Vec::new());

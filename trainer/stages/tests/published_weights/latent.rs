@@ -13,7 +13,7 @@ use stage_lab::Ran;
 use stages::artifacts::{self, DenoiserMeta};
 use stages::generate::Generator;
 use stages::parts::control::ControlMeta;
-use stages::parts::networks::Autoencoder;
+use stages::parts::latent_networks::Autoencoder;
 use stages::parts::text;
 
 use crate::exports::{expect_file, exported};

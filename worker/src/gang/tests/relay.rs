@@ -5,9 +5,10 @@ use std::net::{Shutdown, SocketAddr, TcpListener, TcpStream};
 use std::sync::mpsc;
 
 use super::*;
-use crate::gang::exchange::{Contribution, Interrupt, Met};
+use crate::gang::exchange::{Contribution, Interrupt};
 use crate::gang::frame::MAX_PAYLOAD;
 use crate::gang::handshake;
+use crate::gang::rendezvous::Met;
 
 const BARRIER: &str = "barrier `test`";
 
@@ -92,7 +93,7 @@ fn pair(timing: Timing) -> (Relay, [Arc<Mesh>; 2]) {
     let meshes = [0, 1].map(|own| mesh(&gang, &[0, 1], own, "s").0);
     thread::scope(|scope| {
         for mesh in &meshes {
-            scope.spawn(|| assert_eq!(exchange::rendezvous(mesh, Some(5), &[], &|| None), Ok(Met::Keep)));
+            scope.spawn(|| assert_eq!(rendezvous::rendezvous(mesh, Some(5), &[], &|| None), Ok(Met::Keep)));
         }
     });
     // As a stage does once its members have met; no peer is named while one of them starts or saves.
@@ -112,10 +113,10 @@ fn p20_bytes_that_move_keep_a_link_of_30_kb_a_second_and_300_ms() {
     let begun = Instant::now();
     let state = vec![7u8; 3 * MAX_PAYLOAD];
     thread::scope(|scope| {
-        scope.spawn(|| assert_eq!(exchange::rendezvous(&ahead, Some(6), &[&state], &|| None), Ok(Met::Keep)));
-        assert_eq!(exchange::rendezvous(&behind, Some(5), &[], &|| None), Ok(Met::Behind(0, 6)));
+        scope.spawn(|| assert_eq!(rendezvous::rendezvous(&ahead, Some(6), &[&state], &|| None), Ok(Met::Keep)));
+        assert_eq!(rendezvous::rendezvous(&behind, Some(5), &[], &|| None), Ok(Met::Behind(0, 6)));
         let mut room = vec![0; state.len()];
-        assert_eq!(exchange::adopt(&behind, 0, &mut [&mut room], true, &|| None), Ok(Vec::new()));
+        assert_eq!(rendezvous::adopt(&behind, 0, &mut [&mut room], true, &|| None), Ok(Vec::new()));
         assert!(room == state);
     });
     assert!(begun.elapsed() > QUICK.patience * 2, "it took {:.1?}", begun.elapsed());

@@ -66,7 +66,7 @@ fn p18_each_barrier_has_a_name_and_a_time_and_lists_who_is_missing() {
                         if is_stopped && name == "rendezvous" {
                             return stop();
                         }
-                        let met = exchange::rendezvous(&mesh, Some(5), &[], &|| None);
+                        let met = rendezvous::rendezvous(&mesh, Some(5), &[], &|| None);
                         if name == "exchange" {
                             met.expect("all are there");
                             if is_stopped {

@@ -2,10 +2,10 @@
 
 use std::thread;
 
-use super::{Gang, Halt, Head, Kind, QUICK, exchange, mesh, wait_until};
-use crate::gang::exchange::Met;
+use super::{Gang, Halt, Head, Kind, QUICK, mesh, rendezvous, wait_until};
 use crate::gang::frame::MAX_PAYLOAD;
 use crate::gang::mesh::STATE_FRAMES;
+use crate::gang::rendezvous::Met;
 
 const BARRIER: &str = "barrier `rendezvous` of generation 7";
 
@@ -22,9 +22,9 @@ fn a_state_arrives_where_it_belongs_however_it_is_cut() {
         thread::scope(|scope| {
             scope.spawn(|| {
                 let pieces = [&state[..8], &state[8..], b"rows behind it"];
-                assert_eq!(exchange::rendezvous(&ahead, Some(5), &pieces, &|| None), Ok(Met::Keep));
+                assert_eq!(rendezvous::rendezvous(&ahead, Some(5), &pieces, &|| None), Ok(Met::Keep));
             });
-            assert_eq!(exchange::rendezvous(&behind, applied, &[], &|| None), Ok(Met::Behind(0, 5)));
+            assert_eq!(rendezvous::rendezvous(&behind, applied, &[], &|| None), Ok(Met::Behind(0, 5)));
             let mut room = vec![0; state.len()];
             let mut rest = room.as_mut_slice();
             let mut pieces = Vec::new();
@@ -34,16 +34,16 @@ fn a_state_arrives_where_it_belongs_however_it_is_cut() {
                 rest = later;
             }
             pieces.push(rest);
-            let more = exchange::adopt(&behind, 0, &mut pieces, applied.is_none(), &|| None);
+            let more = rendezvous::adopt(&behind, 0, &mut pieces, applied.is_none(), &|| None);
             assert_eq!(more, Ok(b"rows behind it".to_vec()));
             assert!(room == state);
         });
     }
     // A state of another length, as another build may send.
     thread::scope(|scope| {
-        scope.spawn(|| exchange::rendezvous(&ahead, Some(5), &[&state[..100]], &|| None).expect("sent"));
-        assert_eq!(exchange::rendezvous(&behind, None, &[], &|| None), Ok(Met::Behind(0, 5)));
-        let refused = exchange::adopt(&behind, 0, &mut [&mut [0; 101]], true, &|| None);
+        scope.spawn(|| rendezvous::rendezvous(&ahead, Some(5), &[&state[..100]], &|| None).expect("sent"));
+        assert_eq!(rendezvous::rendezvous(&behind, None, &[], &|| None), Ok(Met::Behind(0, 5)));
+        let refused = rendezvous::adopt(&behind, 0, &mut [&mut [0; 101]], true, &|| None);
         assert!(matches!(&refused, Err(Halt::Disagree(why)) if why.contains("100 bytes; expected 101")), "{refused:?}");
     });
     [ahead, behind].into_iter().for_each(|mesh| mesh.close(None));
@@ -60,7 +60,7 @@ fn a_state_that_is_cut_short_takes_the_place_of_none() {
     wait_until("the first half is there", || behind.queued(0) == 2);
     ahead.sever();
     let mut room = vec![9; 2 * MAX_PAYLOAD];
-    assert_eq!(exchange::adopt(&behind, 0, &mut [&mut room], false, &|| None), Err(Halt::Peer));
+    assert_eq!(rendezvous::adopt(&behind, 0, &mut [&mut room], false, &|| None), Err(Halt::Peer));
     assert!(room.iter().all(|byte| *byte == 9));
     behind.close(None);
 }
@@ -72,13 +72,13 @@ fn a_state_is_queued_within_bounds() {
     let [ahead, behind] = [0, 1].map(|own| mesh(&gang, &[0, 1], own, "s").0);
     let state = bytes(96 << 20);
     thread::scope(|scope| {
-        let sending = scope.spawn(|| exchange::rendezvous(&ahead, Some(5), &[&state], &|| None));
-        assert_eq!(exchange::rendezvous(&behind, None, &[], &|| None), Ok(Met::Behind(0, 5)));
+        let sending = scope.spawn(|| rendezvous::rendezvous(&ahead, Some(5), &[&state], &|| None));
+        assert_eq!(rendezvous::rendezvous(&behind, None, &[], &|| None), Ok(Met::Behind(0, 5)));
         wait_until("as much as may be is queued", || behind.queued(0) == STATE_FRAMES);
         thread::sleep(QUICK.patience / 4);
         assert!(behind.queued(0) <= STATE_FRAMES + 1 && !sending.is_finished(), "{} frames are here", behind.queued(0));
         let mut room = vec![0; state.len()];
-        assert_eq!(exchange::adopt(&behind, 0, &mut [&mut room], true, &|| None), Ok(Vec::new()));
+        assert_eq!(rendezvous::adopt(&behind, 0, &mut [&mut room], true, &|| None), Ok(Vec::new()));
         assert!(room == state);
         assert_eq!(sending.join().expect("no panic"), Ok(Met::Keep));
     });

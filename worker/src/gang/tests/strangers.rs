@@ -98,7 +98,7 @@ fn slow_strangers_keep_no_peer_out() {
         let met: Vec<_> = thread::scope(|scope| {
             let meet = |mesh: &Arc<Mesh>| {
                 let mesh = mesh.clone();
-                scope.spawn(move || exchange::rendezvous(&mesh, None, &[], &|| None).map(drop))
+                scope.spawn(move || rendezvous::rendezvous(&mesh, None, &[], &|| None).map(drop))
             };
             [meet(first), meet(second)].map(|met| met.join().expect("no panic")).to_vec()
         });

@@ -71,7 +71,7 @@ pub struct EvaluateT2m {
     /// that drop the last batch do. These clips are drawn again in each repeat. Otherwise only R-precision and MM-Dist
     /// leave them out.
     pub drop_last: bool,
-    /// Settings of MultiModality.
+    /// Numbers of captions, samples and pairs for the MultiModality metric.
     pub multimodality: MultiModality,
     /// Split of the clips. Choose on `val`; keep `test` for the final result.
     pub split: Split,

@@ -47,7 +47,7 @@ pub struct TokenNetwork {
     /// Width of MoMask's token embeddings. T2M-GPT's have the network's width, MMM's are the tokenizer's codes.
     #[schemars(range(min = 1, max = 4_096), extend("x-unit" = "channels"))]
     pub embedding: usize,
-    /// For MMM: number of blocks that attend to the caption's words, counted among `layers` of the first half.
+    /// Number of blocks in the first half of MMM's network that attend to the caption's words; at most `layers`.
     #[schemars(range(min = 0, max = 255), extend("x-unit" = "blocks"))]
     pub word_blocks: usize,
 }

@@ -18,7 +18,7 @@ use crate::context::StageError;
 use crate::generate::refine::refine;
 use crate::parts::control::{ControlMeta, TrainedControl};
 use crate::parts::flow_decoder::{FlowDecoder, UNIT};
-use crate::parts::networks::{Autoencoder, Conditions, Denoiser, SeeLatents};
+use crate::parts::latent_networks::{Autoencoder, Conditions, Denoiser, SeeLatents};
 use crate::parts::text::{self, TextEncoder};
 use crate::parts::{self, model_error};
 

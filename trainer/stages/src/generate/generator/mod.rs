@@ -7,8 +7,8 @@
 mod feature_diffusion;
 mod interface;
 mod latent_diffusion;
+mod mmm_condition;
 mod tokens;
-mod words;
 
 use std::cell::RefCell;
 use std::collections::BTreeMap;
@@ -28,8 +28,8 @@ use crate::parts::model_error;
 pub(crate) use feature_diffusion::NAME as FEATURE_DIFFUSION;
 pub use interface::{Batch, ControlRequest, Edit, Infilling, Lap, LatentGenerator, MotionGenerator, Seeds, Text};
 pub(crate) use latent_diffusion::NAME as LATENT_DIFFUSION;
+pub(crate) use mmm_condition::{codebook, with_words};
 pub(crate) use tokens::{GeneratorMeta, MASKED_PREFIX, NAME as TOKENS, RESIDUAL_PREFIX};
-pub(crate) use words::{codebook, with_words};
 
 /// Opens a generator with the parts of a model.
 type Open = fn(&Model, &dyn Blobs, &Device) -> Result<Box<dyn MotionGenerator>, StageError>;

@@ -28,7 +28,7 @@ use protocol::stage::{DataFormat, Family, Sampler, TokenNetwork};
 use protocol::{ArtifactKind, Manifest};
 use serde::{Deserialize, Serialize};
 
-use super::words::{codebook, with_words};
+use super::mmm_condition::{codebook, with_words};
 use super::{Batch, Edit, Infilling, Lap, MotionGenerator, Seeds, Text};
 use crate::artifacts;
 use crate::context::StageError;

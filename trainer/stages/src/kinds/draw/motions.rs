@@ -10,7 +10,7 @@ use std::collections::BTreeMap;
 use mocap::Body;
 use mocap::glb;
 use mocap::html::{Page, Panel, Section, packed};
-use mocap::rotations::Rig;
+use mocap::rig::Rig;
 use motion::waypoints::{self, Waypoint};
 use motion::{Skeleton, npy};
 use protocol::stage::{DrawMotions, Sampler};

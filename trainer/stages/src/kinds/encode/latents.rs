@@ -15,7 +15,7 @@ use crate::artifacts::{self, Augmented, LATENTS_FILE, LatentsMeta, Tensors, VaeM
 use crate::context::{AttemptContext, Outcome, StageError};
 use crate::kinds::shape::Map;
 use crate::metrics::latent_fid::standard_deviation;
-use crate::parts::networks::Autoencoder;
+use crate::parts::latent_networks::Autoencoder;
 use crate::shards::{self, shard_range};
 
 /// Meta of one shard, its entries' part of [`LatentsMeta`].
@@ -23,6 +23,29 @@ use crate::shards::{self, shard_range};
 struct ShardMeta {
     latents: LatentsMeta,
     first: usize,
+}
+
+/// Encodes an entry's crops `(start, frames)`, those of one length together. `rows` returns the features of a crop.
+/// Returns mu and sigma `[crops, N, d]`.
+fn encode_crops(vae: &Autoencoder, crops: &[(usize, usize)], rows: &dyn Fn(usize) -> Vec<f32>) -> (Vec<f32>, Vec<f32>) {
+    let size = vae.meta().latent.tokens * vae.meta().latent.dim;
+    let mut mu = vec![0.0; crops.len() * size];
+    let mut sigma = mu.clone();
+    let mut by_length: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
+    for (c, (_, frames)) in crops.iter().enumerate() {
+        by_length.entry(*frames).or_default().push(c);
+    }
+    for (frames, members) in by_length {
+        let mut batch: Vec<f32> = members.iter().flat_map(|c| rows(*c)).collect();
+        vae.normalise(&mut batch);
+        let posterior = vae.encode(batch, frames);
+        for (i, c) in members.into_iter().enumerate() {
+            let to = c * size..(c + 1) * size;
+            mu[to.clone()].copy_from_slice(&posterior.mu[i * size..(i + 1) * size]);
+            sigma[to].copy_from_slice(&posterior.sigma[i * size..(i + 1) * size]);
+        }
+    }
+    (mu, sigma)
 }
 
 impl Map for EncodeLatents {
@@ -45,7 +68,6 @@ impl Map for EncodeLatents {
         let range = shard_range(dataset.entries.len(), index, of);
         let purpose = format!("{}/crop", cx.task().name);
         let seed = cx.task().seed;
-        let size = latent.tokens * latent.dim;
         let (mut mu, mut sigma) = (Vec::new(), Vec::new());
         let mut meta = LatentsMeta {
             format,
@@ -70,24 +92,10 @@ impl Map for EncodeLatents {
             let crops: Vec<(usize, usize)> = (0..self.crops)
                 .map(|c| crop(&mut Stream::new(seed, &purpose, c as u64, e as u64), entry.len, dataset.skeleton()))
                 .collect();
-            let mut by_length: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
-            for (c, (_, frames)) in crops.iter().enumerate() {
-                by_length.entry(*frames).or_default().push(c);
-            }
-            let at = mu.len();
-            mu.resize(at + self.crops * size, 0.0);
-            sigma.resize(at + self.crops * size, 0.0);
-            for (frames, members) in by_length {
-                let rows = |c: &usize| artifacts::crop_rows(&dataset, (e, *c), crops[*c], meta.augmented.as_ref());
-                let mut batch: Vec<f32> = members.iter().flat_map(rows).collect();
-                vae.normalise(&mut batch);
-                let posterior = vae.encode(batch, frames);
-                for (i, c) in members.into_iter().enumerate() {
-                    let to = at + c * size..at + (c + 1) * size;
-                    mu[to.clone()].copy_from_slice(&posterior.mu[i * size..(i + 1) * size]);
-                    sigma[to].copy_from_slice(&posterior.sigma[i * size..(i + 1) * size]);
-                }
-            }
+            let rows = |c: usize| artifacts::crop_rows(&dataset, (e, c), crops[c], meta.augmented.as_ref());
+            let (crops_mu, crops_sigma) = encode_crops(&vae, &crops, &rows);
+            mu.extend(crops_mu);
+            sigma.extend(crops_sigma);
             meta.splits.push(entry.split);
             meta.captions.push(entry.captions.clone());
             meta.lengths.extend(crops.iter().map(|(_, frames)| frames));

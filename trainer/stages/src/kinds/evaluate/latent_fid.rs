@@ -253,21 +253,7 @@ impl Map for EvaluateLatentFid {
 
     fn merge(&self, cx: &mut dyn AttemptContext, shards: &[Digest]) -> Result<Outcome, StageError> {
         let plan = Plan::read(cx, self)?;
-        let mut blocks: BTreeMap<Unit, Vec<f32>> = BTreeMap::new();
-        for shard in shards::read::<Units<Unit>>(cx, shards, "samples", SAMPLES_FILE) {
-            let (Units { units }, mut tensors) = shard?;
-            let rows = tensors.take("z", 2, SAMPLES_FILE)?;
-            let mut at = 0;
-            for unit in units {
-                let end = at + plan.block(unit.block).len() * plan.width();
-                blocks.insert(unit, rows.values[at..end].to_vec());
-                at = end;
-            }
-        }
-        shards::expect_units(blocks.keys().copied(), plan.units())?;
-        if !blocks.values().flatten().all(|v| v.is_finite()) {
-            return Err(StageError::Input("samples are not finite; the denoiser is not trained well enough".into()));
-        }
+        let blocks = gather(cx, &plan, shards)?;
         let of = |maker: Maker, repeat: usize| -> Vec<f32> {
             let mine = blocks.iter().filter(|(u, _)| u.maker == maker && u.repeat == repeat);
             mine.flat_map(|(_, values)| values.iter().copied()).collect()
@@ -316,6 +302,30 @@ impl Map for EvaluateLatentFid {
         metrics.insert("latent_std_real".into(), standard_deviation(&compared(&plan, &z)));
         publish_report(cx, metrics, details(&plan, &reference, &values, &spread))
     }
+}
+
+/// The samples of every unit.
+fn gather(
+    cx: &mut dyn AttemptContext,
+    plan: &Plan<'_>,
+    shards: &[Digest],
+) -> Result<BTreeMap<Unit, Vec<f32>>, StageError> {
+    let mut blocks: BTreeMap<Unit, Vec<f32>> = BTreeMap::new();
+    for shard in shards::read::<Units<Unit>>(cx, shards, "samples", SAMPLES_FILE) {
+        let (Units { units }, mut tensors) = shard?;
+        let rows = tensors.take("z", 2, SAMPLES_FILE)?;
+        let mut at = 0;
+        for unit in units {
+            let end = at + plan.block(unit.block).len() * plan.width();
+            blocks.insert(unit, rows.values[at..end].to_vec());
+            at = end;
+        }
+    }
+    shards::expect_units(blocks.keys().copied(), plan.units())?;
+    if !blocks.values().flatten().all(|v| v.is_finite()) {
+        return Err(StageError::Input("samples are not finite; the denoiser is not trained well enough".into()));
+    }
+    Ok(blocks)
 }
 
 /// Details for the report beside the metrics.

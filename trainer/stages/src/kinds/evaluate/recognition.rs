@@ -85,6 +85,15 @@ struct Asked {
     length: usize,
 }
 
+impl Asked {
+    /// Draws one of `entries`, which are those of `activity`, with a caption and a length.
+    fn draw(draw: &mut Stream, dataset: &Dataset, activity: usize, entries: &[usize]) -> Self {
+        let entry = &dataset.entries[entries[draw.below(entries.len())]];
+        let caption = entry.captions[draw.below(entry.captions.len())];
+        Self { activity, caption, length: crop(draw, entry.len, dataset.skeleton()).1 }
+    }
+}
+
 /// A motion that was generated.
 struct Drawn {
     asked: Asked,
@@ -159,14 +168,11 @@ impl Plain for EvaluateRecognition {
 
         let seed = cx.task().seed;
         let stream = |what: &str, i: usize| Stream::new(seed, &format!("evaluate.recognition/{what}"), 0, i as u64);
-        let asked = (0..self.motions).map(|i| {
+        let mut asked = Vec::with_capacity(self.motions);
+        for i in 0..self.motions {
             let activity = present[i % present.len()];
-            let mut draw = stream("entry", i);
-            let entry = &dataset.entries[looked_at[activity][draw.below(looked_at[activity].len())]];
-            let caption = entry.captions[draw.below(entry.captions.len())];
-            Asked { activity, caption, length: crop(&mut draw, entry.len, dataset.skeleton()).1 }
-        });
-        let mut asked: Vec<Asked> = asked.collect();
+            asked.push(Asked::draw(&mut stream("entry", i), &dataset, activity, &looked_at[activity]));
+        }
         let mut drawn: Vec<Drawn> = Vec::new();
         while !asked.is_empty() {
             if cx.interrupted() {
@@ -199,13 +205,8 @@ impl Plain for EvaluateRecognition {
             "split": self.split,
             "sampler": self.sampler,
         });
-        publish_illustrated(
-            cx,
-            metrics,
-            json!({}),
-            details,
-            sheet.map(|bytes| ("contact-sheet.png", bytes)).into_iter().collect(),
-        )
+        let pictures = sheet.map(|bytes| ("contact-sheet.png", bytes)).into_iter().collect();
+        publish_illustrated(cx, metrics, json!({}), details, pictures)
     }
 }
 

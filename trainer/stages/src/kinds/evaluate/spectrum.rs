@@ -35,6 +35,24 @@ fn add(to: &mut Vec<f64>, from: &[f64]) {
     to.iter_mut().zip(from).for_each(|(to, from)| *to += from);
 }
 
+/// Energy of each band and step as a share of the real clips', and how far the step has settled on the last.
+fn metrics(steps: &[Step], real: &[f64], last: &[f64]) -> Result<BTreeMap<String, f64>, StageError> {
+    let mut metrics = BTreeMap::new();
+    for (s, step) in steps.iter().enumerate() {
+        for b in 0..real.len() {
+            let place = format!("{}/{}", b + 1, s + 1);
+            metrics.insert(format!("energy/{place}"), step.energy[b] / real[b].max(f64::MIN_POSITIVE));
+            metrics.insert(format!("settled/{place}"), 1.0 - step.off[b] / last[b].max(f64::MIN_POSITIVE));
+        }
+    }
+    match metrics.iter().find(|(_, value)| !value.is_finite()) {
+        None => Ok(metrics),
+        Some((name, value)) => {
+            Err(StageError::Input(format!("`{name}` is {value}: the model is not trained well enough")))
+        }
+    }
+}
+
 impl Plain for EvaluateSpectrum {
     fn run(&self, cx: &mut dyn AttemptContext) -> Result<Outcome, StageError> {
         let (dataset, model) = measured(cx, &self.sampler)?;
@@ -81,17 +99,7 @@ impl Plain for EvaluateSpectrum {
             }
             cx.progress(done as u64 + 1, entries.len() as u64, "motions", &[]);
         }
-        let mut metrics = BTreeMap::new();
-        for (s, step) in steps.iter().enumerate() {
-            for b in 0..real.len() {
-                metrics.insert(format!("energy/{}/{}", b + 1, s + 1), step.energy[b] / real[b].max(f64::MIN_POSITIVE));
-                metrics
-                    .insert(format!("settled/{}/{}", b + 1, s + 1), 1.0 - step.off[b] / last[b].max(f64::MIN_POSITIVE));
-            }
-        }
-        if let Some((name, value)) = metrics.iter().find(|(_, value)| !value.is_finite()) {
-            return Err(StageError::Input(format!("`{name}` is {value}: the model is not trained well enough")));
-        }
+        let metrics = metrics(&steps, &real, &last)?;
         let count = entries.len() as f64;
         let details = json!({
             "bands_hz": self.bands,

@@ -37,6 +37,22 @@ use crate::metrics::spread;
 use crate::shards::{self, Units, in_turn};
 use crate::stand_in::CLIPS;
 
+/// Embeddings of all samples for the caption of a unit of [`Part::Many`].
+fn samples_of_one(plan: &Plan<'_>, maker: &Maker<'_>, unit: Unit) -> Result<Vec<f32>, StageError> {
+    let entry = plan.many(unit.repeat)[unit.block];
+    let draw = plan.of.draw(unit.repeat, entry, true);
+    let samples = plan.settings.multimodality.samples;
+    let mut embeddings = Vec::new();
+    for first in (0..samples).step_by(BLOCK) {
+        let count = BLOCK.min(samples - first);
+        let motions = maker.motions(plan, &vec![draw; count], &|k, b| {
+            plan.of.stream(&format!("many {k}"), unit.repeat, entry * samples + first + b)
+        })?;
+        embeddings.extend(plan.of.trained.motions(&motions));
+    }
+    Ok(embeddings)
+}
+
 impl Map for EvaluateT2m {
     fn repetitions(&self, entries: &dyn Fn(Split) -> f64) -> f64 {
         let many = if self.generates() { self.multimodality.captions * self.multimodality.samples } else { 0 };
@@ -89,16 +105,7 @@ impl Map for EvaluateT2m {
                 }
                 Part::Many => {
                     let maker = maker.as_ref().ok_or_else(|| StageError::Fault("only a model has samples".into()))?;
-                    let entry = plan.many(unit.repeat)[unit.block];
-                    let draw = plan.of.draw(unit.repeat, entry, true);
-                    let samples = self.multimodality.samples;
-                    for first in (0..samples).step_by(BLOCK) {
-                        let count = BLOCK.min(samples - first);
-                        let motions = maker.motions(&plan, &vec![draw; count], &|k, b| {
-                            plan.of.stream(&format!("many {k}"), unit.repeat, entry * samples + first + b)
-                        })?;
-                        many.extend(plan.of.trained.motions(&motions));
-                    }
+                    many.extend(samples_of_one(&plan, maker, *unit)?);
                 }
             }
             cx.progress(done as u64 + 1, units.len() as u64, "blocks", &[]);

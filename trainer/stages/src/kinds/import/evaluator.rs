@@ -25,7 +25,7 @@ use crate::context::{AttemptContext, Outcome, StageError};
 use crate::external::{self, Given};
 use crate::kinds::shape::Plain;
 use crate::parts::evaluator::{self, EvaluatorMeta};
-use crate::parts::words::{CLASSES, WORD_WIDTH, Words};
+use crate::parts::word_vectors::{CLASSES, WORD_WIDTH, Words};
 use crate::stand_in;
 
 /// The state dicts of the pickle.

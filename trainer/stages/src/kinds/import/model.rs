@@ -33,8 +33,8 @@ use crate::generate::generator::{
 use crate::kinds::shape::Plain;
 use crate::parts::control::{CONTROLNET_PREFIX, ControlMeta, TRAJECTORY_PREFIX};
 use crate::parts::flow_decoder::{Backbone, FlowMeta, HEAD};
+use crate::parts::latent_networks::TIME_DIM;
 use crate::parts::motion_networks::{Architecture, MotionDenoiserMeta};
-use crate::parts::networks::TIME_DIM;
 use crate::parts::tokenizer::TokenizerMeta;
 use crate::parts::{self, model_error, weights};
 use crate::published::sizes::TokenizerSizes;

@@ -52,6 +52,38 @@ fn texts(cx: &dyn AttemptContext) -> Result<(Vec<String>, Vec<usize>), StageErro
     Ok((texts, of))
 }
 
+/// The rows of all shards and their width. All shards must come from the encoder with the digest `encoder`.
+fn gather(
+    settings: &TextEmbed,
+    cx: &mut dyn AttemptContext,
+    shards: &[Digest],
+    encoder: Digest,
+) -> Result<(Vec<f32>, usize), StageError> {
+    let mut rows: Vec<f32> = Vec::new();
+    let mut dim = 0;
+    for shard in shards::read::<ShardMeta>(cx, shards, "embeddings", EMBEDDINGS_FILE) {
+        let (meta, mut part) = shard?;
+        if meta.encoder != encoder {
+            return Err(StageError::Input(format!(
+                "the encoder in {} differs between workers, or changed during the stage; give all workers the same \
+                 encoder and run the stage again",
+                settings.path
+            )));
+        }
+        let part = part.take("rows", 2, EMBEDDINGS_FILE)?;
+        dim = part.row_len();
+        if meta.first * dim != rows.len() {
+            let have = rows.len() / dim.max(1);
+            return Err(StageError::Fault(format!(
+                "a shard begins at text {}, but the previous shard ended at text {have}",
+                meta.first
+            )));
+        }
+        rows.extend_from_slice(&part.values);
+    }
+    Ok((rows, dim))
+}
+
 impl Map for TextEmbed {
     // Reading published encoders takes longer than the rest of an estimate.
     fn cheaper(&self) -> Option<StageSettings> {
@@ -84,29 +116,7 @@ impl Map for TextEmbed {
     fn merge(&self, cx: &mut dyn AttemptContext, shards: &[Digest]) -> Result<Outcome, StageError> {
         let (texts, of) = texts(cx)?;
         let named = external::read(cx, |_, given| Named::open(self, given))?;
-        let encoder = fingerprint(named.digest());
-        let mut rows: Vec<f32> = Vec::new();
-        let mut dim = 0;
-        for shard in shards::read::<ShardMeta>(cx, shards, "embeddings", EMBEDDINGS_FILE) {
-            let (meta, mut part) = shard?;
-            if meta.encoder != encoder {
-                return Err(StageError::Input(format!(
-                    "the encoder in {} differs between workers, or changed during the stage; give all workers the same \
-                     encoder and run the stage again",
-                    self.path
-                )));
-            }
-            let part = part.take("rows", 2, EMBEDDINGS_FILE)?;
-            dim = part.row_len();
-            if meta.first * dim != rows.len() {
-                let have = rows.len() / dim.max(1);
-                return Err(StageError::Fault(format!(
-                    "a shard begins at text {}, but the previous shard ended at text {have}",
-                    meta.first
-                )));
-            }
-            rows.extend_from_slice(&part.values);
-        }
+        let (rows, dim) = gather(self, cx, shards, fingerprint(named.digest()))?;
         if dim == 0 || rows.len() != texts.len() * dim {
             return Err(StageError::Fault(format!(
                 "the shards have {} numbers for {} texts of {dim} numbers each",

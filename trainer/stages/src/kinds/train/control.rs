@@ -20,6 +20,7 @@ use std::collections::BTreeMap;
 
 use burn::module::Module;
 use burn::tensor::{Device, Gradients, Tensor};
+use checkpoint::Blobs;
 use checkpoint::model::{self, Model, Parts};
 use models::diffusion::{Grid, Schedule, TIMESTEPS, affine, unzip};
 use models::flat::{self, Entry};
@@ -38,7 +39,7 @@ use crate::kinds::shape::Gang;
 use crate::parts::control::{CONTROLNET_PREFIX, ControlMeta, FEEDBACK_PREFIX, TRAJECTORY_PREFIX};
 use crate::parts::feedback::Seen;
 use crate::parts::hint::{Hint, NormalisedHints, joint_statistics, metres, told_count, told_frames};
-use crate::parts::networks::Autoencoder;
+use crate::parts::latent_networks::Autoencoder;
 use crate::parts::warm_start::WarmStart;
 use crate::parts::{self, model_error, weights};
 use crate::train::data::latents::{LatentData, LatentSlice};
@@ -65,6 +66,19 @@ struct Decoder {
     body: Body,
     /// Metres in one unit of the data.
     metres: f32,
+}
+
+impl Decoder {
+    /// Reads the VAE of `model`.
+    fn read(blobs: &dyn Blobs, model: &Model, device: &Device) -> Result<Self, StageError> {
+        let part = parts::part(blobs, model, &Role::VAE, ArtifactKind::Vae)?;
+        let vae: VaeMeta = artifacts::meta(&part, "the VAE")?;
+        let skeleton = Skeleton::of(vae.format);
+        #[expect(clippy::cast_possible_truncation, reason = "a unit")]
+        let metres = skeleton.metres_per_unit as f32;
+        let body = Body::new(skeleton, &vae.mean, &vae.std, device);
+        Ok(Self { vae: Autoencoder::read(blobs, &part, device)?, body, metres })
+    }
 }
 
 /// The term that compares motions with their targets.
@@ -432,17 +446,8 @@ impl Gang for TrainControl {
         let feedback = meta.feedback(&base_meta, &mut init);
         let feedback = feedback.map(|network| start.take(network, FEEDBACK_PREFIX)).transpose()?;
         start.finish(cx, &meta)?;
-        let decoder = if self.loss.control > 0.0 || feedback.is_some() {
-            let part = parts::part(&*blobs, &model, &Role::VAE, ArtifactKind::Vae)?;
-            let vae: VaeMeta = artifacts::meta(&part, "the VAE")?;
-            let skeleton = Skeleton::of(vae.format);
-            #[expect(clippy::cast_possible_truncation, reason = "a unit")]
-            let metres = skeleton.metres_per_unit as f32;
-            let body = Body::new(skeleton, &vae.mean, &vae.std, &device);
-            Some(Decoder { vae: Autoencoder::read(&*blobs, &part, &device)?, body, metres })
-        } else {
-            None
-        };
+        let decodes = self.loss.control > 0.0 || feedback.is_some();
+        let decoder = decodes.then(|| Decoder::read(&*blobs, &model, &device)).transpose()?;
         let mut objective = Controlled {
             settings: self.clone(),
             data,

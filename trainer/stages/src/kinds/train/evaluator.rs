@@ -26,7 +26,7 @@ use crate::external;
 use crate::kinds::shape::Gang;
 use crate::parts::evaluator::{self, EvaluatorMeta, UNIT};
 use crate::parts::warm_start::WarmStart;
-use crate::parts::words::{CLASSES, CaptionBatch, WORD_WIDTH, WORDS, Words};
+use crate::parts::word_vectors::{CLASSES, CaptionBatch, WORD_WIDTH, WORDS, Words};
 use crate::train::network::{dropout_seed, group, no_clips};
 use crate::train::{GroupPlan, Objective, Order, Pick, SliceResult, TrainState, Turns, train};
 
@@ -257,22 +257,28 @@ impl Objective for EvaluatorObjective {
     }
 }
 
+/// Refuses a phase without a step.
+fn check_phases(settings: &TrainEvaluator) -> Result<(), StageError> {
+    let steps = settings.training.steps.0;
+    let turn = turning_point(settings);
+    if 0 < turn && turn < steps {
+        return Ok(());
+    }
+    Err(StageError::Input(format!(
+        "`movement.until` assigns {turn} of {steps} steps to the movement phase; each of the two phases needs at least \
+         one"
+    )))
+}
+
 impl Gang for TrainEvaluator {
     fn run(&self, cx: &mut dyn GangContext) -> Result<Outcome, StageError> {
         let dataset = artifacts::input_dataset(cx)?;
         let train_entries = dataset.entries_of(Split::Train);
         let stage = cx.task().name.clone();
-        let steps = self.training.steps.0;
-        let turn = turning_point(self);
         if train_entries.is_empty() {
             return Err(no_clips());
         }
-        if turn == 0 || turn >= steps {
-            return Err(StageError::Input(format!(
-                "`movement.until` assigns {turn} of {steps} steps to the movement phase; each of the two phases needs \
-                 at least one"
-            )));
-        }
+        check_phases(self)?;
         let words = external::read(cx, |_, given| Words::open(given.get("words")))?;
         let meta = EvaluatorMeta {
             format: dataset.format,

@@ -23,7 +23,7 @@ use protocol::stage::{Family, TrainMld};
 use crate::artifacts::{self, DenoiserMeta, VaeMeta};
 use crate::context::{GangContext, Outcome, StageError};
 use crate::kinds::shape::Gang;
-use crate::parts::networks::Autoencoder;
+use crate::parts::latent_networks::Autoencoder;
 use crate::parts::warm_start::WarmStart;
 use crate::train::data::latents::{self, LatentData};
 use crate::train::frequency::{FrequencyTerms, LOW_FREQUENCY, Predicted, SEMANTIC, clean};

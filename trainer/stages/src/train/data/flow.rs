@@ -13,7 +13,7 @@ use super::windows::TokenWindows;
 use crate::artifacts;
 use crate::context::{GangContext, StageError};
 use crate::parts::flow_decoder::{Backbone, Field, UNIT};
-use crate::parts::networks::Autoencoder;
+use crate::parts::latent_networks::Autoencoder;
 use crate::parts::tokenizer::TrainedTokenizer;
 use crate::train::network::{group, slice_result};
 use crate::train::{GroupPlan, Losses, Order, SliceResult};

@@ -230,39 +230,13 @@ impl Denoiser {
             see(t, &clean);
         };
         self.meta.family.accepts(sampler).map_err(StageError::Input)?;
-        let (latent, text_dim) = (self.meta.latent, self.meta.text_dim);
+        let latent = self.meta.latent;
         let batch = conditions.noise.len() / (latent.tokens * latent.dim);
         let shape = [batch, latent.tokens, latent.dim];
         let on_device = |values: Vec<f32>, shape| tensor(values, shape, &self.device);
         let z = on_device(conditions.noise.clone(), shape);
         Ok(host(match self.meta.family {
-            Family::Mld => {
-                let mut text = conditions.text.clone();
-                text.extend(conditions.null.repeat(batch));
-                let text = on_device(text, [2 * batch, 1, text_dim]);
-                let [_, tokens, dim] = shape;
-                let out = |z: Tensor<3>, t: usize| {
-                    let both = Tensor::cat(vec![z.clone(), z.clone()], 0);
-                    let noise = self.predict(both, &vec![t; 2 * batch], text.clone(), None, steering);
-                    let half = |from: usize| noise.clone().slice([from..from + batch, 0..tokens, 0..dim]);
-                    let out = guided(half(0), half(batch), sampler.guidance);
-                    seen(&z, t, &out);
-                    out
-                };
-                let form = match self.meta.family.solver(sampler.solver) {
-                    Some(Solver::DpmSolver) => Some(Form::Noise),
-                    Some(Solver::DpmSolverPp) => Some(Form::Data),
-                    _ => None,
-                };
-                match form {
-                    // Deterministic forms need no noise.
-                    Some(form) => {
-                        let path = DpmPath::even(&self.schedule, sampler.steps);
-                        dpm_sample(&self.schedule, &path, form, z.clone(), |_| z.zeros_like(), out)
-                    }
-                    None => ddim_sample(&self.schedule, sampler.steps, z, out),
-                }
-            }
+            Family::Mld => self.sample_teacher(conditions, sampler, z, steering, &mut seen),
             Family::Lcm { skip, .. } => {
                 let mut eps = self.student(conditions, sampler, batch, steering);
                 let timesteps = lcm_path(skip, sampler);
@@ -285,6 +259,37 @@ impl Denoiser {
                 })
             }
         }))
+    }
+
+    /// Samples with guidance from noise `z` `[batch, N, d]`; `seen` receives each step's input, timestep and output.
+    fn sample_teacher(
+        &self,
+        conditions: &Conditions,
+        sampler: &Sampler,
+        z: Tensor<3>,
+        steering: Option<&Steering<'_>>,
+        seen: &mut dyn FnMut(&Tensor<3>, usize, &Tensor<3>),
+    ) -> Tensor<3> {
+        let [batch, tokens, dim] = z.dims();
+        let mut text = conditions.text.clone();
+        text.extend(conditions.null.repeat(batch));
+        let text = tensor(text, [2 * batch, 1, self.meta.text_dim], &self.device);
+        let out = |z: Tensor<3>, t: usize| {
+            let both = Tensor::cat(vec![z.clone(), z.clone()], 0);
+            let noise = self.predict(both, &vec![t; 2 * batch], text.clone(), None, steering);
+            let half = |from: usize| noise.clone().slice([from..from + batch, 0..tokens, 0..dim]);
+            let out = guided(half(0), half(batch), sampler.guidance);
+            seen(&z, t, &out);
+            out
+        };
+        let form = match self.meta.family.solver(sampler.solver) {
+            Some(Solver::DpmSolver) => Form::Noise,
+            Some(Solver::DpmSolverPp) => Form::Data,
+            _ => return ddim_sample(&self.schedule, sampler.steps, z, out),
+        };
+        let path = DpmPath::even(&self.schedule, sampler.steps);
+        // Deterministic forms need no noise.
+        dpm_sample(&self.schedule, &path, form, z.clone(), |_| z.zeros_like(), out)
     }
 
     fn predict(
