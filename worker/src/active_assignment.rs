@@ -97,8 +97,10 @@ impl ActiveAssignment {
             offered: None,
             newest: None,
         };
-        let (state, busy) = (Mutex::new(state), Busy::default());
-        let (postponable, put_off) = (AtomicBool::new(false), Mutex::default());
+        let state = Mutex::new(state);
+        let busy = Busy::default();
+        let postponable = AtomicBool::new(false);
+        let put_off = Mutex::default();
         let held = Self { state, event_count: Arc::default(), wake, endpoint, flags, busy, postponable, put_off };
         held.connect(&mut lock(&held.state));
         Arc::new(held)
@@ -131,7 +133,8 @@ impl ActiveAssignment {
     /// Compares `newer` orders with this assignment.
     pub(crate) fn read(&self, newer: &Assignment) -> Reading {
         let state = lock(&self.state);
-        let (old, new) = (&state.assignment.grant, &newer.grant);
+        let old = &state.assignment.grant;
+        let new = &newer.grant;
         let gang = matches!((&state.assignment.role, &newer.role), (Role::Member { .. }, Role::Member { .. }));
         if old == new {
             Reading::Same
@@ -166,7 +169,9 @@ impl ActiveAssignment {
             state.ended = Some(reason);
             return;
         };
-        let (task, members, secret) = (grant.task.clone(), members.clone(), secret.clone());
+        let task = grant.task.clone();
+        let members = members.clone();
+        let secret = secret.clone();
         let busy = self.busy.clone();
         let config = MeshConfig { task, generation: *generation, rank, members, secret, busy };
         if let Some(unused) = state.offered.take() {

@@ -205,7 +205,10 @@ pub(crate) async fn follow(client: &Client, offer: &Join, shared: &Shared) -> En
         Err(end) => return end,
     };
     let path = format!("/v1/workers/{}/poll", offer.worker);
-    let (mut version, mut pause, mut refusals, mut leave) = (0, SHORTEST, 0, false);
+    let mut version = 0;
+    let mut pause = SHORTEST;
+    let mut refusals = 0;
+    let mut leave = false;
     let mut away = false;
     loop {
         if (leave || shared.is_leaving()) && shared.is_idle(true) {

@@ -432,7 +432,8 @@ mod tests {
 
     #[test]
     fn blobs_of_a_store_on_this_machine_are_read_in_place_and_verified() {
-        let (store, folder) = (tempfile::tempdir().expect("a folder"), tempfile::tempdir().expect("a folder"));
+        let store = tempfile::tempdir().expect("a folder");
+        let folder = tempfile::tempdir().expect("a folder");
         let (digest, bytes) = blob(1, 100);
         let path = checkpoint::blob_path(store.path(), digest);
         fs::create_dir_all(path.parent().expect("a shelf")).expect("writable");

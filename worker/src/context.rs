@@ -81,8 +81,13 @@ impl HttpContext {
         });
         let (telemetry, sender) = TelemetryBuffer::open(held.clone(), client.clone());
         let task = assignment.stage;
-        let (mesh, behind, now) = (None, None, Instant::now());
-        let (computes_since, has_met, begun, pace) = (now, false, now, Pace::new(now));
+        let mesh = None;
+        let behind = None;
+        let now = Instant::now();
+        let computes_since = now;
+        let has_met = false;
+        let begun = now;
+        let pace = Pace::new(now);
         let _sender = sender;
         Self {
             task,
@@ -254,7 +259,8 @@ impl AttemptContext for HttpContext {
         let manifest: Manifest = serde_json::from_slice(&bytes)
             .map_err(|e| ContextError::Corrupt(format!("cannot parse the manifest {digest}: {e}")))?;
         if manifest.format != Manifest::FORMAT {
-            let (found, known) = (manifest.format, Manifest::FORMAT);
+            let found = manifest.format;
+            let known = Manifest::FORMAT;
             return Err(ContextError::Corrupt(format!(
                 "manifest {digest} has format {found}; this build reads {known}"
             )));
@@ -387,7 +393,8 @@ impl GangContext for HttpContext {
             };
             own.push((slice..slice + 1, part));
         }
-        let (drain, durable) = (self.held.drain(), self.telemetry.durable());
+        let drain = self.held.drain();
+        let durable = self.telemetry.durable();
         let contribution = Contribution { step, slices, parts: own, drain, saved, computed, durable };
         let held = self.held.clone();
         let exchanged = exchange::exchange(&mesh, &contribution, &|| held.halt(generation));
@@ -448,7 +455,8 @@ impl GangContext for HttpContext {
             if self.is_regrouped() && !self.held.leads() {
                 return Err(CallError::NoLongerLeads("another member leads the gang now".to_owned()));
             }
-            let (grant, metrics) = (credential.grant.clone(), metrics.clone());
+            let grant = credential.grant.clone();
+            let metrics = metrics.clone();
             let commit = CommitCheckpoint { grant, step, manifest: digest, metrics };
             let vouched = Vouched { what: commit, receipts: receipts.clone() };
             self.client.wait(self.client.tell("/v1/checkpoints", credential, &vouched))

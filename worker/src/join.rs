@@ -176,7 +176,9 @@ fn work(options: Options, device: Device, kinds: Arc<dyn Kinds>, timing: Timing)
 
     let cache = Arc::new(cache);
     let preparer = {
-        let (shared, client, cache) = (shared.clone(), client.clone(), cache.clone());
+        let shared = shared.clone();
+        let client = client.clone();
+        let cache = cache.clone();
         let run = move || shared.preparation.run(&client, &cache);
         thread::Builder::new().name("prepare".to_owned()).spawn(run).map_err(system("the prefetch thread"))?
     };

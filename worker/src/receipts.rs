@@ -40,7 +40,8 @@ impl Receipts {
     /// The receipts of a manifest and of everything that it names, directly or through other manifests of this attempt.
     pub(crate) fn for_manifest(&self, digest: Digest) -> BTreeMap<Digest, String> {
         let held = lock(&self.0);
-        let (mut seen, mut queue) = (BTreeSet::new(), vec![digest]);
+        let mut seen = BTreeSet::new();
+        let mut queue = vec![digest];
         while let Some(next) = queue.pop() {
             if seen.insert(next) {
                 queue.extend(held.named.get(&next).into_iter().flatten());

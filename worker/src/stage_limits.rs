@@ -57,7 +57,8 @@ impl StageLimits {
         }
         let most = self.time.filter(|_| !matches!(held.assignment().role, Role::Member { .. }))?;
         (time > most).then(|| {
-            let (time, most) = (time.as_secs(), most.as_secs());
+            let time = time.as_secs();
+            let most = most.as_secs();
             let message = format!(
                 "is not done after {time} s; expected at most {most} s; use less data or more `shards`, or start its \
                  worker with a larger `--stage-time`"

@@ -85,7 +85,9 @@ impl Worker {
         let shared = Shared::new(endpoint);
         let cache = Arc::new(Cache::new(None, None, Bounds::default()).expect("memory"));
         let preparer = {
-            let (shared, client, cache) = (shared.clone(), client.clone(), cache.clone());
+            let shared = shared.clone();
+            let client = client.clone();
+            let cache = cache.clone();
             thread::spawn(move || shared.preparation.run(&client, &cache))
         };
         let bench = Bench {
@@ -110,7 +112,8 @@ impl Worker {
             labels: Default::default(),
         };
         let poll = {
-            let (shared, handle) = (shared.clone(), server.handle().clone());
+            let shared = shared.clone();
+            let handle = server.handle().clone();
             thread::spawn(move || {
                 let end = handle.block_on(assignments::follow(&client, &offer, &shared));
                 shared.end("the worker leaves");
@@ -439,7 +442,9 @@ fn leaving_saves_and_yields() {
     worker.grant(1);
     worker.wait("some steps", |coordinator| coordinator.metrics.len() > 3);
     worker.shared.leave();
-    let (poll, stage, fake) = (worker.poll, worker.stage, worker.fake);
+    let poll = worker.poll;
+    let stage = worker.stage;
+    let fake = worker.fake;
     assert_eq!(poll.join().expect("no panic"), End::Left);
     stage.join().expect("no panic");
     let coordinator = lock(&fake.coordinator);

@@ -97,7 +97,8 @@ pub fn follow(
     let mut x = noise_btf;
     see(&x);
     for k in 0..intervals {
-        let (t, step) = (at(k), at(k + 1) - at(k));
+        let t = at(k);
+        let step = at(k + 1) - at(k);
         let first = velocity(x.clone(), t);
         x = match solver {
             Solver::Euler => x + first * step,

@@ -160,7 +160,8 @@ mod tests {
 
     #[test]
     fn stages_are_those_of_the_released_code_at_its_step_counts() {
-        let (low, semantic) = (Stage::of_shares(0.6, 1.0, 50), Stage::of_shares(0.0, 0.4, 50));
+        let low = Stage::of_shares(0.6, 1.0, 50);
+        let semantic = Stage::of_shares(0.0, 0.4, 50);
         assert_eq!([29, 30, 49].map(|t| low.has(t)), [false, true, true]);
         assert_eq!([0, 20, 21].map(|t| semantic.has(t)), [true, true, false]);
         let low = Stage::of_shares(0.0, 0.3, 1000);

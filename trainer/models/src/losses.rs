@@ -33,7 +33,8 @@ pub fn pseudo_huber(found: Tensor<3>, expected: Tensor<3>, c: f64) -> Tensor<1> 
 
 /// KL divergence from the standard normal, mean of each example, summed.
 pub fn kl(posterior: &Posterior) -> Tensor<1> {
-    let (mu, logvar) = (posterior.mu_bnd.clone(), posterior.logvar_bnd.clone());
+    let mu = posterior.mu_bnd.clone();
+    let logvar = posterior.logvar_bnd.clone();
     per_example((mu.square() + logvar.clone().exp() - 1.0 - logvar) * 0.5)
 }
 
@@ -328,7 +329,8 @@ mod tests {
     #[test]
     fn gradients_of_joints_agree_with_differences() {
         let skeleton = Skeleton::of(DataFormat::Humanml3d);
-        let (frames, device) = (6, Device::flex());
+        let frames = 6;
+        let device = Device::flex();
         let base = rows(skeleton, frames, 1);
         let loss = |x: Tensor<3>| {
             let found = plain(skeleton).joints(x);
@@ -346,7 +348,8 @@ mod tests {
         let found = found.as_slice::<f32>().unwrap();
         let number = |x: Tensor<3>| loss(x).into_data().as_slice::<f32>().unwrap()[0];
         for (t, k) in [(0, 0), (2, 0), (1, 1), (3, 2), (4, 3), (2, 10), (5, 40), (5, 0), (3, 200)] {
-            let (i, h) = (t * skeleton.features + k, 4e-3);
+            let i = t * skeleton.features + k;
+            let h = 4e-3;
             let mut moved = base.clone();
             moved[i] += h;
             let up = number(at(&moved, &device));
@@ -393,7 +396,9 @@ mod tests {
         };
         let part = |x: &Tensor<3>, r: std::ops::Range<usize>| x.clone().slice([r, 0..5, 0..3]);
         let number = |x: Tensor<1>| x.into_data().as_slice::<f32>().unwrap()[0];
-        let (a, b, lengths) = (make(0), make(9), [5, 2, 3, 1]);
+        let a = make(0);
+        let b = make(9);
+        let lengths = [5, 2, 3, 1];
         let masked = |r: std::ops::Range<usize>| {
             let weights = FrameWeights::masked(&lengths[r.clone()], 5, &device);
             number(weights.compare(Pointwise::SmoothL1, part(&a, r.clone()), part(&b, r)))

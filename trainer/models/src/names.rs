@@ -86,7 +86,8 @@ fn header<E>(bytes: u64, read: &mut ReadAt<'_, E>) -> Result<Result<Header, Load
 fn places(header: &Header, entries: &[Entry], prefix: &str) -> Result<Vec<u64>, LoadError> {
     let mut unused: BTreeMap<String, &TensorInfo> = header.metadata.tensors().into_iter().collect();
     unused.retain(|name, _| name.starts_with(prefix));
-    let (mut places, mut missing) = (Vec::with_capacity(entries.len()), Vec::new());
+    let mut places = Vec::with_capacity(entries.len());
+    let mut missing = Vec::new();
     for entry in entries {
         let name = format!("{prefix}{}", entry.name);
         match unused.remove(&name) {

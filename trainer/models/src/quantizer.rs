@@ -44,7 +44,8 @@ pub fn assign(
     device: &Device,
     mut uniforms: Option<LayerUniforms<'_>>,
 ) -> Vec<usize> {
-    let (n, k) = (rows.len() / width, codes.len() / width);
+    let n = rows.len() / width;
+    let k = codes.len() / width;
     assert!(k > 0, "a codebook has codes");
     let tensor = |values: &[f32], rows| Tensor::<2>::from_data(TensorData::new(values.to_vec(), [rows, width]), device);
     let products = kernels::linear(tensor(rows, n), tensor(codes, k), None).into_data();
@@ -87,7 +88,8 @@ pub struct LayerPass {
 impl LayerPass {
     /// The number of rows of each of `count` codes, and their sum [K, d].
     pub fn statistics(&self, count: usize, width: usize) -> (Vec<f32>, Vec<f32>) {
-        let (mut counts, mut sums) = (vec![0.0; count], vec![0.0; count * width]);
+        let mut counts = vec![0.0; count];
+        let mut sums = vec![0.0; count * width];
         for (row, code) in self.rows.chunks_exact(width).zip(&self.codes) {
             counts[*code] += 1.0;
             sums[code * width..(code + 1) * width].iter_mut().zip(row).for_each(|(sum, r)| *sum += r);
@@ -244,7 +246,8 @@ impl Book<'_> {
 
     /// Updates running sums and counts with those of a batch.
     fn follow(&mut self, sums: &[f32], counts: &[f32]) {
-        let (keep, take) = (self.decay as f32, (1.0 - self.decay) as f32);
+        let keep = self.decay as f32;
+        let take = (1.0 - self.decay) as f32;
         // Two roundings: a count of one row in the first update must stay exactly 1.
         let follow = |kept: &mut [f32], new: &[f32]| {
             kept.iter_mut().zip(new).for_each(|(kept, new)| *kept = keep * *kept + take * new);
@@ -329,7 +332,9 @@ mod tests {
 
     #[test]
     fn a_code_that_nobody_takes_stays_finite() {
-        let (mut codes, mut sums, mut counts) = (vec![1.0, 2.0], vec![0.0, 2.0], vec![0.0, 1.0]);
+        let mut codes = vec![1.0, 2.0];
+        let mut sums = vec![0.0, 2.0];
+        let mut counts = vec![0.0, 1.0];
         let mut book = Book { codes: &mut codes, sums: &mut sums, counts: &mut counts, decay: 0.99 };
         book.update_remembering(&[0.0, 0.0], &[0.0, 0.0], &[7.0, 7.0], &mut [0.0, 0.0], &mut 0.0);
         assert_eq!(codes[0], 1.0);

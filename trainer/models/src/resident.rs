@@ -96,7 +96,8 @@ impl Resident {
     /// Moves the average towards the parameters, as [`crate::optim::ema`]. Does nothing if none is kept.
     pub fn follow(&mut self, decay: f64) {
         if let Some(average) = &mut self.average {
-            let (keep, take) = (decay as f32, (1.0 - decay) as f32);
+            let keep = decay as f32;
+            let take = (1.0 - decay) as f32;
             *average = average.clone().mul_scalar(keep) + self.params.clone().mul_scalar(take);
         }
     }

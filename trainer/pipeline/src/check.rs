@@ -95,7 +95,8 @@ impl PipelineStage {
                 "stage `{name}` is marked as created by a sweep; only a running sweep creates such stages"
             ));
         }
-        let (own, swept) = (graph::references(&self.settings), trial::references(self));
+        let own = graph::references(&self.settings);
+        let swept = trial::references(self);
         if own.iter().any(|reference| !self.inputs.contains(reference)) {
             wrong.push(format!("the inputs of stage `{name}` do not match its settings"));
         }
@@ -107,7 +108,8 @@ impl PipelineStage {
         };
         for input in self.inputs.iter().filter(|input| !own.contains(input) && !swept.contains(input) && !added(input))
         {
-            let (field, stage) = (shown(&input.field), shown(input.stage.as_str()));
+            let field = shown(&input.field);
+            let stage = shown(input.stage.as_str());
             wrong.push(format!("stage `{name}` reads `{stage}` as `{field}`, but its settings have no such input"));
         }
         let folders = self.settings.folders().into_iter().map(|folder| folder.field);

@@ -66,7 +66,8 @@ fn window_of(characters: Vec<char>, column: usize) -> (String, usize) {
     }
     let from = column.saturating_sub(60).min(characters.len().saturating_sub(110));
     let to = (from + 110).min(characters.len());
-    let (before, after) = (if from > 0 { "..." } else { "" }, if to < characters.len() { "..." } else { "" });
+    let before = if from > 0 { "..." } else { "" };
+    let after = if to < characters.len() { "..." } else { "" };
     let shown: String = characters[from..to].iter().collect();
     (format!("{before}{shown}{after}"), column - from + before.len())
 }

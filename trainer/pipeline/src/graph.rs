@@ -86,7 +86,9 @@ fn cycle(stages: &[PipelineStage], placed: &BTreeSet<&StageName>) -> Vec<StageNa
 
 /// Checks the limits on all stages together. The problem is reported at the stage that exceeds a limit.
 pub(crate) fn check_totals(stages: &[PipelineStage], found: &mut ByStage) {
-    let (mut shards, mut trials, mut values) = (0_u64, 0_usize, 0_usize);
+    let mut shards = 0_u64;
+    let mut trials = 0_usize;
+    let mut values = 0_usize;
     let most_values = limits::SWEPT_VALUES.min(limits::SWEPT_CHECKS / stages.len().max(1));
     for stage in stages {
         let before = (shards, trials, values);

@@ -184,7 +184,8 @@ fn a_number_out_of_range_is_refused_where_it_stands_and_none_breaks_the_reader()
     base.fill_external(|_, _| Ok::<_, ()>(Digest::of(b"x"))).unwrap();
     base.check().unwrap();
     let base = serde_json::to_value(&base).unwrap();
-    let (mut tried, mut refused) = (0, 0);
+    let mut tried = 0;
+    let mut refused = 0;
     for (i, (name, value)) in whole.iter().enumerate() {
         let mut found = Vec::new();
         numbers(value, "", &mut found);

@@ -146,7 +146,8 @@ impl Reader {
         let head = self.head(&root);
         let (written, stages) = self.stages(&root);
         let stages = self.connect(&root, &written, stages);
-        let (head, stages) = (head?, stages?);
+        let head = head?;
+        let stages = stages?;
         let Head { name, seed, backend } = head;
         let mut pipeline = Pipeline { name, seed, backend, stages, code_versions: BTreeMap::new() };
         pipeline.note_code_versions();
@@ -321,7 +322,8 @@ impl Reader {
     }
 
     fn stage(&mut self, entry: &Entry) -> Option<(StageSettings, Placement, Option<Sweep>)> {
-        let (name, node) = (&entry.key, &entry.value);
+        let name = &entry.key;
+        let node = &entry.value;
         let path = format!("stages.{name}");
         let owner = format!("stage `{name}`");
         if !is_stage_name(name) {

@@ -131,7 +131,8 @@ pub fn markdown() -> String {
     table(&mut text, &sweep::described());
     for settings in &all {
         let schema = described_kind(settings);
-        let (kind, output) = (settings.kind(), settings.output());
+        let kind = settings.kind();
+        let output = settings.output();
         let runs = match settings.shape() {
             Shape::Gang => "trained by a gang of workers",
             Shape::Map => "split into shards over workers",

@@ -29,7 +29,8 @@ pub(crate) fn rules(stage: &PipelineStage) -> Vec<Problem> {
     if evaluated_field(&sweep.evaluate, stage.settings.output().kind).is_none()
         || sweep.evaluate.output().kind != ArtifactKind::Report
     {
-        let (evaluation, gives) = (sweep.evaluate.kind(), stage.settings.output().kind.noun());
+        let evaluation = sweep.evaluate.kind();
+        let gives = stage.settings.output().kind.noun();
         p.add("sweep.evaluate", format!("`{evaluation}` does not measure {gives}"), "");
     }
     if !p.0.is_empty() {
@@ -150,7 +151,8 @@ fn space_rules(p: &mut Problems, stage: &PipelineStage, sweep: &Sweep) {
     let references = |settings: &StageSettings| -> Vec<String> {
         settings.clone().refs().into_iter().map(|reference| reference.field.into_owned()).collect()
     };
-    let (of_stage, of_evaluation) = (references(&stage.settings), references(&sweep.evaluate));
+    let of_stage = references(&stage.settings);
+    let of_evaluation = references(&sweep.evaluate);
     for (path, domain) in &sweep.space {
         let field = format!("sweep.space.{path}");
         let found = sweep.setting(&stage.settings, path).filter(|value| !value.is_object());

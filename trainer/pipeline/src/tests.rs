@@ -557,7 +557,8 @@ fn how_checkpoints_are_kept_is_no_part_of_a_stage_s_key() {
         "    steps: 10\n",
         "    steps: 10\n    checkpoint: {every: 5, keep: {best: 2, metric: joint, mode: max}}\n",
     );
-    let (plain, kept) = (read("p.yaml", GOOD, &[]).unwrap(), read("p.yaml", &kept, &[]).unwrap());
+    let plain = read("p.yaml", GOOD, &[]).unwrap();
+    let kept = read("p.yaml", &kept, &[]).unwrap();
     let vae = |pipeline: &Pipeline| pipeline.stage(&"vae".into()).unwrap().clone();
     let expected = Keep { latest: 2, ended: 0, best: 2, metric: "joint".into(), mode: Mode::Max };
     assert_eq!(vae(&kept).placement.checkpoint.keep, expected);

@@ -14,7 +14,8 @@ pub(crate) fn trial_settings(
     base: &StageSettings,
     values: &Values,
 ) -> Result<(StageSettings, StageSettings), String> {
-    let (mut own, mut of_evaluation) = (Values::new(), Values::new());
+    let mut own = Values::new();
+    let mut of_evaluation = Values::new();
     for (path, value) in values {
         match in_evaluation(path) {
             Some(path) => of_evaluation.insert(path.to_owned(), value.clone()),

@@ -264,7 +264,8 @@ impl Builder<'_> {
     /// Subtracts `size` from the budget, or reports that it is exceeded.
     fn take(&mut self, span: Span, size: Size) -> Result<(), Stop> {
         let left = &mut self.budget.0;
-        let (values, bytes) = (left.values.checked_sub(size.values), left.bytes.checked_sub(size.bytes));
+        let values = left.values.checked_sub(size.values);
+        let bytes = left.bytes.checked_sub(size.bytes);
         let (what, limit) = match (values, bytes) {
             (Some(values), Some(bytes)) => {
                 *left = Size { values, bytes };

@@ -131,7 +131,8 @@ pub fn crop_rows(
     (start, length): (usize, usize),
     augmented: Option<&Augmented>,
 ) -> Vec<f32> {
-    let (of, skeleton) = (&dataset.entries[entry], dataset.skeleton());
+    let of = &dataset.entries[entry];
+    let skeleton = dataset.skeleton();
     let width = skeleton.features;
     let mut rows = dataset.features(of)[start * width..(start + length) * width].to_vec();
     if let Some(by) = augmented.filter(|_| of.split == Split::Train) {
@@ -350,7 +351,8 @@ impl<T: Pod> HostTensor<T> {
     /// # Panics
     /// If the number of values does not match the shape.
     pub fn new(shape: impl Into<Vec<usize>>, values: impl Into<Values<T>>) -> Self {
-        let (shape, values) = (shape.into(), values.into());
+        let shape = shape.into();
+        let values = values.into();
         assert_eq!(shape.iter().product::<usize>(), values.len(), "values for shape {shape:?}");
         Self { shape, values }
     }

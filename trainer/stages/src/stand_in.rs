@@ -60,7 +60,8 @@ pub(crate) fn evaluator(cx: &mut dyn AttemptContext, format: DataFormat) -> Resu
     };
     let device = cx.device();
     let network = Evaluator::new(&meta.config, &mut Init::new(cx.task().seed, "estimate", Positions::Uniform, &device));
-    let (entries, values) = (flat::layout(&network), flat::read(&network));
+    let entries = flat::layout(&network);
+    let values = flat::read(&network);
     evaluator::publish(cx, &meta, (&entries[..], &values[..]), &words)
 }
 

@@ -98,7 +98,8 @@ impl Description {
     /// The defect.
     pub fn check(&self) -> Result<(), String> {
         self.network.check()?;
-        let (most, positions) = (self.rules.most, self.network.positions());
+        let most = self.rules.most;
+        let positions = self.network.positions();
         if most > positions {
             return Err(format!("captions have up to {most} tokens, but the network has {positions} positions"));
         }
@@ -201,7 +202,8 @@ impl EncoderFolder {
         }
         let parts: Vec<String> = parts.iter().map(|(part, count)| format!("{part}* ({count})")).collect();
         (!parts.is_empty()).then(|| {
-            let (count, names) = (self.skipped.len(), excerpts(parts.iter().map(String::as_str), 8));
+            let count = self.skipped.len();
+            let names = excerpts(parts.iter().map(String::as_str), 8);
             format!("{}: skipped {count} tensors that are not part of the text encoder: {names}", self.path.display())
         })
     }
@@ -230,7 +232,8 @@ fn tokenizer(root: &DataPath, kind: Kind) -> Result<(String, Vec<u8>), EncoderEr
         return Ok((shown("tokenizer.json"), read("tokenizer.json")?));
     }
     if kind == Kind::Clip && is_there("vocab.json") && is_there("merges.txt") {
-        let (vocab, merges) = (read("vocab.json")?, read("merges.txt")?);
+        let vocab = read("vocab.json")?;
+        let merges = read("merges.txt")?;
         let json = clip_from_parts((&shown("vocab.json"), &vocab), (&shown("merges.txt"), &merges))?;
         return Ok((shown("vocab.json"), json));
     }
@@ -275,9 +278,11 @@ fn rules(
     match network {
         Network::Clip(sizes) => {
             let end_word = word("eos_token", "<|endoftext|>");
-            let (first, end) = (id(&word("bos_token", "<|startoftext|>"))?, id(&end_word)?);
+            let first = id(&word("bos_token", "<|startoftext|>"))?;
+            let end = id(&end_word)?;
             if ![2, end as usize].contains(&sizes.eos_token_id) {
-                let (said, is) = (sizes.eos_token_id, excerpt(&end_word));
+                let said = sizes.eos_token_id;
+                let is = excerpt(&end_word);
                 let what = format!("`eos_token_id` is {said}; expected 2, or {end}, the id of `{is}` in the tokenizer");
                 return Err(EncoderError::at(&root.join("config.json"), what));
             }
@@ -292,7 +297,8 @@ fn rules(
             let sentence = if request.kind == Kind::SentenceT5 { json_if_there(&file)? } else { Value::Null };
             let own = own(&sentence["max_seq_length"]).or(own_most).unwrap_or(T5_TOKENS);
             let lower = sentence["do_lower_case"].as_bool().unwrap_or(false);
-            let (end, pad) = (id(&word("eos_token", "</s>"))?, sizes.pad_token_id);
+            let end = id(&word("eos_token", "</s>"))?;
+            let pad = sizes.pad_token_id;
             Ok(Rules {
                 repair: false,
                 strip: true,
@@ -361,7 +367,8 @@ impl Modules {
     fn behind(&self, width: usize) -> Result<Behind, EncoderError> {
         let refuse = |what: String| EncoderError::at(&self.file, what);
         let mut head = Head { width, dense: false, bias: false, normalise: false };
-        let (mut weights, mut left) = (BTreeMap::new(), Vec::new());
+        let mut weights = BTreeMap::new();
+        let mut left = Vec::new();
         let classes: Vec<&str> = self.others.iter().map(|(class, _)| class.as_str()).collect();
         let known =
             [&["Pooling"][..], &["Pooling", "Normalize"], &["Pooling", "Dense"], &["Pooling", "Dense", "Normalize"]];

@@ -194,7 +194,8 @@ impl Network {
                 size("max_position_embeddings", of.max_position_embeddings, POSITIONS)?;
                 size("projection_dim", of.projection_dim, WIDEST)?;
                 small("layer_norm_eps", of.layer_norm_eps)?;
-                let (width, heads) = (of.hidden_size, of.num_attention_heads);
+                let width = of.hidden_size;
+                let heads = of.num_attention_heads;
                 if width % heads != 0 {
                     return Err(format!("`hidden_size` is {width}; expected a multiple of the {heads} heads"));
                 }
@@ -213,7 +214,8 @@ impl Network {
                 size("relative_attention_num_buckets", of.relative_attention_num_buckets, WIDEST)?;
                 size("relative_attention_max_distance", of.relative_attention_max_distance, WIDEST)?;
                 small("layer_norm_epsilon", of.layer_norm_epsilon)?;
-                let (buckets, most) = (of.relative_attention_num_buckets, of.relative_attention_max_distance);
+                let buckets = of.relative_attention_num_buckets;
+                let most = of.relative_attention_max_distance;
                 if buckets % 4 != 0 || most <= buckets / 4 {
                     return Err(format!(
                         "there are {buckets} buckets up to a distance of {most}; expected a multiple of 4, and a \
@@ -260,7 +262,8 @@ impl Network {
         let mut add = |name: String, shape: &[usize]| all.push(TensorSpec { name, shape: shape.to_vec() });
         match self {
             Self::Clip(of) => {
-                let (width, inner) = (of.hidden_size, of.intermediate_size);
+                let width = of.hidden_size;
+                let inner = of.intermediate_size;
                 add("text_model.embeddings.token_embedding.weight".into(), &[of.vocab_size, width]);
                 add("text_model.embeddings.position_embedding.weight".into(), &[of.max_position_embeddings, width]);
                 for layer in 0..of.num_hidden_layers {
@@ -283,7 +286,8 @@ impl Network {
                 add("text_projection.weight".into(), &[of.projection_dim, width]);
             }
             Self::T5(of) => {
-                let (width, inner) = (of.d_model, of.num_heads * of.d_kv);
+                let width = of.d_model;
+                let inner = of.num_heads * of.d_kv;
                 add("shared.weight".into(), &[of.vocab_size, width]);
                 for layer in 0..of.num_layers {
                     let name = |part: &str| format!("encoder.block.{layer}.layer.{part}.weight");

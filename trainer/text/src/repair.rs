@@ -116,7 +116,8 @@ fn windows_byte(c: char) -> Option<u8> {
 
 /// Replaces entities by their characters.
 fn unescaped(text: &str) -> String {
-    let (mut out, mut rest) = (String::with_capacity(text.len()), text);
+    let mut out = String::with_capacity(text.len());
+    let mut rest = text;
     while let Some(at) = rest.find('&') {
         out.push_str(&rest[..at]);
         rest = &rest[at..];

@@ -196,7 +196,8 @@ impl Tokenizer {
     pub fn ids(&self, caption: &str) -> Result<Vec<u32>, EncoderError> {
         let refuse = |what: String| EncoderError::new(format!("the caption `{}`", excerpt(caption)), what);
         if caption.len() > limits::CAPTION_BYTES {
-            let (found, most) = (caption.len(), limits::CAPTION_BYTES);
+            let found = caption.len();
+            let most = limits::CAPTION_BYTES;
             return Err(refuse(format!("has {found} bytes; expected at most {most}")));
         }
         let text = self.rules.prepared(caption);
@@ -317,8 +318,10 @@ pub(crate) fn clip_from_parts(vocab: (&str, &[u8]), merges: (&str, &[u8])) -> Re
             .and_then(Value::as_u64)
             .ok_or_else(|| EncoderError::new(vocab.0, format!("no token `{token}`, which every caption needs")))
     };
-    let (start, end) = ("<|startoftext|>", "<|endoftext|>");
-    let (first, last) = (id(start)?, id(end)?);
+    let start = "<|startoftext|>";
+    let end = "<|endoftext|>";
+    let first = id(start)?;
+    let last = id(end)?;
     let text = std::str::from_utf8(merges.1).map_err(|e| EncoderError::new(merges.0, e.to_string()))?;
     // The last line may lack its end, or an empty line may follow.
     let lines = text.lines().filter(|line| !line.starts_with("#version") && !line.is_empty());

@@ -236,7 +236,8 @@ impl Weights {
         specs: &[TensorSpec],
         prefix: &str,
     ) -> Result<BTreeMap<String, StoredTensor>, EncoderError> {
-        let (mut found, mut missing) = (BTreeMap::new(), Vec::new());
+        let mut found = BTreeMap::new();
+        let mut missing = Vec::new();
         for TensorSpec { name, shape } in specs {
             match self.tensors.remove(name) {
                 Some(tensor) if tensor.shape == *shape => {

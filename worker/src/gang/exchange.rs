@@ -50,7 +50,8 @@ pub(crate) struct Total {
 
 /// Sums the gradients of all slices of a step.
 pub(crate) fn exchange(mesh: &Mesh, contribution: &Contribution<'_>, interrupt: Interrupt<'_>) -> Result<Total, Halt> {
-    let (own, size) = (mesh.config.rank, mesh.size());
+    let own = mesh.config.rank;
+    let size = mesh.size();
     let root = 0..contribution.slices;
     if size == 1 {
         let length = contribution.parts.first().map_or(0, |(_, part)| part.len());
@@ -121,7 +122,8 @@ fn receive_parts(
     interrupt: Interrupt<'_>,
 ) -> Result<Received, Halt> {
     let disagree = |peer: usize, what: String| disagree(mesh, barrier, peer, &what);
-    let (own, size) = (mesh.config.rank, mesh.size());
+    let own = mesh.config.rank;
+    let size = mesh.size();
     let mut received = Received {
         sums: Vec::new(),
         length: contribution.parts.first().map(|(_, part)| part.len()),
@@ -177,7 +179,9 @@ fn receive_parts(
 
 /// Sends this member's chunk of the sum and receives the others': the all-gather.
 fn gather(mesh: &Mesh, barrier: &str, step: u64, sum: &mut [f32], interrupt: Interrupt<'_>) -> Result<(), Halt> {
-    let (own, size, length) = (mesh.config.rank, mesh.size(), sum.len());
+    let own = mesh.config.rank;
+    let size = mesh.size();
+    let length = sum.len();
     for peer in mesh.others() {
         for (p, range) in pieces(&tree::share(length, own, size)).enumerate() {
             let head = Head::new(Kind::Sum, step, 0, number(p));

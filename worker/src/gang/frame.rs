@@ -325,7 +325,8 @@ mod tests {
             let rate = 500.0 * MAX_PAYLOAD as f64 / begun.elapsed().as_secs_f64() / 1e9;
             eprintln!("{what}: {rate:.2} GB/s on frames of {MAX_PAYLOAD} bytes");
         };
-        let (mut tagged, mut encrypted) = (seal(), Seal::encrypted([7; 32]));
+        let mut tagged = seal();
+        let mut encrypted = Seal::encrypted([7; 32]);
         time("keyed BLAKE3", &mut || {
             std::hint::black_box(tagged.seal(&[0; SIGNED], &payload));
         });

@@ -286,7 +286,8 @@ mod tests {
     #[test]
     fn one_secret_meets_and_each_direction_of_each_connection_has_a_key_of_its_own() {
         let (dialer, dialled) = meet("same", "same");
-        let (mut dialer, mut dialled) = (dialer.expect("welcome"), dialled.expect("proved"));
+        let mut dialer = dialer.expect("welcome");
+        let mut dialled = dialled.expect("proved");
         assert!(agree(&mut dialer.sends.clone(), &mut dialled.receives));
         assert!(agree(&mut dialled.sends.clone(), &mut dialer.receives.clone()));
         assert!(!agree(&mut dialer.sends.clone(), &mut dialer.receives), "a frame is not sent back to who made it");

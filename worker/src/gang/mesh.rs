@@ -100,7 +100,8 @@ impl Mesh {
         };
         let peers = Mutex::new(config.members.iter().map(peer).collect());
         let timing = endpoint.timing;
-        let (waits_for, closed) = (AtomicUsize::new(0), AtomicBool::new(false));
+        let waits_for = AtomicUsize::new(0);
+        let closed = AtomicBool::new(false);
         let pace = Pace::new(config.members.len(), timing.slow);
         let mesh = Arc::new(Self { config, timing, peers, event_count, wake, waits_for, pace, closed });
         if mesh.size() > 1 {
@@ -123,7 +124,8 @@ impl Mesh {
 
     /// Ranks of the others, starting after this one, so that not all members send to the same one first.
     pub(crate) fn others(&self) -> impl Iterator<Item = usize> + use<> {
-        let (rank, size) = (self.config.rank, self.size());
+        let rank = self.config.rank;
+        let size = self.size();
         (1..size).map(move |i| (rank + i) % size)
     }
 
@@ -157,7 +159,8 @@ impl Mesh {
     /// Makes the next poll report that this gang is slower than its member alone, because of `rank`. The connection
     /// stays.
     pub(super) fn complain(&self, rank: usize) {
-        let (task, generation) = (&self.config.task, self.config.generation);
+        let task = &self.config.task;
+        let generation = self.config.generation;
         tracing::warn!(%task, %generation, peer = %self.name(rank), "the gang is slower than this member alone; it waits for this peer");
         self.wake.notify_one();
     }
@@ -255,7 +258,8 @@ impl Mesh {
                 let _ = link.socket.shutdown(Shutdown::Write);
             }
         }
-        let (task, generation) = (&self.config.task, self.config.generation);
+        let task = &self.config.task;
+        let generation = self.config.generation;
         tracing::warn!(%task, %generation, peer = %self.name(rank), "lost a gang member: {reason}");
         self.wake.notify_one();
         self.event_count.notify();

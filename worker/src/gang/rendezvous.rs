@@ -52,10 +52,12 @@ pub(crate) fn rendezvous(
         tracing::info!(step = newest, bytes, receivers = behind.len(), "sending the state to members behind");
         for peer in behind {
             mesh.send(peer, &barrier, Head::new(Kind::StateLength, bytes as u64, 0, 0), &[], interrupt)?;
-            let (begun, mut sent) = (Instant::now(), 0);
+            let begun = Instant::now();
+            let mut sent = 0;
             for piece in state.iter().flat_map(|piece| piece.chunks(MAX_PAYLOAD)) {
                 // All other members wait for this one.
-                let (elapsed, limit) = (begun.elapsed(), mesh.timing.start);
+                let elapsed = begun.elapsed();
+                let limit = mesh.timing.start;
                 let is_slow =
                     elapsed > mesh.timing.slow && elapsed.mul_f64(bytes as f64 / sent.max(1) as f64) > limit / 5;
                 if elapsed > limit || is_slow {
@@ -96,7 +98,8 @@ pub(crate) fn adopt(
         return Err(disagree(mesh, &barrier, source, &what));
     }
     let mut room = Room::new(room);
-    let (mut pieces, mut there) = (Vec::new(), 0);
+    let mut pieces = Vec::new();
+    let mut there = 0;
     while there < length {
         let frame = expect(mesh.next(source, &barrier, interrupt)?, Kind::State, mesh, source)?;
         there += frame.bytes().len() as u64;

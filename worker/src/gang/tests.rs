@@ -284,7 +284,9 @@ fn lose_one(members: usize, victim: usize, plan: Plan, at: u64, delay: Duration)
     let expected = bits(&reference(plan.steps, plan.slices, plan.length));
     thread::scope(|scope| {
         let supervisor = {
-            let (gang, all, over) = (gang.clone(), all.clone(), &over);
+            let gang = gang.clone();
+            let all = all.clone();
+            let over = &over;
             scope.spawn(move || gang.supervise(all, over))
         };
         let threads: Vec<_> = all
@@ -357,7 +359,8 @@ fn a_joiner_takes_the_state_of_a_peer() {
         reached_by_first.recv().expect("the first member trains");
         gang.regroup(&[0, 1, 2], false);
         for i in [1, 2] {
-            let (gang, adopted) = (gang.clone(), &adopted);
+            let gang = gang.clone();
+            let adopted = &adopted;
             threads.push(scope.spawn(move || {
                 let mut first = true;
                 train(&mut gang.context(i), plan, |step| {
@@ -490,7 +493,9 @@ fn throughput() {
         let barrier = std::sync::Barrier::new(members);
         thread::scope(|scope| {
             for i in 0..members {
-                let (gang, begun, barrier) = (gang.clone(), &begun, &barrier);
+                let gang = gang.clone();
+                let begun = &begun;
+                let barrier = &barrier;
                 scope.spawn(move || {
                     let mut context = gang.context(i);
                     context.rendezvous(None, &[]).expect("met");

@@ -8,7 +8,8 @@ use super::*;
 
 #[test]
 fn blobs_are_verified() {
-    let (good, absent) = (Digest::of(b"good"), Digest::of(b"absent"));
+    let good = Digest::of(b"good");
+    let absent = Digest::of(b"absent");
     let worker = Worker::start(Box::new(move |context| {
         let blobs = context.blobs();
         assert_eq!(&*blobs.get(good).expect("a damaged download is repeated"), b"good");

@@ -259,7 +259,8 @@ async fn put_blob(
     assert_eq!(headers["authorization"], format!("Bearer {TOKEN}"));
     let number =
         |name: &str| headers[name].to_str().ok().and_then(|text| text.parse::<usize>().ok()).expect("a number");
-    let (offset, bytes) = (number("x-stride-offset"), number("x-stride-bytes"));
+    let offset = number("x-stride-offset");
+    let bytes = number("x-stride-bytes");
     if lock(&fake.coordinator).unfit {
         return refuse(StatusCode::PAYLOAD_TOO_LARGE, "too-large");
     }

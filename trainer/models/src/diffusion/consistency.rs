@@ -128,7 +128,8 @@ mod tests {
 
     #[test]
     fn timesteps_are_the_published_ones() {
-        let (v1, v2) = (LcmTimesteps::Even(Grid::new(20)), LcmTimesteps::Tuned(Grid::new(100)));
+        let v1 = LcmTimesteps::Even(Grid::new(20));
+        let v2 = LcmTimesteps::Tuned(Grid::new(100));
         assert_eq!(lcm_timesteps(v1, 4), [999, 759, 499, 259]);
         assert_eq!(lcm_timesteps(v1, 3), [999, 679, 339]);
         assert_eq!(lcm_timesteps(v1, 8), [999, 879, 759, 639, 499, 379, 259, 139]);

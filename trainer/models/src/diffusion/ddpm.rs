@@ -24,9 +24,11 @@ pub fn ddpm_timesteps(schedule: &Schedule, steps: usize) -> Vec<usize> {
 
 /// The factors (A, C, D) of `z_s = A z_t + C z_0 + D noise` for s before t.
 pub fn posterior(schedule: &Schedule, t: usize, s: usize) -> (f64, f64, f64) {
-    let (bar_t, bar_s) = (schedule.alpha_bar(t), schedule.alpha_bar(s));
+    let bar_t = schedule.alpha_bar(t);
+    let bar_s = schedule.alpha_bar(s);
     let ratio = bar_t / bar_s;
-    let (a, c) = (ratio.sqrt() * (1.0 - bar_s), bar_s.sqrt() * (1.0 - ratio));
+    let a = ratio.sqrt() * (1.0 - bar_s);
+    let c = bar_s.sqrt() * (1.0 - ratio);
     let variance = (1.0 - ratio) * (1.0 - bar_s) / (1.0 - bar_t);
     (a / (1.0 - bar_t), c / (1.0 - bar_t), variance.sqrt())
 }
@@ -71,7 +73,9 @@ mod tests {
         let schedule = cosine(50);
         for t in 1..50 {
             let (a, c, d) = posterior(&schedule, t, t - 1);
-            let (beta, bar, before) = (schedule.beta(t), schedule.alpha_bar(t), schedule.alpha_bar(t - 1));
+            let beta = schedule.beta(t);
+            let bar = schedule.alpha_bar(t);
+            let before = schedule.alpha_bar(t - 1);
             assert!((a - (1.0 - before) * (1.0 - beta).sqrt() / (1.0 - bar)).abs() < 1e-9, "t {t}");
             assert!((c - beta * before.sqrt() / (1.0 - bar)).abs() < 1e-9, "t {t}");
             assert!((d * d - beta * (1.0 - before) / (1.0 - bar)).abs() < 1e-9, "t {t}");

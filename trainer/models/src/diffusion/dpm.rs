@@ -102,7 +102,8 @@ impl DpmPath {
         let all = schedule.steps();
         assert!((1..=all).contains(&steps), "the solver takes 1 to {all} steps, not {steps}");
         let logs: Vec<f64> = (0..all).map(|t| ratio(schedule, t).ln()).collect();
-        let (high, low) = (logs[all - 1].exp().powf(1.0 / RHO), logs[0].exp().powf(1.0 / RHO));
+        let high = logs[all - 1].exp().powf(1.0 / RHO);
+        let low = logs[0].exp().powf(1.0 / RHO);
         let level = |i: usize| {
             let share = i as f64 / (steps - 1).max(1) as f64;
             let ratio = (high + share * (low - high)).powf(RHO);
@@ -134,7 +135,8 @@ impl DpmPath {
 
     /// The factors of move `j`.
     fn step(&self, form: Form, j: usize) -> Move {
-        let (from, to) = (self.levels[j], self.levels[j + 1]);
+        let from = self.levels[j];
+        let to = self.levels[j + 1];
         if to.sigma == 0.0 {
             // The limit of all three forms at level 0; their own formulas divide by the level.
             let noise = if form == Form::Noise { -from.sigma / from.alpha } else { 0.0 };
@@ -225,7 +227,8 @@ mod tests {
     /// The exact network for one known sample: every form must reach the sample for any number of steps.
     #[test]
     fn a_network_that_knows_the_sample_is_followed_to_it() {
-        let (schedule, device) = (Schedule::published(), Device::flex());
+        let schedule = Schedule::published();
+        let device = Device::flex();
         let clean = Tensor::<3>::from_floats([[[0.7, -1.2, 0.1]]], &device);
         let noise = Tensor::<3>::from_floats([[[-0.4, 0.9, 1.5]]], &device);
         let start = affine_one(clean.clone(), noise, schedule.add_noise(999));

@@ -34,7 +34,8 @@ pub fn column(values: &[f32], like: &Tensor<3>) -> Tensor<3> {
 
 /// Computes `a_b z_b + e_b eps_b` for every sample b; `z`, `eps` [B, N, d], `a`, `e` [B].
 pub fn affine(z: Tensor<3>, eps: Tensor<3>, a: &[f32], e: &[f32]) -> Tensor<3> {
-    let (a, e) = (column(a, &z), column(e, &z));
+    let a = column(a, &z);
+    let e = column(e, &z);
     z * a + eps * e
 }
 

@@ -92,12 +92,14 @@ mod tests {
     #[test]
     fn phases_do_not_matter_if_the_prediction_is_constant() {
         use burn::tensor::{Device, TensorData};
-        let (schedule, device) = (Schedule::published(), Device::flex());
+        let schedule = Schedule::published();
+        let device = Device::flex();
         let make = |seed: f32| {
             let values: Vec<f32> = (0..24_u8).map(|i| (f32::from(i) * seed).sin()).collect();
             Tensor::<3>::from_data(TensorData::new(values, [2, 3, 4]), &device)
         };
-        let (z, noise) = (make(0.7), make(1.3));
+        let z = make(0.7);
+        let noise = make(1.3);
         let expected = affine_one(z.clone(), noise.clone(), schedule.jump(999, 0)).into_data();
         for m in [1, 2, 4, 10] {
             let phases = Phases::new(&Grid::new(100), m);

@@ -44,7 +44,8 @@ fn line(first: f32, last: f32, steps: usize) -> impl Iterator<Item = f32> {
 }
 
 fn betas(settings: &Diffusion, steps: usize) -> Vec<f64> {
-    let (first, last) = (settings.beta_first, settings.beta_last);
+    let first = settings.beta_first;
+    let last = settings.beta_last;
     match settings.schedule {
         NoiseSchedule::ScaledLinear => {
             line(first.sqrt() as f32, last.sqrt() as f32, steps).map(|root| f64::from(root * root)).collect()
@@ -181,7 +182,8 @@ impl Schedule {
             let a = alpha / self.alpha(t);
             return (a, sigma - a * self.sigma(t));
         }
-        let (clean, noise) = (self.clean(t), self.noise(t));
+        let clean = self.clean(t);
+        let noise = self.noise(t);
         (alpha * clean.0 + sigma * noise.0, alpha * clean.1 + sigma * noise.1)
     }
 
@@ -289,7 +291,8 @@ mod tests {
         let device = burn::tensor::Device::flex();
         let tensor = |value: f64| Tensor::<3>::full([1, 1, 1], value as f32, &device);
         for (settings, schedule) in all(50) {
-            let (clean, noise) = (0.75_f64, -1.25_f64);
+            let clean = 0.75_f64;
+            let noise = -1.25_f64;
             for t in 0..50 {
                 let (a, e) = schedule.add_noise(t);
                 let z = a * clean + e * noise;
@@ -315,7 +318,8 @@ mod tests {
     #[test]
     fn noising_in_two_moves_has_the_variance_of_one() {
         for (settings, schedule) in all(100) {
-            let (first, second) = (schedule.add_noise(20), schedule.transition(20, 70));
+            let first = schedule.add_noise(20);
+            let second = schedule.transition(20, 70);
             let whole = schedule.add_noise(70);
             let variance = (second.0 * first.1).powi(2) + second.1.powi(2);
             assert!((second.0 * first.0 - whole.0).abs() < 1e-6, "{settings:?}");

@@ -56,7 +56,8 @@ mod kernel {
             let width = found.len() / weights.len().max(1);
             let mut total = 0.0;
             for (row, weight) in weights.iter().enumerate() {
-                let (a, b) = (&found[row * width..][..width], &expected[row * width..][..width]);
+                let a = &found[row * width..][..width];
+                let b = &expected[row * width..][..width];
                 let sum = match distance {
                     Pointwise::SmoothL1 => lanes(
                         |i| {
@@ -80,8 +81,10 @@ mod kernel {
         fn slopes(distance: Pointwise, found: &[f32], expected: &[f32], weights: &[f32], scale: f32, out: &mut [f32]) {
             let width = found.len() / weights.len().max(1);
             for (row, weight) in weights.iter().enumerate() {
-                let (a, b) = (&found[row * width..][..width], &expected[row * width..][..width]);
-                let (out, factor) = (&mut out[row * width..][..width], weight * scale);
+                let a = &found[row * width..][..width];
+                let b = &expected[row * width..][..width];
+                let out = &mut out[row * width..][..width];
+                let factor = weight * scale;
                 match distance {
                     Pointwise::SmoothL1 => {
                         for i in 0..width {

@@ -94,7 +94,8 @@ mod kernel {
 
         /// Reorders states from [turn, B, g] to [B, T, g].
         fn by_sequence(&self, states: &[f32]) -> Vec<f32> {
-            let (size, width) = (self.batch * self.width, self.width);
+            let size = self.batch * self.width;
+            let width = self.width;
             let mut out = vec![0.0; states.len()];
             for i in 0..self.tokens {
                 for b in 0..self.batch {
@@ -124,10 +125,12 @@ mod kernel {
             let old = if i == 0 { start } else { &before[(i - 1) * size..] };
             u.clear();
             (0..batch).for_each(|_| u.extend_from_slice(bias));
-            let (by_row, by_gate) = (View::rows(width), View::rows(3 * width));
+            let by_row = View::rows(width);
+            let by_gate = View::rows(3 * width);
             matmul((batch, 3 * width, width), old, by_row, weight, by_row.t(), &mut u, by_gate, 1.0, 1.0);
             for b in 0..batch {
-                let (old, new) = (&old[b * width..][..width], &mut after[b * width..][..width]);
+                let old = &old[b * width..][..width];
+                let new = &mut after[b * width..][..width];
                 if t < shape.lengths[b] {
                     let a = &input[(b * tokens + t) * 3 * width..][..3 * width];
                     let gates = &mut run.gates[(i * batch + b) * 4 * width..][..4 * width];
@@ -157,12 +160,17 @@ mod kernel {
         /// Computes one token of one sequence.
         fn unit(a: &[f32], u: &[f32], old: &[f32], gates: &mut [f32], new: &mut [f32]) {
             let g = old.len();
-            let (a_r, a_z, a_n) = (&a[..g], &a[g..2 * g], &a[2 * g..3 * g]);
-            let (u_r, u_z, u_n) = (&u[..g], &u[g..2 * g], &u[2 * g..3 * g]);
+            let a_r = &a[..g];
+            let a_z = &a[g..2 * g];
+            let a_n = &a[2 * g..3 * g];
+            let u_r = &u[..g];
+            let u_z = &u[g..2 * g];
+            let u_n = &u[2 * g..3 * g];
             let (gate_r, rest) = gates.split_at_mut(g);
             let (gate_z, rest) = rest.split_at_mut(g);
             let (gate_n, kept) = rest.split_at_mut(g);
-            let (new, kept) = (&mut new[..g], &mut kept[..g]);
+            let new = &mut new[..g];
+            let kept = &mut kept[..g];
             for k in 0..g {
                 let r = logistic(a_r[k] + u_r[k]);
                 let z = logistic(a_z[k] + u_z[k]);
@@ -181,15 +189,21 @@ mod kernel {
         /// part of the gradient of the state before it, without the part through the gates.
         fn unit_back(gates: &[f32], old: &[f32], dh: &mut [f32], da: &mut [f32], du: &mut [f32]) {
             let g = old.len();
-            let (gate_r, gate_z) = (&gates[..g], &gates[g..2 * g]);
-            let (gate_n, kept) = (&gates[2 * g..3 * g], &gates[3 * g..4 * g]);
+            let gate_r = &gates[..g];
+            let gate_z = &gates[g..2 * g];
+            let gate_n = &gates[2 * g..3 * g];
+            let kept = &gates[3 * g..4 * g];
             let (da_r, rest) = da.split_at_mut(g);
             let (da_z, da_n) = rest.split_at_mut(g);
             let (du_r, rest) = du.split_at_mut(g);
             let (du_z, du_n) = rest.split_at_mut(g);
-            let (dh, da_n, du_n) = (&mut dh[..g], &mut da_n[..g], &mut du_n[..g]);
+            let dh = &mut dh[..g];
+            let da_n = &mut da_n[..g];
+            let du_n = &mut du_n[..g];
             for k in 0..g {
-                let (r, z, n) = (gate_r[k], gate_z[k], gate_n[k]);
+                let r = gate_r[k];
+                let z = gate_z[k];
+                let n = gate_n[k];
                 let pre_n = dh[k] * (1.0 - z) * (1.0 - n * n);
                 let pre_z = dh[k] * (old[k] - n) * z * (1.0 - z);
                 let pre_r = pre_n * kept[k] * r * (1.0 - r);
@@ -221,7 +235,9 @@ mod kernel {
         ) -> [Option<FlexTensor>; 4] {
             let shape = self;
             let &Gru { batch, tokens, width, .. } = shape;
-            let (dy, start, weight) = (slice(&dy), slice(&start), slice(&weight));
+            let dy = slice(&dy);
+            let start = slice(&start);
+            let weight = slice(&weight);
             let size = batch * width;
             let mut dh = vec![0.0; size];
             let mut da = vec![0.0; 3 * size * tokens];
@@ -245,11 +261,13 @@ mod kernel {
                         unit_back(gates, old, dh, da, &mut du[b * 3 * width..][..3 * width]);
                     }
                 }
-                let (by_row, by_gate) = (View::rows(width), View::rows(3 * width));
+                let by_row = View::rows(width);
+                let by_gate = View::rows(3 * width);
                 matmul((batch, width, 3 * width), du, by_gate, weight, by_row, &mut dh, by_row, 1.0, 1.0);
             }
             let by_weight = || {
-                let (by_row, by_gate) = (View::rows(width), View::rows(3 * width));
+                let by_row = View::rows(width);
+                let by_gate = View::rows(3 * width);
                 make(product((3 * width, width, tokens * batch), &du, by_gate.t(), &olds, by_row), &[3 * width, width])
             };
             let by_bias = || {
@@ -257,7 +275,8 @@ mod kernel {
                 add_rows(&mut db, &du);
                 make(db, &[3 * width])
             };
-            let (weight, bias) = (wanted[2].then(by_weight), wanted[3].then(by_bias));
+            let weight = wanted[2].then(by_weight);
+            let bias = wanted[3].then(by_bias);
             [Some(make(da, &[batch, tokens, 3 * width])), Some(make(dh, &[batch, width])), weight, bias]
         }
     }

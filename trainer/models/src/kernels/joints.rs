@@ -47,7 +47,8 @@ pub fn joint_velocities(joints: Tensor<4>, which: &[usize], rate: f64) -> Tensor
 /// Joints of features that are not normalised.
 fn composed(features: Tensor<3>, skeleton: &Skeleton) -> Tensor<4> {
     let [batch, frames, _] = features.dims();
-    let (device, others) = (features.device(), skeleton.joints - 1);
+    let device = features.device();
+    let others = skeleton.joints - 1;
     let columns = |range: std::ops::Range<usize>| features.clone().slice([0..batch, 0..frames, range]);
     // Row t holds the increment that leads *to* frame t; the first row is zero.
     let before = |x: Tensor<3>| {
@@ -59,9 +60,11 @@ fn composed(features: Tensor<3>, skeleton: &Skeleton) -> Tensor<4> {
         Tensor::cat(vec![first, x.slice([0..batch, 0..frames - 1, 0..width])], 1)
     };
     let yaw = before(columns(0..1)).cumsum(1) * 2.0;
-    let (sin, cos) = (yaw.clone().sin(), yaw.cos());
+    let sin = yaw.clone().sin();
+    let cos = yaw.cos();
 
-    let (step_x, step_z) = (before(columns(1..2)), before(columns(2..3)));
+    let step_x = before(columns(1..2));
+    let step_z = before(columns(2..3));
     let root_x = (cos.clone() * step_x.clone() - sin.clone() * step_z.clone()).cumsum(1);
     let root_z = (sin.clone() * step_x + cos.clone() * step_z).cumsum(1);
     let root = Tensor::cat(vec![root_x.clone(), columns(3..4), root_z.clone()], 2).reshape([batch, frames, 1, 3]);
@@ -69,7 +72,10 @@ fn composed(features: Tensor<3>, skeleton: &Skeleton) -> Tensor<4> {
     let local = columns(skeleton.layout().positions).reshape([batch, frames, others, 3]);
     let axis = |k: usize| local.clone().slice([0..batch, 0..frames, 0..others, k..k + 1]);
     let wide = |x: Tensor<3>| x.reshape([batch, frames, 1, 1]);
-    let (x, z, sin, cos) = (axis(0), axis(2), wide(sin), wide(cos));
+    let x = axis(0);
+    let z = axis(2);
+    let sin = wide(sin);
+    let cos = wide(cos);
     let turned_x = cos.clone() * x.clone() - sin.clone() * z.clone() + wide(root_x);
     let turned_z = sin * x + cos * z + wide(root_z);
     Tensor::cat(vec![root, Tensor::cat(vec![turned_x, axis(1), turned_z], 3)], 2)
@@ -110,7 +116,8 @@ mod kernel {
             let mut turned = 0.0;
             let mut headings = Vec::with_capacity(clip.len() / width);
             for t in 0..clip.len() / width {
-                let (mut step_x, mut step_z) = (0.0, 0.0);
+                let mut step_x = 0.0;
+                let mut step_z = 0.0;
                 if t > 0 {
                     let value = |k: usize| clip[(t - 1) * width + k] * std[k] + mean[k];
                     turned += value(TURN);
@@ -125,8 +132,10 @@ mod kernel {
         /// Appends the joints of a clip.
         fn place(&self, clip: &[f32], mean: &[f32], std: &[f32], headings: &[Heading], out: &mut Vec<f32>) {
             let at = self.skeleton.layout().positions;
-            let (mean_at, std_at) = (&mean[at.clone()], &std[at.clone()]);
-            let (mut root_x, mut root_z) = (0.0, 0.0);
+            let mean_at = &mean[at.clone()];
+            let std_at = &std[at.clone()];
+            let mut root_x = 0.0;
+            let mut root_z = 0.0;
             for (row, heading) in clip.chunks_exact(self.skeleton.features).zip(headings) {
                 let Heading { sin, cos, step_x, step_z } = *heading;
                 root_x += cos * step_x - sin * step_z;
@@ -136,7 +145,8 @@ mod kernel {
                 let row = &row[at.clone()];
                 for j in (0..row.len()).step_by(3) {
                     let value = |k: usize| row[j + k] * std_at[j + k] + mean_at[j + k];
-                    let (x, z) = (value(0), value(2));
+                    let x = value(0);
+                    let z = value(2);
                     let joint = [cos * x - sin * z + root_x, value(1), sin * x + cos * z + root_z];
                     out.extend(joint.map(|v| v * self.scale));
                 }
@@ -153,22 +163,32 @@ mod kernel {
             dout: &[f32],
             out: &mut [f32],
         ) {
-            let (width, at) = (self.skeleton.features, self.skeleton.layout().positions);
-            let (mean_at, std_at) = (&mean[at.clone()], &std[at.clone()]);
+            let width = self.skeleton.features;
+            let at = self.skeleton.layout().positions;
+            let mean_at = &mean[at.clone()];
+            let std_at = &std[at.clone()];
             // Gradients of the root's place and of the sum of turns, summed from the last frame to this one.
-            let (mut root_x, mut root_z, mut turned) = (0.0, 0.0, 0.0);
+            let mut root_x = 0.0;
+            let mut root_z = 0.0;
+            let mut turned = 0.0;
             for (t, heading) in headings.iter().enumerate().rev() {
                 let Heading { sin, cos, step_x, step_z } = *heading;
-                let (row, to) = (&clip[t * width..][..width][at.clone()], &mut out[t * width..][..width]);
+                let row = &clip[t * width..][..width][at.clone()];
+                let to = &mut out[t * width..][..width];
                 let dout = &dout[t * 3 * self.skeleton.joints..][..3 * self.skeleton.joints];
                 to[HEIGHT] = dout[1] * self.scale * std[HEIGHT];
-                let (mut sum_x, mut sum_z) = (dout[0] * self.scale, dout[2] * self.scale);
-                let (mut dsin, mut dcos) = (0.0, 0.0);
+                let mut sum_x = dout[0] * self.scale;
+                let mut sum_z = dout[2] * self.scale;
+                let mut dsin = 0.0;
+                let mut dcos = 0.0;
                 let to = &mut to[at.clone()];
                 for (j, d) in dout[3..].chunks_exact(3).enumerate() {
                     let value = |k: usize| row[3 * j + k] * std_at[3 * j + k] + mean_at[3 * j + k];
-                    let (x, z) = (value(0), value(2));
-                    let (dx, dy, dz) = (d[0] * self.scale, d[1] * self.scale, d[2] * self.scale);
+                    let x = value(0);
+                    let z = value(2);
+                    let dx = d[0] * self.scale;
+                    let dy = d[1] * self.scale;
+                    let dz = d[2] * self.scale;
                     sum_x += dx;
                     sum_z += dz;
                     dsin += x * dz - z * dx;
@@ -198,7 +218,8 @@ mod kernel {
         fn forward(&self, inputs: [FlexTensor; 3]) -> (FlexTensor, Self::Kept) {
             let [features, mean, std] = inputs.each_ref().map(slice);
             let sizes = shape(&inputs[0]);
-            let (batch, frames) = (sizes[0], sizes[1]);
+            let batch = sizes[0];
+            let frames = sizes[1];
             let mut out = Vec::with_capacity(batch * frames * 3 * self.skeleton.joints);
             let mut headings = Vec::with_capacity(batch * frames);
             for clip in features.chunks_exact(frames * self.skeleton.features) {
@@ -244,7 +265,9 @@ mod kernel {
 
         fn forward(&self, [joints]: [FlexTensor; 1]) -> (FlexTensor, Vec<usize>) {
             let sizes = shape(&joints);
-            let (batch, frames, width) = (sizes[0], sizes[1], 3 * sizes[2]);
+            let batch = sizes[0];
+            let frames = sizes[1];
+            let width = 3 * sizes[2];
             let mut out = Vec::with_capacity(batch * (frames - 1) * 3 * self.which.len());
             for clip in slice(&joints).chunks_exact(frames * width) {
                 for (now, next) in clip.chunks_exact(width).zip(clip[width..].chunks_exact(width)) {
@@ -257,7 +280,8 @@ mod kernel {
         }
 
         fn backward(&self, sizes: Vec<usize>, dy: FlexTensor, _: [bool; 1]) -> [Option<FlexTensor>; 1] {
-            let (frames, width) = (sizes[1], 3 * sizes[2]);
+            let frames = sizes[1];
+            let width = 3 * sizes[2];
             let mut out = vec![0.0; sizes.iter().product()];
             let moved = 3 * self.which.len();
             for (clip, dy) in out.chunks_exact_mut(frames * width).zip(slice(&dy).chunks_exact((frames - 1) * moved)) {

@@ -43,8 +43,10 @@ mod kernel {
     fn forward(x: &FlexTensor, w: &FlexTensor, bias: Option<&FlexTensor>) -> FlexTensor {
         let mut to = shape(x);
         let inner = to[to.len() - 1];
-        let (x, w) = (slice(x), slice(w));
-        let (rows, out) = (x.len() / inner, w.len() / inner);
+        let x = slice(x);
+        let w = slice(w);
+        let rows = x.len() / inner;
+        let out = w.len() / inner;
         let sizes = (rows, out, inner);
         let y = match bias {
             Some(bias) => {
@@ -60,11 +62,15 @@ mod kernel {
 
     /// The gradients of input and weight.
     fn backward(x: &FlexTensor, w: &FlexTensor, dy: &[f32], wanted: [bool; 2]) -> [Option<FlexTensor>; 2] {
-        let (to, weight) = (shape(x), shape(w));
+        let to = shape(x);
+        let weight = shape(w);
         let inner = to[to.len() - 1];
-        let (x, w) = (slice(x), slice(w));
-        let (rows, out) = (x.len() / inner, w.len() / inner);
-        let (wide, narrow) = (View::rows(inner), View::rows(out));
+        let x = slice(x);
+        let w = slice(w);
+        let rows = x.len() / inner;
+        let out = w.len() / inner;
+        let wide = View::rows(inner);
+        let narrow = View::rows(out);
         [
             wanted[0].then(|| make(product((rows, inner, out), dy, narrow, w, wide), &to)),
             wanted[1].then(|| make(product((out, inner, rows), dy, narrow.t(), x, wide), &weight)),

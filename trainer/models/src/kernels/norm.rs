@@ -154,7 +154,9 @@ mod kernel {
             let width = gamma.len();
             #[expect(clippy::cast_precision_loss, reason = "a width is small")]
             let count = width as f32;
-            let (beta, dgamma, dbeta) = (&beta[..width], &mut dgamma[..width], &mut dbeta[..width]);
+            let beta = &beta[..width];
+            let dgamma = &mut dgamma[..width];
+            let dbeta = &mut dbeta[..width];
             for ((hat, dy), scale) in hat.chunks_exact(width).zip(dy.chunks_exact_mut(width)).zip(scales) {
                 if slope != 1.0 {
                     for i in 0..width {
@@ -178,10 +180,12 @@ mod kernel {
     impl Norm {
         /// The result, the normed rows and their scales.
         fn rows(&self, rows: &Rows<'_>, keep: bool) -> (Vec<f32>, Vec<f32>, Vec<f32>) {
-            let (count, width) = (rows.x.len(), rows.gamma.len());
+            let count = rows.x.len();
+            let width = rows.gamma.len();
             let kept = if keep { count } else { width };
             let mut out = Vec::with_capacity(count);
-            let (mut hat, mut scales) = (Vec::with_capacity(kept), Vec::with_capacity(kept / width));
+            let mut hat = Vec::with_capacity(kept);
+            let mut scales = Vec::with_capacity(kept / width);
             #[expect(clippy::cast_possible_truncation, reason = "a setting")]
             forward(rows, self.eps as f32, self.slope, keep, &mut hat, &mut scales, &mut out);
             (out, hat, scales)
@@ -197,9 +201,12 @@ mod kernel {
         fn gradients(&self, kept: Kept, dy: FlexTensor) -> [Option<FlexTensor>; 3] {
             let Kept { hat, scales, gamma, beta } = kept;
             let width = slice(&gamma).len();
-            let (mut dgamma, mut dbeta) = (vec![0.0; width], vec![0.0; width]);
+            let mut dgamma = vec![0.0; width];
+            let mut dbeta = vec![0.0; width];
             let dx = overwrite(dy, |dy| {
-                let (hat, gamma, beta) = (slice(&hat), slice(&gamma), slice(&beta));
+                let hat = slice(&hat);
+                let gamma = slice(&gamma);
+                let beta = slice(&beta);
                 backward(hat, &scales, gamma, beta, self.slope, dy, &mut dgamma, &mut dbeta);
             });
             [Some(dx), Some(make(dgamma, &[width])), Some(make(dbeta, &[width]))]

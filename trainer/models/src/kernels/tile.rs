@@ -34,14 +34,17 @@ pub(super) fn multiply<const SET: u8>(
         && (k - 1) * b_row + n <= b.len()
         && (m - 1) * c_row + n <= c.len();
     assert!(fits, "matrix out of bounds");
-    let (left, right, to) = (a.values.as_ptr(), b.as_ptr(), c.as_mut_ptr());
+    let left = a.values.as_ptr();
+    let right = b.as_ptr();
+    let to = c.as_mut_ptr();
     let mut at = 0;
     while at < n {
         let wide = (n - at).min(3 * LANES);
         #[expect(unsafe_code, reason = "checks of every element would take longer than the product")]
         // SAFETY: all elements that the strides reach lie inside the slices, as was checked above.
         unsafe {
-            let (right, to) = (right.add(at), to.add(at));
+            let right = right.add(at);
+            let to = to.add(at);
             match wide / LANES {
                 1 => columns::<SET, LANES>((m, k), left, (a.row, a.col), (right, b_row), (to, c_row)),
                 2 => columns::<SET, { 2 * LANES }>((m, k), left, (a.row, a.col), (right, b_row), (to, c_row)),
@@ -69,7 +72,8 @@ unsafe fn columns<const SET: u8, const N: usize>(
     while at < m {
         // SAFETY: as promised by the caller; the block's rows are among the m.
         unsafe {
-            let (a, c) = (a.add(at * row), c.add(at * c_row));
+            let a = a.add(at * row);
+            let c = c.add(at * c_row);
             at += match m - at {
                 6.. if SET == set::WIDE => block::<SET, 6, N>(k, a, (row, col), (b, b_row), (c, c_row)),
                 4.. => block::<SET, 4, N>(k, a, (row, col), (b, b_row), (c, c_row)),
@@ -147,7 +151,8 @@ mod tests {
     fn a_small_product_is_the_product() {
         for (m, n, k) in [(1, 8, 1), (5, 16, 3), (6, 24, 18), (18, 24, 24), (13, 64, 54), (64, 40, 7)] {
             let wave = |count: usize| (0..count).map(|i| (i as f32 * 0.37).sin()).collect::<Vec<_>>();
-            let (a, b) = (wave(m * k), wave(k * n));
+            let a = wave(m * k);
+            let b = wave(k * n);
             for by_rows in [true, false] {
                 let mut c = vec![f32::NAN; m * n];
                 both(m, n, k, &a, by_rows, &b, &mut c);

@@ -137,7 +137,9 @@ impl SplitAttention {
     }
 
     fn own(&self, x_bth: Tensor<3>, sight: &Sight, dropout: &mut Dropout) -> Tensor<3> {
-        let (q, k, v) = (self.query.forward(x_bth.clone()), self.key.forward(x_bth.clone()), self.value.forward(x_bth));
+        let q = self.query.forward(x_bth.clone());
+        let k = self.key.forward(x_bth.clone());
+        let v = self.value.forward(x_bth);
         let attended = match sight {
             Sight::Keys(mask) => {
                 kernels::self_attention(Tensor::cat(vec![q, k, v], 2), self.heads, mask.as_ref(), dropout)

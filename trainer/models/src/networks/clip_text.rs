@@ -133,7 +133,8 @@ pub struct ClipStates {
 impl ClipText {
     /// Creates a tower with untrained weights.
     pub fn new(config: &ClipTextConfig, init: &mut Init<'_>) -> Self {
-        let (width, inner) = (config.hidden_size, config.intermediate_size);
+        let width = config.hidden_size;
+        let inner = config.intermediate_size;
         let mut block = || {
             let mut square = || linear(init, width, width);
             let self_attn = ClipAttention { k_proj: square(), v_proj: square(), q_proj: square(), out_proj: square() };
@@ -169,7 +170,8 @@ impl ClipText {
     /// If there are more tokens than positions, or an id is not in the table.
     pub fn forward(&self, ids: &[usize], batch: usize, visible: Option<&[bool]>) -> ClipStates {
         let embeddings = &self.text_model.embeddings;
-        let (len, rows) = (ids.len() / batch, self.config.vocab_size);
+        let len = ids.len() / batch;
+        let rows = self.config.vocab_size;
         assert!(len <= self.config.max_position_embeddings, "{len} tokens, the tower has too few positions");
         assert!(ids.iter().all(|id| *id < rows), "an id is beyond the table of {rows} tokens");
         let positions: Vec<usize> = (0..len).collect();
@@ -189,7 +191,8 @@ impl ClipText {
     }
 
     fn block(&self, block: &ClipBlock, x_bth: Tensor<3>, bias: &Tensor<4>) -> Tensor<3> {
-        let (eps, attention) = (self.config.layer_norm_eps, &block.self_attn);
+        let eps = self.config.layer_norm_eps;
+        let attention = &block.self_attn;
         let normed = block.layer_norm1.forward(x_bth.clone(), eps);
         let (q, k, v) = (
             attention.q_proj.forward(normed.clone()),

@@ -85,7 +85,8 @@ impl Denoiser {
 /// Copies every parameter that `base` and `control` share from `base`; the condition embedding and the zero layers keep
 /// their own values.
 pub fn copied_from(base: &Denoiser, control: Denoiser) -> Denoiser {
-    let (entries, values) = (flat::layout(base), flat::read(base));
+    let entries = flat::layout(base);
+    let values = flat::read(base);
     let mut at = 0;
     let known: std::collections::BTreeMap<&str, &[f32]> = entries
         .iter()
@@ -94,7 +95,8 @@ pub fn copied_from(base: &Denoiser, control: Denoiser) -> Denoiser {
             (entry.name.as_str(), &values[at - entry.len()..at])
         })
         .collect();
-    let (own, mut weights) = (flat::layout(&control), flat::read(&control));
+    let own = flat::layout(&control);
+    let mut weights = flat::read(&control);
     let mut at = 0;
     for entry in &own {
         let to = &mut weights[at..at + entry.len()];

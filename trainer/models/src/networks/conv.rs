@@ -90,7 +90,8 @@ impl Conv1d {
         let rows = self.stride * (reach / self.stride + count);
         let blocks = self.padded(x_btc, rows).reshape([batch, rows / self.stride, self.stride * inner]);
         let tap = |k: usize| {
-            let (block, at) = (k * self.dilation / self.stride, k * self.dilation % self.stride * inner);
+            let block = k * self.dilation / self.stride;
+            let at = k * self.dilation % self.stride * inner;
             blocks.clone().slice([0..batch, block..block + count, at..at + inner])
         };
         Tensor::cat((0..taps).map(tap).collect(), 2)

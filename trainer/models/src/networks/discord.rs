@@ -288,7 +288,8 @@ impl BatchNorm {
     fn forward(&self, x_btc: Tensor<3>) -> Tensor<3> {
         let width = x_btc.dims()[2];
         let row = |x: Tensor<1>| x.reshape([1, 1, width]);
-        let (mean, variance) = (self.running_mean.val().detach(), self.running_var.val().detach());
+        let mean = self.running_mean.val().detach();
+        let variance = self.running_var.val().detach();
         let centred = (x_btc - row(mean)) / row((variance + BATCH_EPS).sqrt());
         centred * row(self.weight.val()) + row(self.bias.val())
     }
@@ -370,7 +371,8 @@ impl FlowUnet {
         let time = 4 * width;
         let widths: Vec<usize> = [width].into_iter().chain(config.multiples.iter().map(|m| m * width)).collect();
         let pairs: Vec<(usize, usize)> = widths.windows(2).map(|pair| (pair[0], pair[1])).collect();
-        let (levels, deepest) = (pairs.len(), widths[pairs.len()]);
+        let levels = pairs.len();
+        let deepest = widths[pairs.len()];
         let init_proj = Conv1d::same(init, features + condition_dim, width, 1);
         let time_mlp = time_layers(config, time, init);
         let condition_projection = projection_layers(config, init);
@@ -484,7 +486,8 @@ impl FlowUnet {
         let condition = self.condition(tokens_bnc);
         let time = self.time(times, &x_btf.device());
         let first = self.net.init_proj.forward(Tensor::cat(vec![x_btf, condition], 2));
-        let (mut x, mut kept) = (first.clone(), Vec::new());
+        let mut x = first.clone();
+        let mut kept = Vec::new();
         for level in &self.net.downs {
             for part in level {
                 x = match part {
@@ -560,7 +563,8 @@ fn time_layers(config: &UnetConfig, time: usize, init: &mut Init<'_>) -> Vec<Tim
 }
 
 fn projection_layers(config: &UnetConfig, init: &mut Init<'_>) -> Vec<ProjectionPart> {
-    let (inner, out) = (config.token_dim, config.condition_dim);
+    let inner = config.token_dim;
+    let out = config.condition_dim;
     let mut linear = |inner, out| ProjectionPart::Linear(Conv1d::same(init, inner, out, 1));
     let gap = || ProjectionPart::Gap(GAP);
     match config.projection {

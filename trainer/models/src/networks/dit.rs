@@ -120,9 +120,13 @@ impl DitBlock {
     ) -> Tensor<3> {
         let mut parts = pieces(self.adaLN_modulation.1.forward(silu(time_bh.clone())), 6).into_iter();
         let mut next = || parts.next().expect("six parts");
-        let (shift, scale, gate) = (next(), next(), next());
+        let shift = next();
+        let scale = next();
+        let gate = next();
         let x = x_bth.clone() + gate * self.attended(modulated(x_bth, shift, scale), bias, drop);
-        let (shift, scale, gate) = (next(), next(), next());
+        let shift = next();
+        let scale = next();
+        let gate = next();
         let hidden = gelu_approximate(self.mlp.fc1.forward(modulated(x.clone(), shift, scale)));
         x + gate * self.mlp.fc2.forward(hidden)
     }
@@ -283,7 +287,8 @@ impl FlowDit {
         let out = &self.net.out_proj;
         let mut parts = pieces(out.adaLN_modulation.1.forward(silu(time)), 2).into_iter();
         let mut next = || parts.next().expect("two parts");
-        let (shift, scale) = (next(), next());
+        let shift = next();
+        let scale = next();
         out.linear.forward(modulated(x, shift, scale))
     }
 }

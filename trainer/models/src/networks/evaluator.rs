@@ -225,9 +225,11 @@ impl BiGru {
     pub fn forward(&self, x_btc: Tensor<3>, lengths: &[usize], start: [Tensor<2>; 2]) -> [Tensor<3>; 2] {
         let [forward, backward] = start;
         let gates = |w: &Param<Tensor<2>>, b: &Param<Tensor<1>>| kernels::linear(x_btc.clone(), w.val(), Some(b.val()));
-        let (w, b) = (self.weight_hh_l0.val(), self.bias_hh_l0.val());
+        let w = self.weight_hh_l0.val();
+        let b = self.bias_hh_l0.val();
         let ahead = gru(gates(&self.weight_ih_l0, &self.bias_ih_l0), forward, w, b, lengths, false);
-        let (w, b) = (self.weight_hh_l0_reverse.val(), self.bias_hh_l0_reverse.val());
+        let w = self.weight_hh_l0_reverse.val();
+        let b = self.bias_hh_l0_reverse.val();
         let back = gru(gates(&self.weight_ih_l0_reverse, &self.bias_ih_l0_reverse), backward, w, b, lengths, true);
         [ahead, back]
     }

@@ -131,7 +131,8 @@ impl Mmm {
     ) -> Tensor<3> {
         let MmmCondition { codes_kd, text_bc, words_bnc, words } = condition.clone();
         let base = &self.trans_base;
-        let (batch, device) = (text_bc.dims()[0], text_bc.device());
+        let batch = text_bc.dims()[0];
+        let device = text_bc.device();
         let positions = ids.len() / batch;
         let table = Tensor::cat(vec![codes_kd, base.learn_tok_emb.weight.val()], 0);
         let x = base.to_emb.forward(rows_of(table, ids, batch));

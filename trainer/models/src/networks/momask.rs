@@ -217,8 +217,11 @@ impl ResidualTransformer {
         assert!(quantizers > 2, "a residual generator has at least three layers of codes");
         let mut table = |rows: usize| init.scaled_normal(DEVIATION, [rows, codes + 1, dim]);
         let mut part = |wanted: bool, rows: usize| wanted.then(|| table(rows));
-        let (between, first, last) = (part(shared, quantizers - 2), part(shared, 1), part(shared, 1));
-        let (outputs, inputs) = (part(!shared, quantizers - 1), part(!shared, quantizers - 1));
+        let between = part(shared, quantizers - 2);
+        let first = part(shared, 1);
+        let last = part(shared, 1);
+        let outputs = part(!shared, quantizers - 1);
+        let inputs = part(!shared, quantizers - 1);
         Self {
             embed_proj_shared_weight: between,
             token_embed_weight_: first,

@@ -188,7 +188,8 @@ fn standardised(x_btc: Tensor<3>) -> Tensor<3> {
     let [batch, frames, channels] = x_btc.dims();
     let width = channels / GROUPS;
     let device = x_btc.device();
-    let (ones, zeros) = (Tensor::ones([width], &device), Tensor::zeros([width], &device));
+    let ones = Tensor::ones([width], &device);
+    let zeros = Tensor::zeros([width], &device);
     layer_norm(x_btc.reshape([batch, frames, GROUPS, width]), ones, zeros, NORM_EPS).reshape([batch, frames, channels])
 }
 
@@ -270,7 +271,8 @@ impl TextAttention {
     fn forward(&self, x_btc: Tensor<3>, condition: &TokenCondition, drop: &mut Dropout) -> Tensor<3> {
         let query = self.query.forward(self.norm.forward(x_btc, NORM_EPS));
         let text = self.text_norm.forward(condition.text_bnc.clone(), NORM_EPS);
-        let (key, value) = (self.key.forward(text.clone()), self.value.forward(text));
+        let key = self.key.forward(text.clone());
+        let value = self.value.forward(text);
         if self.full {
             let mask = condition.lengths.as_deref().map(|lengths| KeyMask::new(lengths, 0));
             return cross_attention(query, Tensor::cat(vec![key, value], 2), HEADS, mask.as_ref(), drop);
@@ -488,7 +490,8 @@ mod tests {
         let device = Device::flex();
         for full in [false, true] {
             let network = network(full, &device);
-            let (x, tokens) = (wave([2, 20, 10], &device), wave([2, 5, 6], &device));
+            let x = wave([2, 20, 10], &device);
+            let tokens = wave([2, 5, 6], &device);
             let run = |tokens: Tensor<3>, lengths: Option<Vec<usize>>, kept: [bool; 2]| {
                 let drop = &mut Dropout::off();
                 let text_bnc = network.encode_text(tokens, lengths.as_deref(), drop);

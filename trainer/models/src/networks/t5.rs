@@ -136,13 +136,19 @@ pub struct T5Encoder {
 impl T5Encoder {
     /// Creates an encoder with untrained weights.
     pub fn new(config: &T5Config, init: &mut Init<'_>) -> Self {
-        let (width, inner) = (config.d_model, config.num_heads * config.d_kv);
+        let width = config.d_model;
+        let inner = config.num_heads * config.d_kv;
         let mut block = |first: bool| {
             let mut plain = |from, to| Linear { weight: init.scaled_normal(DEVIATION, [to, from]), bias: None };
-            let (q, k, v, o) = (plain(width, inner), plain(width, inner), plain(width, inner), plain(inner, width));
+            let q = plain(width, inner);
+            let k = plain(width, inner);
+            let v = plain(width, inner);
+            let o = plain(inner, width);
             let mut up = |is_there: bool| is_there.then(|| plain(width, config.d_ff));
             let is_gated = config.feed_forward_proj == T5FeedForward::GatedGelu;
-            let (wi, wi_0, wi_1) = (up(!is_gated), up(is_gated), up(is_gated));
+            let wi = up(!is_gated);
+            let wi_0 = up(is_gated);
+            let wi_1 = up(is_gated);
             let wo = plain(config.d_ff, width);
             let buckets = config.relative_attention_num_buckets;
             let relative_attention_bias = first.then(|| Embedding::new(init, buckets, config.num_heads));
@@ -174,7 +180,8 @@ impl T5Encoder {
     /// # Panics
     /// If an id is not in the table.
     pub fn forward(&self, ids: &[usize], lengths: &[usize]) -> Tensor<3> {
-        let (batch, rows) = (lengths.len(), self.config.vocab_size);
+        let batch = lengths.len();
+        let rows = self.config.vocab_size;
         let len = ids.len() / batch;
         assert!(ids.iter().all(|id| *id < rows), "an id is beyond the table of {rows} tokens");
         let x = self.shared.rows(ids, batch);
@@ -191,7 +198,8 @@ impl T5Encoder {
     pub fn position_bias(&self, len: usize) -> Tensor<4> {
         let table = self.encoder.block.first().and_then(|b| b.layer.0.SelfAttention.relative_attention_bias.as_ref());
         let table = table.expect("the first block has the table").weight.val();
-        let (all, most) = (self.config.relative_attention_num_buckets, self.config.relative_attention_max_distance);
+        let all = self.config.relative_attention_num_buckets;
+        let most = self.config.relative_attention_max_distance;
         let at = |q: usize, k: usize| distance_bucket(k as i64 - q as i64, all, most);
         let buckets: Vec<usize> = (0..len).flat_map(|q| (0..len).map(move |k| at(q, k))).collect();
         rows_of(table, &buckets, 1).reshape([1, len, len, self.config.num_heads]).permute([0, 3, 1, 2])
@@ -201,7 +209,9 @@ impl T5Encoder {
         let (eps, (attention, feed_forward)) = (self.config.layer_norm_epsilon, &block.layer);
         let normed = attention.layer_norm.forward(x_bth.clone(), eps);
         let T5SelfAttention { q, k, v, o, .. } = &attention.SelfAttention;
-        let (q, k, v) = (q.forward(normed.clone()), k.forward(normed.clone()), v.forward(normed));
+        let q = q.forward(normed.clone());
+        let k = k.forward(normed.clone());
+        let v = v.forward(normed);
         let attended = attend_at(1.0, q, k, v, self.config.num_heads, Some(bias.clone()), &mut Dropout::off());
         let x = x_bth + o.forward(attended);
         let normed = feed_forward.layer_norm.forward(x.clone(), eps);

@@ -60,7 +60,8 @@ impl Hints {
             (0..batch).map(|b| (0..frames).filter(|t| given[row(b, *t)].contains(&true)).collect()).collect();
         // One row of padding if no motion has a target.
         let most = live.iter().map(Vec::len).max().unwrap_or_default().max(1);
-        let (mut rows, mut numbers) = (vec![0.0; batch * most * width], vec![0; batch * most]);
+        let mut rows = vec![0.0; batch * most * width];
+        let mut numbers = vec![0; batch * most];
         for (b, kept) in live.iter().enumerate() {
             for (m, t) in kept.iter().enumerate() {
                 let at = b * most + m;

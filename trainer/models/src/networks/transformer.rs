@@ -130,7 +130,8 @@ impl Attention {
 
     fn cross(&self, x_bth: Tensor<3>, memory_bnh: Tensor<3>, dropout: &mut Dropout) -> Tensor<3> {
         let width = x_bth.dims()[2];
-        let (weight, bias) = (self.in_proj_weight.val(), self.in_proj_bias.val());
+        let weight = self.in_proj_weight.val();
+        let bias = self.in_proj_bias.val();
         let q = kernels::linear(x_bth, weight.clone().slice([0..width, 0..width]), Some(bias.clone().slice(0..width)));
         let kv =
             kernels::linear(memory_bnh, weight.slice([width..3 * width, 0..width]), Some(bias.slice(width..3 * width)));

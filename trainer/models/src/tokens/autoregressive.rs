@@ -32,7 +32,8 @@ impl std::fmt::Debug for Draw<'_> {
 /// dropped.
 pub fn sample(network: &Gpt, config: &GptConfig, text_bc: Tensor<2>, mut draw: Draw<'_>) -> Vec<Vec<usize>> {
     let batch = text_bc.dims()[0];
-    let (end, classes) = (config.end(), config.codes + 1);
+    let end = config.end();
+    let classes = config.codes + 1;
     let mut ids: Vec<Vec<usize>> = vec![Vec::new(); batch];
     let mut lengths: Vec<Option<usize>> = vec![None; batch];
     let mut exponentials = vec![0.0; classes];

@@ -56,7 +56,9 @@ pub fn generate(
 ) -> Vec<i64> {
     let lengths: Vec<usize> = canvases.iter().map(|canvas| canvas.tokens.len()).collect();
     let len = lengths.iter().copied().max().unwrap_or(0);
-    let (mask, pad, classes) = (config.mask(), config.pad(), config.codes);
+    let mask = config.mask();
+    let pad = config.pad();
+    let classes = config.codes;
     let mut ids: Vec<usize> = canvases
         .iter()
         .flat_map(|canvas| (0..len).map(|p| canvas.tokens.get(p).map_or(pad, |known| known.unwrap_or(mask))))

@@ -69,7 +69,9 @@ pub fn sample(
     uniforms: Uniforms<'_>,
     mut see: impl FnMut(&Step<'_>),
 ) -> Vec<usize> {
-    let (batch, positions, classes) = (given.len(), config.positions(), config.codes);
+    let batch = given.len();
+    let positions = config.positions();
+    let classes = config.codes;
     let lengths: Vec<usize> = given.iter().map(Vec::len).collect();
     assert!(lengths.iter().all(|len| *len < positions), "clips of {lengths:?} tokens for {positions} positions");
     let visible: Vec<usize> = lengths.iter().map(|len| len + 1).collect();
@@ -174,7 +176,8 @@ impl Example {
     /// # Panics
     /// If the tokens and the end exceed the network's positions.
     pub fn new(config: &MmmConfig, tokens: &[usize], draws: &Corruption<'_>) -> Self {
-        let (len, positions) = (tokens.len(), config.positions());
+        let len = tokens.len();
+        let positions = config.positions();
         assert!(len < positions, "{len} tokens for {positions} positions");
         let mut target = tokens.to_vec();
         target.push(config.end());

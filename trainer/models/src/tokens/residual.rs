@@ -38,7 +38,9 @@ pub fn generate(
     uniforms: Uniforms<'_>,
 ) -> Vec<i64> {
     let First { ids: first, lengths, known } = first;
-    let (batch, pad, classes) = (lengths.len(), config.residual_pad(), config.codes + 1);
+    let batch = lengths.len();
+    let pad = config.residual_pad();
+    let classes = config.codes + 1;
     let len = first.len() / batch;
     let valid = |at: usize| at % len < lengths[at / len];
     let mut layers: Vec<Vec<usize>> =

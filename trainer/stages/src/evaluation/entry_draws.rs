@@ -77,7 +77,8 @@ impl EntryDraws {
         let dataset = artifacts::input_dataset(cx)?;
         let (evaluator, manifest) = artifacts::input(cx, "evaluator", ArtifactKind::Evaluator)?;
         let trained = TrainedEvaluator::read(&*blobs, &manifest, &cx.device())?;
-        let (mut entries, mut taken) = (dataset.entries_of(split), split);
+        let mut entries = dataset.entries_of(split);
+        let mut taken = split;
         if all_if_small && entries.len() < pool {
             (entries, taken) = (dataset.entries_of(Split::All), Split::All);
         }
@@ -144,7 +145,8 @@ impl EntryDraws {
         (text, made, real): (&[f64], &[f64], &[f64]),
         ranking: &Ranking<'_>,
     ) -> BTreeMap<String, f64> {
-        let (width, n) = (self.trained.width(), self.entries.len());
+        let width = self.trained.width();
+        let n = self.entries.len();
         // Entries that do not fill a pool are at the end of its permutation.
         let pools = self.order("pools", repeat, n);
         let dealt = if ranking.shuffled { self.order("shuffled", repeat, n) } else { pools.clone() };
@@ -160,7 +162,8 @@ impl EntryDraws {
             metrics.insert(format!("mm_dist{suffix}"), found.matching_score);
         }
         let rows = self.kept(repeat, ranking.kept);
-        let (made, real) = (reorder(made, &rows, width), reorder(real, &rows, width));
+        let made = reorder(made, &rows, width);
+        let real = reorder(real, &rows, width);
         let pairs = spread::DIVERSITY_PAIRS.min(rows.len());
         let [first, second] = ["diversity 1", "diversity 2"].map(|what| self.some(what, repeat, rows.len(), pairs));
         metrics.insert("fid".to_owned(), Gaussian::fit(&real, width).distance(&Gaussian::fit(&made, width)).max(0.0));
@@ -191,7 +194,8 @@ impl EntryDraws {
         (mut metrics, repeats): (BTreeMap<String, f64>, Repeats),
         (meta, details): (Value, Value),
     ) -> Result<Outcome, StageError> {
-        let (entries, width) = (self.entries.len(), self.trained.width());
+        let entries = self.entries.len();
+        let width = self.trained.width();
         let few = (samples < FEW * width).then(|| {
             format!(
                 "FID is taken of {samples} motions in {width} dimensions; it is then larger than of many, and compares \

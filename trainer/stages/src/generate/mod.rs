@@ -256,7 +256,8 @@ impl Generator {
         let texts: Vec<_> = self.model.embed(&[prompt])?.into_iter().map(Rc::new).collect();
         let embedded = Instant::now();
         let seeds = |k: usize, _| Stream::new(seed, "generate/noise", 0, k as u64);
-        let (mut sampled, mut decoded) = (embedded, embedded);
+        let mut sampled = embedded;
+        let mut decoded = embedded;
         let mut lap = |lap| match lap {
             Lap::Sampled => (sampled, decoded) = (Instant::now(), Instant::now()),
             Lap::Decoded => decoded = Instant::now(),

@@ -28,7 +28,9 @@ const ADAM: AdamW = AdamW { beta1: 0.9, beta2: 0.99, eps: 1e-8, weight_decay: 0.
 /// Refines latents `[batch, N, d]` of motions of `lengths` frames in `steps` steps towards the targets of `hints`.
 pub(crate) fn refine(vae: &Autoencoder, z: &mut [f32], lengths: &[usize], hints: &[Hint], steps: usize) {
     let meta = vae.meta();
-    let (skeleton, latent, device) = (Skeleton::of(meta.format), meta.latent, vae.device());
+    let skeleton = Skeleton::of(meta.format);
+    let latent = meta.latent;
+    let device = vae.device();
     let body = Body::new(skeleton, &meta.mean, &meta.std, device);
     let told = Target::new(hints, device);
     let wanted = Target::new(&hints.iter().map(Hint::wants).collect::<Vec<_>>(), device);
@@ -37,7 +39,8 @@ pub(crate) fn refine(vae: &Autoencoder, z: &mut [f32], lengths: &[usize], hints:
         Tensor::<3>::from_data(TensorData::new(z.to_vec(), [lengths.len(), latent.tokens, latent.dim]), device)
     };
     let as_drawn = AsDrawn::new(vae.decode_tensor(at(z, device), lengths), lengths, skeleton);
-    let (mut m, mut v) = (vec![0.0; z.len()], vec![0.0; z.len()]);
+    let mut m = vec![0.0; z.len()];
+    let mut v = vec![0.0; z.len()];
     for step in 0..steps {
         let z_bnd = at(z, &tracked).require_grad();
         let features = vae.decode_tensor(z_bnd.clone(), lengths);
@@ -68,7 +71,8 @@ impl AsDrawn {
     fn new(features: Tensor<3>, lengths: &[usize], skeleton: &Skeleton) -> Self {
         let [batch, frames, width] = features.dims();
         let layout = skeleton.layout();
-        let (root, pose) = (layout.root_velocity.end, layout.positions.start);
+        let root = layout.root_velocity.end;
+        let pose = layout.positions.start;
         let row = |values: Vec<f64>, frames: usize| {
             let values: Vec<f32> = values.into_iter().map(|v| v as f32).collect();
             Tensor::from_data(TensorData::new(values, [batch, frames, 1]), &features.device())
@@ -106,7 +110,8 @@ impl Target {
     /// Collects the targets of `hints`, in metres.
     fn new(hints: &[Hint], device: &Device) -> Self {
         let coordinates = 3 * hints.first().map(Hint::joints).unwrap_or_default();
-        let (zero, one) = (vec![0.0; coordinates], vec![1.0; coordinates]);
+        let zero = vec![0.0; coordinates];
+        let one = vec![1.0; coordinates];
         let told = NormalisedHints::of(hints, &zero, &one);
         let of = ControlTarget::new(&told.values, &told.given, told.shape, (&zero, &one), true, device);
         let weights = of.entries().iter().map(|own| 1.0 / (*own).max(1) as f32).collect();

@@ -118,7 +118,8 @@ impl Tail {
 
     /// Keeps only frames `range`.
     fn keep(&mut self, range: std::ops::Range<usize>, skeleton: &Skeleton) {
-        let (row, frame) = (skeleton.features, 3 * skeleton.joints);
+        let row = skeleton.features;
+        let frame = 3 * skeleton.joints;
         self.features.truncate(range.end * row);
         self.features.drain(..range.start * row);
         self.joints.truncate(range.end * frame);
@@ -163,7 +164,8 @@ impl MotionStream {
             (None, Some(unit)) => (Joining::Infilling, unit),
             (None, None) => (Joining::Placement, skeleton.unit),
         };
-        let (mut told, mut percent) = (Vec::new(), OVERLAP_PERCENT);
+        let mut told = Vec::new();
+        let mut percent = OVERLAP_PERCENT;
         if let Some(control) = generator.control() {
             told = control.format.joints_of_all(&control.hints.joints).map_err(StageError::Input)?;
             if control.hints.setting == ControlSetting::Temporal {
@@ -356,7 +358,8 @@ impl MotionStream {
     /// Places `frames` new frames of generated rows in the world, after `overlap` existing ones, and joins them.
     /// Returns the joints and the distance at the junction before fading.
     fn placed(&self, rows: &[f32], (overlap, frames): (usize, usize), place: Placement) -> (Vec<f64>, f64) {
-        let (joints, metres) = (self.skeleton.joints, self.skeleton.metres_per_unit);
+        let joints = self.skeleton.joints;
+        let metres = self.skeleton.metres_per_unit;
         let mut world: Vec<f64> = recover_joints_wide(rows, self.skeleton)
             .chunks_exact(3)
             .flat_map(|p| place.to_world([p[0] * metres, p[1] * metres, p[2] * metres]))
@@ -370,7 +373,8 @@ impl MotionStream {
                 Some(frame) => world[frame * width + i],
                 // Before its start the clip moves with its initial velocity.
                 None => {
-                    let (first, behind) = ((k + 1 - overlap) as f64, usize::from(world.len() / width > 1));
+                    let first = (k + 1 - overlap) as f64;
+                    let behind = usize::from(world.len() / width > 1);
                     world[i] - first * (world[behind * width + i] - world[i])
                 }
             };

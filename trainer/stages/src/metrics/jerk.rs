@@ -52,7 +52,8 @@ impl JerkError {
         assert!(!truth.is_empty() && truth.len() == guess.len(), "jerks of motions of one length, at least 4 frames");
         let mut sums = [0.0; 5];
         for (g, p) in truth.iter().zip(guess) {
-            let (off, scale) = (p - g, g + p);
+            let off = p - g;
+            let scale = g + p;
             sums[0] += (-off).max(0.0) / (scale + EPS);
             sums[1] += off.max(0.0) / (scale + EPS);
             sums[2] += (-off).max(0.0);
@@ -93,7 +94,8 @@ mod tests {
                 [first, truth(k, 0.25)].concat()
             })
             .collect();
-        let (real, guess) = (jerk(&real, 2, &[0, 1], 20.0), jerk(&guess, 2, &[0, 1], 20.0));
+        let real = jerk(&real, 2, &[0, 1], 20.0);
+        let guess = jerk(&guess, 2, &[0, 1], 20.0);
         let mean = |j: usize| real.iter().skip(j).step_by(2).sum::<f64>() / 9.0;
         let error = JerkError::between(&real, &guess);
         for (found, expected) in [

@@ -276,7 +276,8 @@ mod tests {
             (0..WIDTH).map(|i| z.iter().skip(i).step_by(WIDTH).sum::<f32>() / (60 * CROPS) as f32).collect();
         assert!((reference.distance(reference.whole(), &middle.repeat(20)) - 1.0).abs() < 1e-3);
         // Against only their own entries, half of the rows are as near; two halves of other clusters are far apart.
-        let (some, rows) = (&all[..30], &z[..30 * CROPS * WIDTH]);
+        let some = &all[..30];
+        let rows = &z[..30 * CROPS * WIDTH];
         assert!(reference.distance(&reference.target(real, some), rows).abs() < 1e-9);
         assert!(reference.distance(reference.whole(), rows) > 1e-3);
         let apart = reference.halves(real, &all, Seed(3)).expect("enough entries");

@@ -66,7 +66,8 @@ mod tests {
 
     #[test]
     fn a_similarity_is_no_error_and_a_mirror_image_is_one() {
-        let (truth, turn) = (body(), Rotation3::from_euler_angles(0.3, -1.2, 2.0));
+        let truth = body();
+        let turn = Rotation3::from_euler_angles(0.3, -1.2, 2.0);
         let similar = moved(&truth, |p| turn * p * 1.7 + Vector3::new(3.0, -1.0, 0.5));
         assert!(aligned(&truth, &similar, 7).iter().all(|e| *e < 1e-12));
         let mirrored = moved(&truth, |p| Vector3::new(-p.x, p.y, p.z));

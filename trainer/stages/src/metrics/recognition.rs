@@ -106,7 +106,8 @@ mod tests {
         let mut stream = Stream::new(Seed(3), "rows", class as u64, number);
         let frames = 40 + stream.below(60);
         let phase = stream.range(0.0, 6.0);
-        let (speed, place) = ([0.2, 0.2, 0.9][class], [0.0, 1.5, 0.0][class]);
+        let speed = [0.2, 0.2, 0.9][class];
+        let place = [0.0, 1.5, 0.0][class];
         let mut rows: Vec<f32> = (0..frames * skeleton.features).map(|_| stream.range(-0.3, 0.3) as f32).collect();
         for (t, row) in rows.chunks_exact_mut(skeleton.features).enumerate() {
             row[4..44].iter_mut().for_each(|v| *v += (place + (t as f64 * speed + phase).sin()) as f32);

@@ -53,8 +53,10 @@ pub struct ClipJerk {
 impl ClipErrors {
     /// Compares a clip with its reconstruction; both are rows `[L, D]` of normalised features.
     pub fn between(truth: &[f32], guess: &[f32], mean: &[f32], std: &[f32], skeleton: &Skeleton) -> Self {
-        let (truth_natural, guess_natural) = (natural(truth, mean, std), natural(guess, mean, std));
-        let (a, b) = (recover_joints(&truth_natural, skeleton), recover_joints(&guess_natural, skeleton));
+        let truth_natural = natural(truth, mean, std);
+        let guess_natural = natural(guess, mean, std);
+        let a = recover_joints(&truth_natural, skeleton);
+        let b = recover_joints(&guess_natural, skeleton);
         let (a_wide, b_wide) =
             (recover_joints_wide(&truth_natural, skeleton), recover_joints_wide(&guess_natural, skeleton));
         let posture = |rows: &[f32]| joints::posture(rows, skeleton.features, skeleton.joints);
@@ -88,7 +90,8 @@ fn in_metres(mut joints: Vec<f64>, skeleton: &Skeleton) -> Vec<f64> {
 fn clip_jerk(truth: &[f64], guess: &[f64], skeleton: &Skeleton) -> Option<ClipJerk> {
     let of = joints_of(skeleton.format);
     let jerks = |joints: &[f64]| jerk(&in_metres(joints.to_vec(), skeleton), skeleton.joints, of, skeleton.fps);
-    let (truth, guess) = (jerks(truth), jerks(guess));
+    let truth = jerks(truth);
+    let guess = jerks(guess);
     if truth.is_empty() {
         return None;
     }
@@ -159,10 +162,12 @@ mod tests {
     fn one_joint_that_jumps_is_counted_as_the_papers_count_it() {
         for format in [DataFormat::Humanml3d, DataFormat::Kit] {
             let skeleton = Skeleton::of(format);
-            let (mean, std) = (vec![0.0; skeleton.features], vec![1.0; skeleton.features]);
+            let mean = vec![0.0; skeleton.features];
+            let std = vec![1.0; skeleton.features];
             let (rest, jump) = (|_: usize| 0.0, |t: usize| if t == 5 { 0.5 } else { 0.0 });
             let errors = |frames: usize, truth: &dyn Fn(usize) -> f32, guess: &dyn Fn(usize) -> f32| {
-                let (truth, guess) = (still(skeleton, frames, truth), still(skeleton, frames, guess));
+                let truth = still(skeleton, frames, truth);
+                let guess = still(skeleton, frames, guess);
                 ClipErrors::between(&truth, &guess, &mean, &std, skeleton)
             };
             let clips = [errors(12, &rest, &jump), errors(20, &rest, &rest), errors(3, &rest, &rest)];
@@ -200,7 +205,8 @@ mod tests {
     fn a_body_dragged_along_the_ground_skates() {
         for format in [DataFormat::Humanml3d, DataFormat::Kit] {
             let skeleton = Skeleton::of(format);
-            let (mean, std) = (vec![0.0; skeleton.features], vec![1.0; skeleton.features]);
+            let mean = vec![0.0; skeleton.features];
+            let std = vec![1.0; skeleton.features];
             let rest = still(skeleton, 21, |_| 0.0);
             let mut dragged = rest.clone();
             for row in dragged.chunks_exact_mut(skeleton.features) {

@@ -20,7 +20,8 @@ pub struct Retrieval {
 pub fn in_groups(queries: &[f64], targets: &[f64], dim: usize, group: usize) -> Retrieval {
     let groups = queries.len() / dim / group;
     assert!(groups > 0, "at least {group} rows are needed");
-    let (mut hits, mut distances) = ([0usize; 3], 0.0);
+    let mut hits = [0usize; 3];
+    let mut distances = 0.0;
     for start in (0..groups).map(|g| g * group) {
         for query in start..start + group {
             let to = |target: usize| squared(row(queries, query, dim), row(targets, target, dim));

@@ -53,7 +53,8 @@ mod tests {
 
     #[test]
     fn a_wave_is_in_its_band_and_energy_is_kept() {
-        let (frames, fps) = (40, 20.0);
+        let frames = 40;
+        let fps = 20.0;
         let bands = Bands::new(frames, fps, &[0.5, 1.0, 2.0, 4.0]);
         // Coefficient 6 of 40 frames is at 1.5 Hz.
         let wave = |i: usize| (PI * (2 * i + 1) as f64 * 6.0 / 80.0).cos();

@@ -122,12 +122,14 @@ impl TrainedControl {
         let meta: ControlMeta = artifacts::meta(manifest, "the control part")?;
         let device = device.clone().inner();
         let mut blank = Init::blank(&device);
-        let (control, trajectory) = (meta.controlnet(denoiser, &mut blank), meta.trajectory(denoiser, &mut blank));
+        let control = meta.controlnet(denoiser, &mut blank);
+        let trajectory = meta.trajectory(denoiser, &mut blank);
         let what = "the control part's weights";
         let control = weights::load_under(control, blobs, manifest, CONTROLNET_PREFIX, what)?;
         let trajectory = weights::load_under(trajectory, blobs, manifest, TRAJECTORY_PREFIX, what)?;
         if meta.feedback > limits::FEEDBACK_ROUNDS {
-            let (found, most) = (meta.feedback, limits::FEEDBACK_ROUNDS);
+            let found = meta.feedback;
+            let most = limits::FEEDBACK_ROUNDS;
             let why = format!("the control part has {found} rounds of feedback; expected at most {most}");
             return Err(StageError::Input(why));
         }

@@ -56,7 +56,8 @@ impl Seen {
         let mut rows = host(features);
         vae.denormalise(&mut rows);
         let size = inputs(skeleton.joints);
-        let (mut told, mut distances) = (vec![0.0; batch * frames * size], Vec::with_capacity(batch));
+        let mut told = vec![0.0; batch * frames * size];
+        let mut distances = Vec::with_capacity(batch);
         for (b, (length, hint)) in lengths.iter().zip(hints).enumerate() {
             let motion = &rows[b * frames * width..][..length * width];
             distances.push(tell(&mut told[b * frames * size..][..length * size], motion, skeleton, hint));
@@ -99,7 +100,8 @@ fn tell(out: &mut [f32], rows: &[f32], skeleton: &Skeleton, hint: &Hint) -> f64 
     let size = inputs(skeleton.joints);
     for ((heading, root), to) in path.iter().zip(out.chunks_exact_mut(size)) {
         // A heading's angle is half of its turn.
-        let (cos, sin) = (heading[0], heading[2]);
+        let cos = heading[0];
+        let sin = heading[2];
         let told = [root[0] * unit, root[1] * unit, root[2] * unit, cos * cos - sin * sin, 2.0 * sin * cos, mean.ln()];
         to.iter_mut().zip(told).for_each(|(to, value)| *to = value as f32);
     }

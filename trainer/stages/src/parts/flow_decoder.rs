@@ -373,7 +373,8 @@ mod tests {
             Stream::new(Seed(4), "random", number, 0).fill_normal(&mut values);
             Tensor::<3>::from_data(TensorData::new(values, shape), &device)
         };
-        let (x, codes) = (random([1, 16, 6], 0), random([1, 4, 5], 1));
+        let x = random([1, 16, 6], 0);
+        let codes = random([1, 4, 5], 1);
         let field = |prediction| meta(prediction).field(&mut Init::new(Seed(1), "net", Positions::Uniform, &device));
         let data = field(FlowPrediction::Data);
         let given = data.backbone.forward(x.clone(), &[0.25], codes.clone(), &mut Dropout::off());

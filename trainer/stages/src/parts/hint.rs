@@ -158,7 +158,9 @@ pub fn share(percent: f64, length: usize) -> usize {
 pub fn joint_statistics(dataset: &Dataset) -> (Vec<f32>, Vec<f32>) {
     let skeleton = dataset.skeleton();
     let width = skeleton.joints * AXES;
-    let (mut sums, mut squares, mut frames) = (vec![0.0_f64; width], vec![0.0_f64; width], 0_usize);
+    let mut sums = vec![0.0_f64; width];
+    let mut squares = vec![0.0_f64; width];
+    let mut frames = 0_usize;
     for entry in dataset.entries_of(Split::Train) {
         for row in metres(dataset.features(&dataset.entries[entry]), skeleton).chunks_exact(width) {
             for ((sum, square), value) in sums.iter_mut().zip(&mut squares).zip(row) {
@@ -191,11 +193,13 @@ impl NormalisedHints {
         let joints = mean.len() / AXES;
         let frames = hints.iter().map(Hint::frames).max().unwrap_or_default();
         let width = frames * joints * AXES;
-        let (mut values, mut given) = (vec![0.0; hints.len() * width], vec![false; hints.len() * width]);
+        let mut values = vec![0.0; hints.len() * width];
+        let mut given = vec![false; hints.len() * width];
         for (b, hint) in hints.iter().enumerate() {
             for (t, j, position) in hint.iter() {
                 for (axis, value) in position.iter().enumerate() {
-                    let (at, of) = (b * width + (t * joints + j) * AXES + axis, j * AXES + axis);
+                    let at = b * width + (t * joints + j) * AXES + axis;
+                    let of = j * AXES + axis;
                     values[at] = (value - mean[of]) / std[of];
                     given[at] = true;
                 }
@@ -223,7 +227,8 @@ mod tests {
         let hint = Hint::of(&motion, 2, &[1], &[1]);
         assert_eq!(hint.iter().collect::<Vec<_>>(), [(1, 1, [9.0, 10.0, 11.0])]);
         let longer = Hint::of(&[1.0; 18], 2, &[0], &[0, 2]);
-        let (mean, std) = ([0.0, 0.0, 0.0, 1.0, 2.0, 3.0], [1.0, 1.0, 1.0, 2.0, 2.0, 4.0]);
+        let mean = [0.0, 0.0, 0.0, 1.0, 2.0, 3.0];
+        let std = [1.0, 1.0, 1.0, 2.0, 2.0, 4.0];
         let both = NormalisedHints::of(&[hint.clone(), longer], &mean, &std);
         assert_eq!(both.shape, (2, 3, 2));
         assert_eq!(both.values[9..12], [4.0, 4.0, 2.0]);

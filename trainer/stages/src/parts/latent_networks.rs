@@ -111,7 +111,8 @@ impl Autoencoder {
         if self.meta.format == format {
             return Ok(());
         }
-        let (ours, theirs) = (word(&self.meta.format), word(&format));
+        let ours = word(&self.meta.format);
+        let theirs = word(&format);
         Err(StageError::Input(format!(
             "the VAE was trained on `{ours}` features, but the dataset has `{theirs}` features"
         )))
@@ -154,7 +155,8 @@ impl Autoencoder {
 
     /// Decodes latents `[batch, N, d]` to clips of `lengths[b]` frames each, normalised.
     pub fn decode_ragged(&self, z: Vec<f32>, lengths: &[usize]) -> Vec<Vec<f32>> {
-        let (latent, width) = (self.meta.latent, self.meta.features);
+        let latent = self.meta.latent;
+        let width = self.meta.features;
         let frames = lengths.iter().copied().max().unwrap_or_default();
         let z = tensor(z, [lengths.len(), latent.tokens, latent.dim], &self.device);
         let rows = host(self.vae.decode(z, lengths, frames, &mut Dropout::off()));

@@ -44,7 +44,8 @@ impl Lengths {
         artifacts::expect("the length estimator", manifest, ArtifactKind::Length)?;
         let meta: LengthMeta = artifacts::meta(manifest, "the length estimator")?;
         if meta.unit != LengthEstimator::UNIT {
-            let (found, known) = (meta.unit, LengthEstimator::UNIT);
+            let found = meta.unit;
+            let known = LengthEstimator::UNIT;
             return Err(StageError::Input(format!(
                 "the length estimator has {found} frames per class; expected {known}"
             )));

@@ -280,7 +280,8 @@ impl MotionDenoiser {
         noise: &dyn Fn(usize, usize, &mut [f32]),
         see: &mut SeeMotions<'_>,
     ) -> Result<Tensor<3>, StageError> {
-        let (batch, width) = (drawing.captions.rows.len(), self.meta.mean.len());
+        let batch = drawing.captions.rows.len();
+        let width = self.meta.mean.len();
         let fill = |k: usize| {
             let mut values = vec![0.0; batch * frames * width];
             values.chunks_exact_mut(frames * width).enumerate().for_each(|(b, row)| noise(k, b, row));

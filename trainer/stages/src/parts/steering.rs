@@ -27,7 +27,9 @@ impl Steering<'_> {
     ) -> (Vec<Tensor<3>>, f64) {
         let times = latent_bnd.dims()[0] / self.tokens_bnd.dims()[0].max(1);
         let tokens = Tensor::cat(vec![self.tokens_bnd.clone(); times.max(1)], 0);
-        let (latent, text, guidance) = (latent_bnd.clone(), text_blc.clone(), guidance_bg.cloned());
+        let latent = latent_bnd.clone();
+        let text = text_blc.clone();
+        let guidance = guidance_bg.cloned();
         (self.control.residuals(latent, timesteps, text, guidance, tokens, &mut Dropout::off()), self.scale)
     }
 }

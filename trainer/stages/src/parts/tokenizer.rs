@@ -116,7 +116,8 @@ impl TrainedTokenizer {
         if self.meta.format == format {
             return Ok(());
         }
-        let (ours, theirs) = (word(&self.meta.format), word(&format));
+        let ours = word(&self.meta.format);
+        let theirs = word(&format);
         Err(StageError::Input(format!(
             "the tokenizer was trained on `{ours}` features, but the dataset has `{theirs}` features"
         )))
@@ -198,7 +199,8 @@ impl Tokens {
         let ids = tensors.take_integers("ids", 2, TOKENS_FILE)?;
         let all: usize = meta.lengths.iter().sum();
         if ids.shape != [all, meta.quantizers] || meta.splits.len() != meta.lengths.len() {
-            let (found, wanted) = (&ids.shape, [all, meta.quantizers]);
+            let found = &ids.shape;
+            let wanted = [all, meta.quantizers];
             return Err(bad(format!("`ids` has shape {found:?}; the manifest declares {wanted:?}")));
         }
         let codes = meta.codes as i64;

@@ -50,7 +50,8 @@ impl WarmStart {
     /// Opens the artifact of `kind` that `init` names, or that is a part of the model there.
     pub(crate) fn find(cx: &dyn AttemptContext, kind: ArtifactKind) -> Result<Self, StageError> {
         let Some(&digest) = cx.task().inputs.get(INIT) else { return Ok(Self(None)) };
-        let (blobs, manifest) = (cx.blobs(), cx.manifest(digest)?);
+        let blobs = cx.blobs();
+        let manifest = cx.manifest(digest)?;
         let (digest, part) = if manifest.kind == ArtifactKind::Model {
             let model = Model::read(&manifest).map_err(model_error)?;
             let part = part_of_kind(&model, kind, |digest| parts::manifest(&*blobs, digest, "a part of `init`"))?;
@@ -138,7 +139,8 @@ impl WarmStart {
         if !cx.leads() {
             return Ok(());
         }
-        let (kind, all) = (part.kind.noun(), taken + fresh.len());
+        let kind = part.kind.noun();
+        let all = taken + fresh.len();
         cx.log(&format!("starts with {taken} of {all} tensors from `{INIT}`, {kind}, {}", digest.short()));
         list(cx, "fresh", &fresh);
         let unused: Vec<String> = there

@@ -75,7 +75,8 @@ impl Solo {
         checkpoint: Option<Manifest>,
         until: u64,
     ) -> Self {
-        let (values, states) = (BTreeMap::new(), BTreeMap::new());
+        let values = BTreeMap::new();
+        let states = BTreeMap::new();
         Self { task, device, blobs, checkpoint, until, values, states, progressed: Vec::new() }
     }
 }

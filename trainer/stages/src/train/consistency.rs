@@ -145,7 +145,8 @@ impl Distiller {
     pub(crate) fn solve(&mut self, step: u64, slice: usize) -> SolverStep {
         let batch = self.data.slice(step, slice, 0.0);
         let (low, high) = self.settings.guidance;
-        let (mut index, mut w) = (Vec::new(), Vec::new());
+        let mut index = Vec::new();
+        let mut w = Vec::new();
         for pick in &batch.picks {
             let mut draw = self.data.stream("distillation", *pick);
             index.push(draw.below(self.grid.steps));

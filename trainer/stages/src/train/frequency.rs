@@ -81,7 +81,8 @@ impl FrequencyTerms {
         if let Some(evaluator) = &evaluator
             && evaluator.meta().format != format
         {
-            let (ours, theirs) = (word(&format), word(&evaluator.meta().format));
+            let ours = word(&format);
+            let theirs = word(&evaluator.meta().format);
             return Err(StageError::Input(format!(
                 "`{}` embeds motions in format `{theirs}`, but the clips have format `{ours}`; train an evaluator on \
                  these clips",
@@ -89,7 +90,8 @@ impl FrequencyTerms {
             )));
         }
         let steps = schedule.steps();
-        let (low, meaning) = (&settings.low_frequency, &settings.semantic);
+        let low = &settings.low_frequency;
+        let meaning = &settings.semantic;
         Ok(Some(Self {
             low: Stage::of_shares(low.from, low.to, steps),
             meaning: Stage::of_shares(meaning.from, meaning.to, steps),
@@ -103,7 +105,8 @@ impl FrequencyTerms {
 
     /// Returns true if any term acts at timestep `t`.
     pub(crate) fn acts(&self, t: usize) -> bool {
-        let (low, meaning) = (&self.settings.low_frequency, &self.settings.semantic);
+        let low = &self.settings.low_frequency;
+        let meaning = &self.settings.semantic;
         (low.weight > 0.0 && self.in_stage(&self.low, t)) || (meaning.weight > 0.0 && self.in_stage(&self.meaning, t))
     }
 
@@ -123,7 +126,8 @@ impl FrequencyTerms {
 
     /// Adds the terms of a slice of a batch of `global` samples.
     pub(crate) fn add(&self, losses: &mut Losses, predicted: &Predicted<'_>, global: usize) {
-        let (batch, frames) = (predicted.lengths.len(), predicted.found.dims()[1]);
+        let batch = predicted.lengths.len();
+        let frames = predicted.found.dims()[1];
         let low = &self.settings.low_frequency;
         let weights = self.weights(&self.low, low.over, predicted, global);
         if low.weight > 0.0 && weights.iter().any(|weight| *weight > 0.0) {
@@ -133,7 +137,8 @@ impl FrequencyTerms {
                 Norm::L1 => Pointwise::L1,
                 Norm::L2 => Pointwise::L2,
             };
-            let (found, target) = (predicted.found.clone(), predicted.target.clone());
+            let found = predicted.found.clone();
+            let target = predicted.target.clone();
             let sum = low_frequency(found, target, lengths, low.keep.min(frames), distance, &weights);
             losses.add(LOW_FREQUENCY, sum, low.weight);
         }

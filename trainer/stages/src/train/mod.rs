@@ -399,7 +399,8 @@ fn begin(
     state: &mut TrainState,
     cx: &mut dyn GangContext,
 ) -> Result<Option<u64>, StageError> {
-    let (mut applied, mut saved_at) = (None, None);
+    let mut applied = None;
+    let mut saved_at = None;
     loop {
         let checkpoint = cx.latest_checkpoint()?;
         let continues = checkpoint.is_some() || cx.task().inputs.contains_key(STATE_INPUT);
@@ -563,7 +564,8 @@ fn hook(
     sums: Vec<(&str, &[f32])>,
     task: &StageTask,
 ) -> Result<(), StageError> {
-    let (step, buffers) = (state.step - 1, &mut state.buffers);
+    let step = state.step - 1;
+    let buffers = &mut state.buffers;
     objective.after(&mut AfterStep { step, buffers, sums, seed: task.seed, stage: &task.name })
 }
 

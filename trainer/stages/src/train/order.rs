@@ -56,7 +56,8 @@ impl Order {
 
     /// The batch of the phase's step `step`, shortest first. `length` returns an example's length at its place.
     pub fn batch(&mut self, step: u64, mut length: impl FnMut(Pick) -> usize) -> Vec<Pick> {
-        let (batch, pool) = (self.batch as u64, self.pool as u64);
+        let batch = self.batch as u64;
+        let pool = self.pool as u64;
         let first = step / pool * pool * batch;
         let mut picks: Vec<(usize, Pick)> = (first..first + pool * batch)
             .map(|place| {

@@ -103,7 +103,8 @@ impl TrainState {
     /// not copied.
     pub fn saved<T>(&self, save: impl FnOnce(&[&[u8]]) -> T) -> T {
         debug_assert!(self.is_fetched());
-        let (header, step) = (self.header(), self.step.to_le_bytes());
+        let header = self.header();
+        let step = self.step.to_le_bytes();
         let all = self.values();
         let mut pieces: Vec<&[u8]> = vec![&header, &step];
         pieces.extend(all.values().map(|values| cast_slice::<f32, u8>(values)));

@@ -10,7 +10,8 @@ pub fn tree_sum(parts: &[Vec<f32>]) -> Vec<f32> {
         return only.clone();
     }
     let (left, right) = parts.split_at(parts.len().next_power_of_two() / 2);
-    let (mut sum, right) = (tree_sum(left), tree_sum(right));
+    let mut sum = tree_sum(left);
+    let right = tree_sum(right);
     assert_eq!(sum.len(), right.len(), "slices give vectors of one length");
     for (a, b) in sum.iter_mut().zip(right) {
         *a += b;

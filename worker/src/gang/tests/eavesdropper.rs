@@ -15,8 +15,11 @@ fn recorder(server: SocketAddr, seen: &Arc<Mutex<Vec<u8>>>) -> SocketAddr {
         for client in listener.incoming().flatten() {
             let Ok(server) = TcpStream::connect(server) else { continue };
             for (from, to) in [(&client, &server), (&server, &client)] {
-                let (from, to, seen) = (from.try_clone(), to.try_clone(), seen.clone());
-                let (mut from, mut to) = (from.expect("a socket twice"), to.expect("a socket twice"));
+                let from = from.try_clone();
+                let to = to.try_clone();
+                let seen = seen.clone();
+                let mut from = from.expect("a socket twice");
+                let mut to = to.expect("a socket twice");
                 thread::spawn(move || {
                     let mut buffer = vec![0; 64 << 10];
                     while let Ok(n @ 1..) = from.read(&mut buffer) {

@@ -34,7 +34,8 @@ impl Relay {
         let listener = TcpListener::bind("127.0.0.1:0").expect("a free port");
         let address = listener.local_addr().expect("bound");
         let relay = Self { address, there: Arc::default(), back: Arc::default() };
-        let (there, back) = (relay.there.clone(), relay.back.clone());
+        let there = relay.there.clone();
+        let back = relay.back.clone();
         thread::spawn(move || {
             for client in listener.incoming().flatten() {
                 let Ok(server) = TcpStream::connect(server) else { continue };
@@ -151,7 +152,9 @@ fn signs_of_life_go_out_between_the_frames_of_a_long_payload() {
     let handshake::Session { mut receives, .. } =
         handshake::dial(&stream, &task(), Generation(7), 1, 0, "s").expect("welcome");
     let over = AtomicBool::new(false);
-    let (mut large, mut signs, begun) = (0, 0, Instant::now());
+    let mut large = 0;
+    let mut signs = 0;
+    let begun = Instant::now();
     thread::scope(|scope| {
         scope.spawn(|| {
             let payload = vec![0; MAX_PAYLOAD];

@@ -55,7 +55,9 @@ fn p18_each_barrier_has_a_name_and_a_time_and_lists_who_is_missing() {
         thread::scope(|scope| {
             let members: Vec<_> = (0..4)
                 .map(|own| {
-                    let (mesh, stopped, over) = (meshes[own].clone(), &stopped, &over);
+                    let mesh = meshes[own].clone();
+                    let stopped = &stopped;
+                    let over = &over;
                     scope.spawn(move || {
                         let is_stopped = stopped.contains(&own);
                         let stop = || {

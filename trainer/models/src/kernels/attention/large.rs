@@ -129,8 +129,11 @@ pub(super) fn backward(attend: &Attend, packed: &Packed<'_>, weights: &[f32], do
     for b in 0..s.batch {
         let valid = attend.valid(b);
         for h in 0..s.heads {
-            let (at, out) = (weight_view(s, b, h), out_view(s, b, h));
-            let (q, k, v) = (packed.q_view(s, b, h), packed.k_view(s, b, h), packed.v_view(s, b, h));
+            let at = weight_view(s, b, h);
+            let out = out_view(s, b, h);
+            let q = packed.q_view(s, b, h);
+            let k = packed.k_view(s, b, h);
+            let v = packed.v_view(s, b, h);
             let p = &weights[at.offset..at.offset + s.queries * s.keys];
             scores.fill(0.0);
             matmul((s.queries, valid, s.head()), dout, out, packed.kv, v.t(), &mut scores, by_keys, 0.0, 1.0);

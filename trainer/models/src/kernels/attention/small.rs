@@ -204,7 +204,8 @@ multiversion! {
     /// `ds = scale p (dp - sum(dp p))`, in place of the gradients of the weights.
     fn head_softmax<const SET>(s: Sizes, valid: usize, dropped: bool, scratch: &mut Scratch) {
         let lanes = s.queries.next_multiple_of(LANES);
-        let (weights, scores) = (&scratch.weights[..valid * lanes], &mut scratch.scores[..valid * lanes]);
+        let weights = &scratch.weights[..valid * lanes];
+        let scores = &mut scratch.scores[..valid * lanes];
         if dropped {
             for (score, factor) in scores.iter_mut().zip(&scratch.factors) {
                 *score *= factor;
@@ -214,13 +215,15 @@ multiversion! {
         for column in (0..lanes).step_by(LANES) {
             let mut dot = [0.0_f32; LANES];
             for (p, dp) in weights.chunks_exact(lanes).zip(scores.chunks_exact(lanes)) {
-                let (p, dp) = (&p[column..column + LANES], &dp[column..column + LANES]);
+                let p = &p[column..column + LANES];
+                let dp = &dp[column..column + LANES];
                 for ((dot, p), dp) in dot.iter_mut().zip(p).zip(dp) {
                     *dot = mul_add::<SET>(*p, *dp, *dot);
                 }
             }
             for (p, dp) in weights.chunks_exact(lanes).zip(scores.chunks_exact_mut(lanes)) {
-                let (p, dp) = (&p[column..column + LANES], &mut dp[column..column + LANES]);
+                let p = &p[column..column + LANES];
+                let dp = &mut dp[column..column + LANES];
                 for ((dot, p), dp) in dot.iter().zip(p).zip(dp) {
                     *dp = p * scale * (*dp - dot);
                 }
@@ -245,7 +248,8 @@ multiversion! {
         let at = Places::of(s, packed, place);
         let lanes = s.queries.next_multiple_of(LANES);
         let by_key = |values| Left { values, row: lanes, col: 1 };
-        let (sizes, column) = ((valid, s.head(), s.queries), place.1 * s.head());
+        let sizes = (valid, s.head(), s.queries);
+        let column = place.1 * s.head();
         let keys = &mut to[packed.k_at + column..];
         multiply::<SET>(sizes, by_key(&scratch.scores), (&packed.q[at.q..], packed.q_row), (keys, packed.kv_row));
         let weights = if dropped { &scratch.dropped } else { &scratch.weights };

@@ -72,7 +72,8 @@ impl MotionGenerator for FeatureDiffusion {
     }
 
     fn predictions(&self, batch: Batch<'_>, sampler: &Sampler) -> Result<Vec<(usize, Vec<f32>)>, StageError> {
-        let (rows, kept) = (vec![batch.texts[0].values.clone()], vec![true]);
+        let rows = vec![batch.texts[0].values.clone()];
+        let kept = vec![true];
         let captions = CaptionRows { rows, kept };
         let drawing = Drawing { captions: &captions, frames: batch.lengths[0], sampler };
         let noise = |k: usize, i: usize, out: &mut [f32]| (batch.seeds)(k, i).fill_normal(out);

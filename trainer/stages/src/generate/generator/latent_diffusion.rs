@@ -50,7 +50,8 @@ pub(super) fn open(model: &Model, blobs: &dyn Blobs, device: &Device) -> Result<
             return Err(StageError::Input(format!("the denoiser was not trained with the model's `{role}` part")));
         }
     }
-    let (ours, theirs) = (meta.latent, vae.meta().latent);
+    let ours = meta.latent;
+    let theirs = vae.meta().latent;
     if ours != theirs {
         return Err(StageError::Input(format!(
             "the denoiser's latent is {}x{}, but the VAE's is {}x{}",
@@ -58,7 +59,8 @@ pub(super) fn open(model: &Model, blobs: &dyn Blobs, device: &Device) -> Result<
         )));
     }
     if meta.text_dim != text.dim() {
-        let (wanted, found) = (meta.text_dim, text.dim());
+        let wanted = meta.text_dim;
+        let found = text.dim();
         return Err(StageError::Input(format!(
             "the denoiser expects {wanted} numbers per caption, but the text encoder returns {found}"
         )));

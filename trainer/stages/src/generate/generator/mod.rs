@@ -48,7 +48,8 @@ pub fn open(manifest: &Manifest, blobs: &dyn Blobs, device: &Device) -> Result<B
     };
     let generator = open(&model, blobs, device)?;
     if generator.format() != model.format {
-        let (found, said) = (generator.format().name(), model.format.name());
+        let found = generator.format().name();
+        let said = model.format.name();
         return Err(StageError::Input(format!(
             "the model's parts generate motions in format `{found}`, but its manifest declares `{said}`"
         )));
@@ -132,7 +133,8 @@ pub fn edited(
 ) -> Result<Vec<f32>, StageError> {
     check_sampler(generator, sampler)?;
     let model = infilling(generator)?;
-    let (frames, longest) = (edit.kept.len() * model.unit(), generator.longest());
+    let frames = edit.kept.len() * model.unit();
+    let longest = generator.longest();
     if !(1..=longest).contains(&frames) {
         return Err(StageError::Input(format!(
             "a motion of {frames} frames was requested; the model generates 1 to {longest} frames"

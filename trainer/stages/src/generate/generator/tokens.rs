@@ -150,7 +150,8 @@ pub(super) fn open(model: &Model, blobs: &dyn Blobs, device: &Device) -> Result<
             )));
         }
     }
-    let (ours, theirs) = ((meta.codes, meta.quantizers), (tokenizer.meta().codes, tokenizer.meta().quantizers));
+    let ours = (meta.codes, meta.quantizers);
+    let theirs = (tokenizer.meta().codes, tokenizer.meta().quantizers);
     if ours != theirs {
         return Err(StageError::Input(format!(
             "the generator has {} codebook(s) of {} codes, but the tokenizer has {} of {}",
@@ -161,7 +162,8 @@ pub(super) fn open(model: &Model, blobs: &dyn Blobs, device: &Device) -> Result<
         text::expect_one_width(&*text)?;
     }
     if meta.text_dim != text.dim() {
-        let (wanted, found) = (meta.text_dim, text.dim());
+        let wanted = meta.text_dim;
+        let found = text.dim();
         return Err(StageError::Input(format!(
             "the token generator expects {wanted} numbers per caption, but the text encoder returns {found}"
         )));
@@ -242,7 +244,8 @@ impl TokenModel {
 
     /// Known ids of the first layer of each motion.
     fn given(&self, batch: Batch<'_>, known: Option<Known<'_>>) -> Vec<Vec<Option<usize>>> {
-        let (unit, quantizers) = (self.tokenizer.unit(), self.meta.quantizers);
+        let unit = self.tokenizer.unit();
+        let quantizers = self.meta.quantizers;
         let id = |place: usize| known.and_then(|known| known.id(quantizers, 0, place));
         batch.lengths.iter().map(|frames| (0..frames.div_ceil(unit)).map(id).collect()).collect()
     }
@@ -316,7 +319,8 @@ impl TokenModel {
                     fill((steps + layer) * places + p, b, out, batch.seeds)
                 };
                 let guidance = if known.is_some() { EDIT_GUIDANCE } else { RESIDUAL_GUIDANCE };
-                let (sampling, quantizers) = (Sampling { guidance, ..of_first }, self.meta.quantizers);
+                let sampling = Sampling { guidance, ..of_first };
+                let quantizers = self.meta.quantizers;
                 let known = |layer, at| known.and_then(|known| known.id(quantizers, layer, at));
                 let first = residual::First { ids: &ids, lengths: &lengths, known: &known };
                 let ids = residual::generate(network, &config, &sampling, text, first, &mut draws);

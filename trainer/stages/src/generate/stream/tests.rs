@@ -171,7 +171,8 @@ fn segments_of_one_motion_are_that_motion() {
     ] {
         let (rows, generator, mut stream, said) = scripted(joining);
         let whole = recover_joints(&rows, body());
-        let (mut all, mut junctions) = (Vec::new(), Vec::new());
+        let mut all = Vec::new();
+        let mut junctions = Vec::new();
         // The last two requests: longer than the model generates at once, and the model's own length.
         for (frames, overlap) in [Some(40), Some(33), Some(60), Some(39), None].into_iter().zip(overlaps) {
             let segment = stream.draw(&generator, &ask(frames)).unwrap();
@@ -245,7 +246,8 @@ fn a_difference_fades() {
         let second = stream.draw(&generator, &ask(Some(40))).unwrap();
         assert!(second.offset > 0.1, "{}", second.offset);
         let far = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
-        let (last, new) = (&first.joints[39 * 66..], &second.joints[..66]);
+        let last = &first.joints[39 * 66..];
+        let new = &second.joints[..66];
         assert!(far(last, new) < 0.5 * second.offset, "{} of {}", far(last, new), second.offset);
         // After the fade it is the other motion, placed in the world.
         let own = recover_joints(&rows[199 * body().features..][..41 * body().features], body());

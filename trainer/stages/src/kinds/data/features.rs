@@ -68,7 +68,9 @@ impl Map for DataFeatures {
     fn merge(&self, cx: &mut dyn AttemptContext, shards: &[Digest]) -> Result<Outcome, StageError> {
         let notes = external::read(cx, |_, given| Ok(listing(given)?.notes))?;
         let mut report = Report { notes, ..Report::default() };
-        let (mut made, mut broken, mut have) = (Vec::new(), Vec::new(), 0);
+        let mut made = Vec::new();
+        let mut broken = Vec::new();
+        let mut have = 0;
         for digest in shards {
             let manifest = cx.manifest(*digest)?;
             let ShardMeta { first, files } = artifacts::meta(&manifest, "a shard of the recordings")?;
@@ -110,7 +112,8 @@ fn read_shard(
     let recipe = recipe(settings, given)?;
     let listing = listing(given)?;
     let range = shard_range(listing.clips.len(), index, of);
-    let (mut files, mut features) = (Vec::new(), Vec::new());
+    let mut files = Vec::new();
+    let mut features = Vec::new();
     for (done, clip) in listing.clips[range.clone()].iter().enumerate() {
         if cx.interrupted() {
             return Ok(Outcome::Yielded { at: 0 });

@@ -19,7 +19,8 @@ impl Plain for DataSynthetic {
         if self.clips == 0 {
             return Err(StageError::Input("`clips` is 0; expected at least 1".into()));
         }
-        let (seed, clips) = (cx.task().seed, self.clips as u64);
+        let seed = cx.task().seed;
+        let clips = self.clips as u64;
         let world = RefCell::new(&mut *cx);
         let go_on = |made: usize| {
             let mut cx = world.borrow_mut();

@@ -60,7 +60,8 @@ impl Objective for Student {
         let index: Vec<usize> =
             batch.uniforms.iter().map(|u| ((u * intervals as f32) as usize).min(intervals - 1)).collect();
         let at = |ahead: usize| -> Vec<f32> { index.iter().map(|k| (k + ahead) as f32 / intervals as f32).collect() };
-        let (from, to) = (at(0), at(1));
+        let from = at(0);
+        let to = at(1);
         let noisy = between(batch.data_btf, batch.noise_btf, &from);
         let codes = batch.codes_bnd;
         let frozen = |field: &Field, x, t: &[f32]| field.velocity(x, t, codes.clone(), &mut Dropout::off());

@@ -95,7 +95,8 @@ fn frames(settings: &DrawMotions, generator: &Generator) -> Result<Option<usize>
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "checked to be 0 to 60 seconds")]
     let frames = (settings.seconds * fps).round() as usize;
     if frames == 0 || frames > generator.longest() {
-        let (seconds, longest) = (settings.seconds, generator.longest() as f64 / fps);
+        let seconds = settings.seconds;
+        let longest = generator.longest() as f64 / fps;
         let message = format!("`seconds` is {seconds}; the model draws {:.2} to {longest:.1}", 1.0 / fps);
         return Err(StageError::Input(message));
     }
@@ -180,7 +181,8 @@ fn publish(
     let body = Body::of(skeleton);
     let mut panels = Vec::with_capacity(drawn.len());
     for Drawn { sentence, seed, motion } in drawn {
-        let (caption, note) = ((*sentence).to_owned(), format!("seed {}", seed.0));
+        let caption = (*sentence).to_owned();
+        let note = format!("seed {}", seed.0);
         panels.push(Panel { caption, note, body: &body, joints: &motion.joints, waypoints });
     }
     let mut motions = packed(&panels).map_err(refused)?;

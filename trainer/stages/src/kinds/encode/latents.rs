@@ -68,7 +68,8 @@ impl Map for EncodeLatents {
         let range = shard_range(dataset.entries.len(), index, of);
         let purpose = format!("{}/crop", cx.task().name);
         let seed = cx.task().seed;
-        let (mut mu, mut sigma) = (Vec::new(), Vec::new());
+        let mut mu = Vec::new();
+        let mut sigma = Vec::new();
         let mut meta = LatentsMeta {
             format,
             vae: vae_digest,
@@ -110,7 +111,8 @@ impl Map for EncodeLatents {
 
     fn merge(&self, cx: &mut dyn AttemptContext, shards: &[Digest]) -> Result<Outcome, StageError> {
         let mut whole: Option<LatentsMeta> = None;
-        let (mut mu, mut sigma) = (Vec::new(), Vec::new());
+        let mut mu = Vec::new();
+        let mut sigma = Vec::new();
         for shard in shards::read(cx, shards, "latents", LATENTS_FILE) {
             let (ShardMeta { latents, first }, mut part) = shard?;
             let have = whole.as_ref().map_or(0, |w| w.splits.len());

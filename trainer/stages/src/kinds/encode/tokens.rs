@@ -32,7 +32,8 @@ impl Map for EncodeTokens {
         let tokenizer = TrainedTokenizer::read(&*blobs, &manifest, &cx.device())?;
         let dataset = artifacts::input_dataset(cx)?;
         tokenizer.check_format(dataset.format)?;
-        let (unit, width) = (tokenizer.unit(), dataset.mean.len());
+        let unit = tokenizer.unit();
+        let width = dataset.mean.len();
         let range = shard_range(dataset.entries.len(), index, of);
         let mut meta = TokensMeta {
             format: dataset.format,

@@ -163,7 +163,8 @@ impl Values {
     }
 
     fn unit(&mut self, plan: &Plan<'_>, maker: &Maker<'_>, unit: Unit) -> Result<(), StageError> {
-        let (of, skeleton) = (&plan.of, plan.of.dataset.skeleton());
+        let of = &plan.of;
+        let skeleton = plan.of.dataset.skeleton();
         let block = of.block(unit.block);
         let draws: Vec<Draw> = block.clone().map(|i| of.draw(unit.repeat, i, true)).collect();
         let crops: Vec<Vec<f32>> = draws.iter().map(|d| of.crop(*d)).collect();
@@ -243,13 +244,17 @@ struct Gathered {
 }
 
 fn gather(cx: &dyn AttemptContext, plan: &Plan<'_>, digests: &[Digest]) -> Result<Vec<Gathered>, StageError> {
-    let (width, ways) = (plan.of.trained.width(), plan.cases.len() + 1);
+    let width = plan.of.trained.width();
+    let ways = plan.cases.len() + 1;
     let mut parts: BTreeMap<Unit, Gathered> = BTreeMap::new();
     for shard in shards::read::<Units<Unit>>(cx, digests, "evaluation", VALUES_FILE) {
         let (Units { units }, mut tensors) = shard?;
         let mut take = |name: &str, rank| Ok::<_, StageError>(to_f64(&tensors.take(name, rank, VALUES_FILE)?.values));
-        let (text, real, made) = (take("text", 2)?, take("real", 2)?, take("made", 2)?);
-        let (skating, errors) = (take("skating", 1)?, take("errors", 2)?);
+        let text = take("text", 2)?;
+        let real = take("real", 2)?;
+        let made = take("made", 2)?;
+        let skating = take("skating", 1)?;
+        let errors = take("errors", 2)?;
         let mut row = 0;
         for unit in units {
             let n = plan.of.block(unit.block).len();

@@ -203,7 +203,8 @@ fn latents_of<'g>(field: &str, generator: &'g dyn MotionGenerator) -> Result<&'g
 fn fits(field: &str, generator: &dyn MotionGenerator, latents: &Latents) -> Result<(), StageError> {
     let refuse = |text: String| Err(StageError::Input(format!("`{field}` does not fit: {text}")));
     let model = latents_of(field, generator)?;
-    let (a, b) = (model.shape(), latents.meta.latent);
+    let a = model.shape();
+    let b = latents.meta.latent;
     if a != b {
         return refuse(format!(
             "its latent is {}x{}, but that of `latents` is {}x{}",
@@ -225,7 +226,8 @@ impl Map for EvaluateLatentFid {
         let plan = Plan::read(cx, self)?;
         let mine = |maker| in_turn(plan.units().into_iter().filter(move |unit| unit.maker == maker), index, of);
         let units: Vec<Unit> = mine(Maker::Model).chain(mine(Maker::Teacher)).collect();
-        let (texts, teacher_sampler) = (Texts::new(&*plan.model), plan.teacher_sampler());
+        let texts = Texts::new(&*plan.model);
+        let teacher_sampler = plan.teacher_sampler();
         let teacher = plan.teacher.as_deref().map(|teacher| (teacher, Texts::new(teacher)));
 
         // Cost in network evaluations, so that progress is even.
@@ -234,7 +236,8 @@ impl Map for EvaluateLatentFid {
             Maker::Teacher => TEACHER_STEPS as u64,
         };
         let total = units.iter().map(cost).sum();
-        let (mut done, mut values) = (0, Vec::new());
+        let mut done = 0;
+        let mut values = Vec::new();
         for unit in &units {
             if cx.interrupted() {
                 return Ok(Outcome::Yielded { at: 0 });
@@ -430,7 +433,8 @@ fn compared(plan: &Plan<'_>, z: &[f32]) -> Vec<f32> {
 /// Another draw of real latents, as many of each entry as there are samples. It scores like a perfect sampler.
 fn fresh(plan: &Plan<'_>) -> Vec<f32> {
     let z = draw(plan, 1);
-    let (crops, width) = (plan.latents.meta.crops, plan.width());
+    let crops = plan.latents.meta.crops;
+    let width = plan.width();
     (0..plan.samples())
         .flat_map(|i| {
             let crop = Stream::new(plan.seed, "evaluate.latent_fid/floor", 0, i as u64).below(crops);

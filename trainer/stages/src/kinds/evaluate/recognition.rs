@@ -112,7 +112,8 @@ impl Recognition<'_> {
         dataset: &Dataset,
         vocabulary: &Vocabulary,
     ) -> Result<Classifier, StageError> {
-        let (mut motions, mut labels) = (Vec::new(), Vec::new());
+        let mut motions = Vec::new();
+        let mut labels = Vec::new();
         let train = by_activity(dataset, vocabulary, Split::Train);
         for (activity, entries) in train.iter().enumerate() {
             if entries.is_empty() {
@@ -219,7 +220,8 @@ struct Real {
 
 impl Real {
     fn of(dataset: &Dataset, classifier: &Classifier, looked_at: &[Vec<usize>]) -> Self {
-        let (mut right, mut skating) = (vec![0; looked_at.len()], 0.0);
+        let mut right = vec![0; looked_at.len()];
+        let mut skating = 0.0;
         for (activity, entries) in looked_at.iter().enumerate() {
             for e in entries {
                 let rows = dataset.features(&dataset.entries[*e]);

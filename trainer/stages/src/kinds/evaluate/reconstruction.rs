@@ -142,7 +142,9 @@ impl Map for EvaluateReconstruction {
 
         let range = shard_range(entries.len(), index, of);
         let total = range.len() as u64;
-        let (skeleton, width, seed) = (dataset.skeleton(), dataset.mean.len(), cx.task().seed);
+        let skeleton = dataset.skeleton();
+        let width = dataset.mean.len();
+        let seed = cx.task().seed;
         let (mean, std) = measured.statistics();
         let mut codes = measured.no_codes();
         let mut rows = Vec::with_capacity(range.len());

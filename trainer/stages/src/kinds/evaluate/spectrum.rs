@@ -60,14 +60,19 @@ impl Plain for EvaluateSpectrum {
         if entries.is_empty() {
             return Err(no_entries(self.split));
         }
-        let (seed, width, fps) = (cx.task().seed, dataset.mean.len(), dataset.skeleton().fps);
+        let seed = cx.task().seed;
+        let width = dataset.mean.len();
+        let fps = dataset.skeleton().fps;
         let stream = |what: &str, i: usize| Stream::new(seed, &format!("evaluate.spectrum/{what}"), 0, i as u64);
         let normalised = |rows: &[f32]| -> Vec<f64> {
             let mut rows = rows.to_vec();
             dataset.normalise(&mut rows);
             rows.into_iter().map(f64::from).collect()
         };
-        let (mut real, mut last, mut steps, mut timesteps) = (Vec::new(), Vec::new(), Vec::<Step>::new(), Vec::new());
+        let mut real = Vec::new();
+        let mut last = Vec::new();
+        let mut steps = Vec::<Step>::new();
+        let mut timesteps = Vec::new();
         for (done, e) in entries.iter().enumerate() {
             if cx.interrupted() {
                 return Ok(Outcome::Yielded { at: 0 });

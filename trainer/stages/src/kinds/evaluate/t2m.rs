@@ -69,7 +69,10 @@ impl Map for EvaluateT2m {
         // Every `of`-th unit of either part, since the parts have different costs.
         let mine = |part| in_turn(plan.units().into_iter().filter(move |unit| unit.part == part), index, of);
         let units: Vec<Unit> = mine(Part::Entries).chain(mine(Part::Many)).collect();
-        let (mut text, mut made, mut real, mut skating) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+        let mut text = Vec::new();
+        let mut made = Vec::new();
+        let mut real = Vec::new();
+        let mut skating = Vec::new();
         let mut many = Vec::new();
         for (done, unit) in units.iter().enumerate() {
             if cx.interrupted() {
@@ -124,7 +127,9 @@ impl Map for EvaluateT2m {
         let plan = Plan::read(cx, self)?;
         let all = gather(cx, &plan, shards)?;
         let measured = over_repeats(self.repeats, |_| true, |repeat| measure(&plan, &all, repeat))?;
-        let (samples, entries, pool) = (plan.kept(), plan.of.entries.len(), self.first_pool());
+        let samples = plan.kept();
+        let entries = plan.of.entries.len();
+        let pool = self.first_pool();
         if samples < entries {
             cx.log(&format!(
                 "{} of {entries} entries do not fill a pool of {pool}; each repeat leaves out different ones",

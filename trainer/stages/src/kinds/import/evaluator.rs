@@ -61,13 +61,15 @@ fn import(settings: &ImportEvaluator, cx: &mut dyn AttemptContext, given: &Given
         )));
     }
     if (config.word, config.classes) != (WORD_WIDTH, CLASSES) {
-        let (word, classes) = (config.word, config.classes);
+        let word = config.word;
+        let classes = config.classes;
         return Err(refuse(format!(
             "it expects word vectors of width {word} and {classes} word classes; expected {WORD_WIDTH} and {CLASSES}"
         )));
     }
     check_parameters(&config, &bytes).map_err(refuse)?;
-    let (mean, std) = (statistic(folder, "mean.npy", skeleton)?, statistic(folder, "std.npy", skeleton)?);
+    let mean = statistic(folder, "mean.npy", skeleton)?;
+    let std = statistic(folder, "std.npy", skeleton)?;
     if let Some(i) = std.iter().position(|s| !(*s > 0.0 && s.is_finite())) {
         return Err(StageError::Input(format!(
             "{}: std.npy: value {i} is {}; expected a number above 0",
@@ -188,7 +190,8 @@ fn check_parameters(config: &EvaluatorConfig, bytes: &[u8]) -> Result<(), String
     let wide = |n: usize| n as u128;
     let linear = |from: u128, to: u128| (from + 1).saturating_mul(to);
     let encoder = |input: usize, width: usize| {
-        let (input, width) = (wide(input), wide(width));
+        let input = wide(input);
+        let width = wide(width);
         let gru = linear(width, width).saturating_mul(12);
         linear(input, width) + gru + linear(2 * width, width) + linear(width, wide(config.embedding)) + 4 * width
     };
@@ -358,7 +361,8 @@ mod tests {
             archive.start_file(name, stored).unwrap();
             archive.write_all(bytes).unwrap();
         }
-        let (archive, weights) = (archive.finish().unwrap().into_inner(), small());
+        let archive = archive.finish().unwrap().into_inner();
+        let weights = small();
         for round in 0..600 {
             let mut bytes = if round % 2 == 0 { archive.clone() } else { weights.clone() };
             // The important bytes are headers at either end of a file; half of the safetensors rounds change only the

@@ -146,7 +146,8 @@ fn statistic(folder: &DataPath, names: [&str; 2], len: usize) -> Result<Vec<f32>
 
 /// Reads mean and deviation from a folder.
 fn statistics(folder: &DataPath, names: [[&str; 2]; 2], len: usize) -> Result<(Vec<f32>, Vec<f32>), StageError> {
-    let (mean, std) = (statistic(folder, names[0], len)?, statistic(folder, names[1], len)?);
+    let mean = statistic(folder, names[0], len)?;
+    let std = statistic(folder, names[1], len)?;
     if let Some(i) = std.iter().position(|s| *s <= 0.0) {
         return Err(StageError::Input(format!(
             "{}: {}: value {i} is {}; expected a number above 0",
@@ -291,7 +292,8 @@ impl Import<'_> {
             _ => {}
         }
         if config.latent != vae.latent {
-            let (ours, theirs) = (config.latent.dim, vae.latent);
+            let ours = config.latent.dim;
+            let theirs = vae.latent;
             return Err(found.refuse(format!(
                 "its latent tokens are {ours} wide, but the latents of `vae` are {}x{}; use the VAE that it was \
                  trained with",
@@ -348,7 +350,8 @@ impl Import<'_> {
         let config = sizes::of_trajectory(&trajectory, self.heads)?;
         let joints = Skeleton::of(model.format).joints;
         if config.joints != joints {
-            let (found, format) = (config.joints, word(&model.format));
+            let found = config.joints;
+            let format = word(&model.format);
             return Err(trajectory.refuse(format!("it expects {found} joints, but `{format}` has {joints}")));
         }
         if config.latent != base.latent {

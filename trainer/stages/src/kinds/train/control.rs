@@ -101,7 +101,8 @@ impl MotionTerm<'_> {
     /// The distance of the joints from their targets. It is summed over the slice so that dividing by the global batch
     /// gives the configured mean.
     fn of(&self, features: Tensor<3>) -> Tensor<1> {
-        let (joints, metres) = (self.decoder.body.joints(features), self.decoder.metres);
+        let joints = self.decoder.body.joints(features);
+        let metres = self.decoder.metres;
         let joints = if metres == 1.0 { joints } else { joints * metres };
         self.target.loss(joints, self.distance, &self.weights)
     }
@@ -240,7 +241,8 @@ impl Controlled {
 
     /// The hints of a slice: joints of the same crops from which its latents were encoded.
     fn hints(&self, batch: &LatentSlice) -> Vec<Hint> {
-        let (meta, skeleton) = (self.data.meta(), self.dataset.skeleton());
+        let meta = self.data.meta();
+        let skeleton = self.dataset.skeleton();
         let one = |((pick, row), length): ((&Pick, &usize), &usize)| {
             let told = self.told(*pick, *length);
             Hint::of(&metres(&meta.rows(&self.dataset, *row), skeleton), skeleton.joints, &told.joints, &told.frames)
@@ -324,8 +326,10 @@ impl Controlled {
         (batch, told): (&LatentSlice, &[Hint]),
         drop: &dyn Fn(u64) -> Dropout,
     ) {
-        let (loss, rounds) = (&self.settings.loss, self.settings.feedback.rounds);
-        let (mut latents, mut motions) = (Vec::new(), Vec::new());
+        let loss = &self.settings.loss;
+        let rounds = self.settings.feedback.rounds;
+        let mut latents = Vec::new();
+        let mut motions = Vec::new();
         for round in 0..rounds {
             let now = features.take().unwrap_or_else(|| motion.decode(latent_bnd.clone()));
             let seen = Seen::of(&motion.decoder.vae, now, &batch.lengths, told);

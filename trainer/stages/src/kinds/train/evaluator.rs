@@ -96,7 +96,8 @@ impl EvaluatorObjective {
             .iter()
             .map(|pick| {
                 let e = self.train[pick.example];
-                let (len, mut draw) = (self.dataset.entries[e].len, self.draw("crop", phase, *pick));
+                let len = self.dataset.entries[e].len;
+                let mut draw = self.draw("crop", phase, *pick);
                 let length = self.settings.movement.window;
                 let (start, len) = if phase == MOVEMENTS {
                     window(&mut draw, length, length, len, skeleton)
@@ -129,7 +130,9 @@ impl EvaluatorObjective {
     fn movement_slice(&mut self, step: u64, slice: usize) -> Result<SliceResult, StageError> {
         let (picks, global) = self.pick(MOVEMENTS, step, slice);
         let Cuts { rows, lengths, frames } = self.cut(MOVEMENTS, &picks);
-        let (batch, width, inner) = (picks.len(), self.meta.mean.len(), self.meta.config.features);
+        let batch = picks.len();
+        let width = self.meta.mean.len();
+        let inner = self.meta.config.features;
         let rows = Tensor::<3>::from_data(TensorData::new(rows, [batch, frames, width]), &self.device);
         let mut dropout = Dropout::new(self.settings.network.dropout, self.dropout_seed, step, slice as u64);
         let features = rows.clone().slice([0..batch, 0..frames, 0..inner]);
@@ -167,7 +170,9 @@ impl EvaluatorObjective {
         let local = step - self.turning_point();
         let (picks, global) = self.pick(MATCHING, local, slice);
         let Cuts { rows, lengths, frames } = self.cut(MATCHING, &picks);
-        let (batch, width, inner) = (picks.len(), self.meta.mean.len(), self.meta.config.features);
+        let batch = picks.len();
+        let width = self.meta.mean.len();
+        let inner = self.meta.config.features;
         let captions: Vec<&motion::dataset::Caption> = picks
             .iter()
             .map(|pick| {
@@ -195,7 +200,8 @@ impl EvaluatorObjective {
         let near = (squared.sqrt() * -1.0 + self.settings.margin).clamp_min(0.0);
         let negative = (near.clone() * near * grid(apart)).sum();
         let part = |x: &Tensor<1>| x.clone().inner().into_scalar::<f32>() / global as f32;
-        let (close, far) = (part(&positive), part(&negative));
+        let close = part(&positive);
+        let far = part(&negative);
 
         let loss = (positive + negative) / global as f32;
         let value = loss.clone().inner().into_scalar::<f32>();
@@ -228,9 +234,12 @@ fn apart(sentences: &[&str]) -> Vec<f32> {
 
 impl Objective for EvaluatorObjective {
     fn groups(&mut self) -> Vec<GroupPlan> {
-        let (turn, training, ema) = (self.turning_point(), &self.settings.training, self.settings.ema);
+        let turn = self.turning_point();
+        let training = &self.settings.training;
+        let ema = self.settings.ema;
         let steps = training.steps.0;
-        let (movements, matching) = (Turns::during(0..turn), Turns::during(turn..steps));
+        let movements = Turns::during(0..turn);
+        let matching = Turns::during(turn..steps);
         vec![
             group("text", &self.text, training, ema).taking(matching.clone(), steps),
             group("motion", &self.motion, training, ema).taking(matching, steps),
@@ -288,7 +297,9 @@ impl Gang for TrainEvaluator {
             words: words.meta(),
             origin: "trained".into(),
         };
-        let (seed, device, plain) = (cx.task().seed, cx.device().autodiff(), cx.device());
+        let seed = cx.task().seed;
+        let device = cx.device().autodiff();
+        let plain = cx.device();
         let purpose = stage.to_string();
         let draws = |what: &str| format!("{purpose}/init {what}");
         let fresh = |purpose: &str| Init::new(seed, purpose, Positions::Uniform, &device);
@@ -297,7 +308,8 @@ impl Gang for TrainEvaluator {
         let text = TextEncoder::new(&meta.config, &mut fresh(&draws("text")));
         let motion = MotionEncoder::new(&meta.config, &mut fresh(&draws("motion")));
         let encoder = start.take(encoder, "movement_encoder.")?;
-        let (text, motion) = (start.take(text, "text_encoder.")?, start.take(motion, "motion_encoder.")?);
+        let text = start.take(text, "text_encoder.")?;
+        let motion = start.take(motion, "motion_encoder.")?;
         start.finish(cx, &meta)?;
         let movements = Movements {
             encoder,

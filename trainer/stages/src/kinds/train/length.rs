@@ -60,7 +60,8 @@ impl Objective for Lengths {
         let batch = self.settings.training.batch;
         let range = self.order.slice(slice, batch.slices);
         let picks = self.order.batch(step, |_| 0)[range].to_vec();
-        let (mut text, mut frames) = (Vec::new(), Vec::new());
+        let mut text = Vec::new();
+        let mut frames = Vec::new();
         for pick in &picks {
             let entry = &self.dataset.entries[self.train[pick.example]];
             let mut draw = Stream::new(self.seed, &format!("{}/caption", self.purpose), pick.place, 0);
@@ -112,7 +113,8 @@ impl Gang for TrainLength {
             classes: LengthEstimator::CLASSES,
             unit: LengthEstimator::UNIT,
         };
-        let (seed, purpose) = (cx.task().seed, cx.task().name.to_string());
+        let seed = cx.task().seed;
+        let purpose = cx.task().name.to_string();
         let tracked = cx.device().autodiff();
         let mut init = Init::new(seed, &format!("{purpose}/init"), Positions::Uniform, &tracked);
         let network = WarmStart::begin(

@@ -122,7 +122,9 @@ impl VqObjective {
         if let Some(first) = &self.first {
             return Rc::clone(first);
         }
-        let (codes, dim, quantizers) = (self.settings.codes, self.settings.code_dim, self.settings.quantizers);
+        let codes = self.settings.codes;
+        let dim = self.settings.code_dim;
+        let quantizers = self.settings.quantizers;
         let count = self.spare().div_ceil(self.tokens());
         let picks = self.order.batch(0, |_| 0)[..count].to_vec();
         let encoded = self.network.encode(self.features(&picks), &mut Dropout::off());
@@ -161,7 +163,8 @@ impl VqObjective {
 
     /// A slice's statistics for the codebooks, in the order of [`Objective::sums`].
     fn statistics(&self, pass: &Pass, step: u64, first_row: usize) -> Vec<Vec<f32>> {
-        let (codes, dim) = (self.settings.codes, self.settings.code_dim);
+        let codes = self.settings.codes;
+        let dim = self.settings.code_dim;
         let places = self.spare_rows(step);
         let mut sums: Vec<Vec<f32>> = self.sums().iter().map(|plan| vec![0.0; plan.len]).collect();
         for (q, layer) in pass.layers.iter().enumerate() {
@@ -190,7 +193,8 @@ impl Objective for VqObjective {
     }
 
     fn buffers(&mut self) -> Vec<BufferPlan> {
-        let (codes, dim) = (self.settings.codes, self.settings.code_dim);
+        let codes = self.settings.codes;
+        let dim = self.settings.code_dim;
         let remembers = self.settings.resets == Resets::Remembering;
         let mut plans = Vec::new();
         for q in 0..self.settings.quantizers {
@@ -211,7 +215,9 @@ impl Objective for VqObjective {
     }
 
     fn sums(&self) -> Vec<SumPlan> {
-        let (codes, dim, spare) = (self.settings.codes, self.settings.code_dim, self.spare());
+        let codes = self.settings.codes;
+        let dim = self.settings.code_dim;
+        let spare = self.spare();
         let plans = (0..self.settings.quantizers).flat_map(|q| {
             [("rows", spare * dim), ("sums", codes * dim), ("counts", codes)]
                 .map(|(what, len)| SumPlan { name: of(what, q), len })
@@ -230,7 +236,8 @@ impl Objective for VqObjective {
         let books = if step == 0 { self.first_books() } else { Rc::new(self.books.clone()) };
         let range = self.order.slice(slice, batch.slices);
         let picks = self.order.batch(step, |_| 0)[range.clone()].to_vec();
-        let (tokens, dim) = (self.tokens(), self.settings.code_dim);
+        let tokens = self.tokens();
+        let dim = self.settings.code_dim;
         let features = self.features(&picks);
         let mut dropout = Dropout::new(self.settings.network.dropout, self.dropout_seed, step, slice as u64);
         let encoded = self.network.encode(features.clone(), &mut dropout);
@@ -244,7 +251,8 @@ impl Objective for VqObjective {
         let weights = FrameWeights::plain(&vec![frames; picks.len()], frames, &self.device);
         let positions = self.windows.dataset.skeleton().layout().positions;
         let part = |x: &Tensor<3>| x.clone().slice([0..picks.len(), 0..frames, positions.clone()]);
-        let (found, wanted) = (part(&decoded), part(&features));
+        let found = part(&decoded);
+        let wanted = part(&features);
         let loss = &self.settings.loss;
         let mut losses = Losses::new(batch.global);
         losses.add("feature", weights.compare(Pointwise::SmoothL1, decoded, features), loss.feature);
@@ -260,7 +268,8 @@ impl Objective for VqObjective {
     fn after(&mut self, after: &mut AfterStep<'_>) -> Result<(), StageError> {
         // The network is still the one of this step.
         let first = (after.step == 0).then(|| self.first_books());
-        let (codes, dim) = (self.settings.codes, self.settings.code_dim);
+        let codes = self.settings.codes;
+        let dim = self.settings.code_dim;
         let active = self.active(after.step);
         for q in 0..self.settings.quantizers {
             let take = |after: &AfterStep<'_>, what: &str| after.buffers.get(&of(what, q)).to_vec();
@@ -272,7 +281,8 @@ impl Objective for VqObjective {
                 state.start(&first[q]);
             }
             if q < active {
-                let (new_sums, new_counts) = (after.sum(&of("sums", q)), after.sum(&of("counts", q)));
+                let new_sums = after.sum(&of("sums", q));
+                let new_counts = after.sum(&of("counts", q));
                 let spare = after.sum(&of("rows", q));
                 let rows = candidates(spare, codes, dim, |len| noise(len, &mut after.stream("replacements", q as u64)));
                 if self.settings.resets == Resets::Remembering {
@@ -310,7 +320,8 @@ impl Gang for TrainTokenizer {
             std: dataset.std.clone(),
         };
         let tracked = cx.device().autodiff();
-        let (seed, purpose) = (windows.seed, windows.purpose.clone());
+        let seed = windows.seed;
+        let purpose = windows.purpose.clone();
         let mut init = Init::new(seed, &format!("{purpose}/init"), Positions::Uniform, &tracked);
         let mut start = WarmStart::find(cx, ArtifactKind::Tokenizer)?;
         let network = start.take(Tokenizer::new(&meta.config(), &mut init), "")?;

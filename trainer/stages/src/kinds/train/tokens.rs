@@ -108,7 +108,9 @@ impl Masked {
         tokens.resize(n, self.config.pad());
         let mut draw = self.data.stream("masks", pick);
         let share = draw.uniform() as f32;
-        let (order, replace, hide) = (uniforms(&mut draw, n), uniforms(&mut draw, n), uniforms(&mut draw, n));
+        let order = uniforms(&mut draw, n);
+        let replace = uniforms(&mut draw, n);
+        let hide = uniforms(&mut draw, n);
         let random: Vec<usize> = (0..n).map(|_| draw.below(self.config.codes)).collect();
         let draws = masked::Corruption { share, order: &order, replace: &replace, hide: &hide, random: &random };
         let example = masked::Example::new(&self.config, &tokens, len, &draws);
@@ -119,7 +121,10 @@ impl Masked {
         // The mean is over all masked tokens of the batch, which every slice counts itself.
         let asked = |pick: &Pick| self.example(*pick).2.asked.iter().filter(|asked| **asked).count();
         let count = all.iter().map(asked).sum::<usize>().max(1) as f32;
-        let (mut input, mut targets, mut weights, mut lengths) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+        let mut input = Vec::new();
+        let mut targets = Vec::new();
+        let mut weights = Vec::new();
+        let mut lengths = Vec::new();
         for pick in picks {
             let (tokens, len, example) = self.example(*pick);
             weights.extend(example.asked.iter().map(|asked| if *asked { 1.0 / count } else { 0.0 }));
@@ -132,7 +137,8 @@ impl Masked {
     }
 
     fn asked(&self, pick: Pick) -> Asked {
-        let (n, pad) = (self.settings.longest, self.config.residual_pad());
+        let n = self.settings.longest;
+        let pad = self.config.residual_pad();
         let uniform = self.data.stream("layer", pick).uniform() as f32;
         let layer = residual::trained_layer(uniform, self.config.quantizers);
         let padded = |q: usize| {
@@ -256,7 +262,8 @@ impl Inputs {
             text_dim: embeddings.meta.dim,
             fits: Parts::from([(Role::TOKENIZER, digest), (Role::TEXT, text.digest())]),
         };
-        let (seed, purpose) = (cx.task().seed, cx.task().name.to_string());
+        let seed = cx.task().seed;
+        let purpose = cx.task().name.to_string();
         let order = Order::new(seed, &purpose, train.len(), settings.training.batch.global, 1);
         let longest = settings.longest;
         let data = TokenData { tokens, embeddings, train, order, seed, purpose, longest };
@@ -282,7 +289,9 @@ impl Gang for TrainTokens {
     fn run(&self, cx: &mut dyn GangContext) -> Result<Outcome, StageError> {
         let Inputs { data, meta, mut parts } = Inputs::read(self, cx)?;
         let format = data.tokens.meta.format;
-        let (tracked, device, dropout_seed) = (cx.device().autodiff(), cx.device(), dropout_seed(cx));
+        let tracked = cx.device().autodiff();
+        let device = cx.device();
+        let dropout_seed = dropout_seed(cx);
         let mut init = Init::new(data.seed, &format!("{}/init", data.purpose), Positions::Uniform, &tracked);
         let mut start = WarmStart::find(cx, ArtifactKind::TokenGenerator)?;
         let mut objective: Box<dyn Objective> = match self.generator {

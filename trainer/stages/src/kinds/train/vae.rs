@@ -160,7 +160,8 @@ impl Gang for TrainVae {
             std: dataset.std.clone(),
             projection: None,
         };
-        let (seed, device) = (cx.task().seed, cx.device().autodiff());
+        let seed = cx.task().seed;
+        let device = cx.device().autodiff();
         let purpose = stage.to_string();
         let mut init = Init::new(seed, &format!("{purpose}/init"), self.network.positions, &device);
         let network = WarmStart::begin(cx, ArtifactKind::Vae, Vae::new(&meta.config(), &mut init), &meta)?;

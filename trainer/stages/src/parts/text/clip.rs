@@ -40,7 +40,8 @@ pub(super) fn open(published: Published, device: &Device) -> Result<Box<dyn Text
             "the manifest of the text encoder `clip` describes another kind of network".into(),
         ));
     };
-    let (width, positions) = (sizes.hidden_size, sizes.max_position_embeddings);
+    let width = sizes.hidden_size;
+    let positions = sizes.max_position_embeddings;
     let config: ClipTextConfig = published.sizes(sizes)?;
     let tower = published.filled(ClipText::new(&config, &mut Init::blank(device)), "")?;
     let (pooled, words) = published.captions.remembered(device);

@@ -52,7 +52,8 @@ pub fn open(manifest: &Manifest, blobs: &dyn Blobs, device: &Device) -> Result<B
     };
     let encoder = open(manifest, blobs, device)?;
     if encoder.dim() != meta.dim {
-        let (found, said) = (encoder.dim(), meta.dim);
+        let found = encoder.dim();
+        let said = meta.dim;
         return Err(StageError::Input(format!(
             "text encoder `{}` returns {found} numbers; its manifest declares {said}",
             meta.encoder
@@ -67,7 +68,8 @@ pub fn open(manifest: &Manifest, blobs: &dyn Blobs, device: &Device) -> Result<B
 /// # Errors
 /// If the widths differ; the message has both.
 pub fn expect_one_width(encoder: &dyn TextEncoder) -> Result<(), StageError> {
-    let (pooled, tokens) = (encoder.dim(), encoder.token_dim());
+    let pooled = encoder.dim();
+    let tokens = encoder.token_dim();
     if pooled == tokens {
         return Ok(());
     }

@@ -54,7 +54,8 @@ impl ReadAt for Pieces {
     }
 
     fn read_at(&self, offset: u64, out: &mut [u8]) -> Result<(), String> {
-        let (mut begin, mut filled) = (0, 0);
+        let mut begin = 0;
+        let mut filled = 0;
         for piece in &self.0 {
             let end = begin + piece.len() as u64;
             let at = offset + filled as u64;

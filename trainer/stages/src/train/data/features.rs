@@ -107,7 +107,9 @@ impl FeatureData {
         if train.is_empty() {
             return Err(no_clips());
         }
-        let (seed, stage, global) = (cx.task().seed, cx.task().name.clone(), training.batch.global);
+        let seed = cx.task().seed;
+        let stage = cx.task().name.clone();
+        let global = training.batch.global;
         let pool = if rules.whole { 1 } else { POOL };
         Ok(Self {
             std: dataset.biased_std(rules.bias),
@@ -185,7 +187,8 @@ impl FeatureData {
         let longest = *lengths.iter().max().expect("no empty slice");
         let frames = if self.rules.whole { self.rules.max_frames } else { longest };
         let width = self.std.len();
-        let (mut rows, mut noise) = (vec![0.0; picks.len() * frames * width], vec![0.0; picks.len() * frames * width]);
+        let mut rows = vec![0.0; picks.len() * frames * width];
+        let mut noise = vec![0.0; picks.len() * frames * width];
         let mut captions = CaptionRows { rows: Vec::new(), kept: Vec::new() };
         for (b, (pick, (start, len))) in picks.iter().zip(&cuts).enumerate() {
             let entry = &self.dataset.entries[self.train[pick.example]];

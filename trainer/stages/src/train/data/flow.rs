@@ -126,7 +126,8 @@ impl FlowData {
     pub(crate) fn slice(&mut self, step: u64, slice: usize) -> FlowSlice {
         let range = self.order.slice(slice, self.batch.slices);
         let picks = self.order.batch(step, |_| 0)[range].to_vec();
-        let (frames, width) = (self.frames, self.windows.dataset.mean.len());
+        let frames = self.frames;
+        let width = self.windows.dataset.mean.len();
         let mut rows = self.windows.rows(&picks);
         self.encoder.normalise(&mut rows);
         let stream =
@@ -134,7 +135,8 @@ impl FlowData {
         let windows = rows.chunks_exact(frames * width).zip(&picks);
         let codes: Vec<f32> =
             windows.flat_map(|(window, pick)| self.encoder.codes(window, &mut stream("latent", pick.place))).collect();
-        let (mut noise, mut uniforms) = (vec![0.0; rows.len()], Vec::with_capacity(picks.len()));
+        let mut noise = vec![0.0; rows.len()];
+        let mut uniforms = Vec::with_capacity(picks.len());
         for (pick, noise) in picks.iter().zip(noise.chunks_exact_mut(frames * width)) {
             let mut draw = stream("flow", pick.place);
             uniforms.push(draw.uniform() as f32);

@@ -129,8 +129,12 @@ impl LatentData {
         let range = self.order.borrow().slice(slice, self.slices);
         let picks: Vec<Pick> = self.picks(step)[range].to_vec();
         let latent = self.latents.meta.latent;
-        let (size, crops) = (latent.tokens * latent.dim, self.latents.meta.crops);
-        let (mut clean, mut text, mut lengths, mut rows) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+        let size = latent.tokens * latent.dim;
+        let crops = self.latents.meta.crops;
+        let mut clean = Vec::new();
+        let mut text = Vec::new();
+        let mut lengths = Vec::new();
+        let mut rows = Vec::new();
         for pick in &picks {
             let entry = self.train[pick.example];
             let mut draw = self.stream("example", *pick);
@@ -142,11 +146,13 @@ impl LatentData {
             let empty = draw.uniform() < drop;
             let mut noise = vec![0.0; size];
             draw.fill_normal(&mut noise);
-            let (mu, sigma) = (self.latents.mu.row(row), self.latents.sigma.row(row));
+            let mu = self.latents.mu.row(row);
+            let sigma = self.latents.sigma.row(row);
             clean.extend(mu.iter().zip(sigma).zip(&noise).map(|((mu, sigma), noise)| mu + sigma * noise));
             text.extend_from_slice(if empty { &self.embeddings.null } else { self.embeddings.captions.row(caption) });
         }
-        let (batch, width) = (picks.len(), self.embeddings.null.len());
+        let batch = picks.len();
+        let width = self.embeddings.null.len();
         let tensor = |values, shape: [usize; 3]| Tensor::from_data(TensorData::new(values, shape), &self.device);
         let null = self.embeddings.null.iter().copied().cycle().take(batch * width).collect();
         LatentSlice {

@@ -34,10 +34,12 @@ impl TokenData {
 
     /// Ids `[tokens, Q]` of the clip at a place, cut to the longest.
     pub(crate) fn ids(&self, pick: Pick) -> &[i64] {
-        let (q, mut draw) = (self.tokens.meta.quantizers, self.stream("clip", pick));
+        let q = self.tokens.meta.quantizers;
+        let mut draw = self.stream("clip", pick);
         let all = self.tokens.of(self.train[pick.example]);
         let len = all.len() / q;
-        let (mut start, mut kept) = (0, len);
+        let mut start = 0;
+        let mut kept = len;
         if len > self.longest {
             (start, kept) = (draw.below(len - self.longest + 1), self.longest);
         } else if len > 1 && draw.below(3) == 0 {

@@ -28,9 +28,13 @@ pub(super) fn gather(cx: &dyn AttemptContext, plan: &Plan<'_>, digests: &[Digest
         let (Units { units }, mut tensors) = shard?;
         let mut take =
             |name: &str, rank| Ok::<_, StageError>(to_f64(&tensors.take(name, rank, EMBEDDINGS_FILE)?.values));
-        let (text, made, real) = (take("text", 2)?, take("made", 2)?, take("real", 2)?);
-        let (many, skating) = (take("many", 2)?, take("skating", 1)?);
-        let (mut row, mut extra) = (0, 0);
+        let text = take("text", 2)?;
+        let made = take("made", 2)?;
+        let real = take("real", 2)?;
+        let many = take("many", 2)?;
+        let skating = take("skating", 1)?;
+        let mut row = 0;
+        let mut extra = 0;
         for unit in units {
             match unit.part {
                 Part::Entries => {
@@ -60,7 +64,10 @@ pub(super) fn measure(plan: &Plan<'_>, all: &Gathered, repeat: usize) -> BTreeMa
     let of = |parts: &BTreeMap<Unit, Vec<f64>>| -> Vec<f64> {
         parts.iter().filter(|(unit, _)| unit.repeat == repeat).flat_map(|(_, values)| values.iter().copied()).collect()
     };
-    let (text, made, real, skating) = (of(&all.text), of(&all.made), of(&all.real), of(&all.skating));
+    let text = of(&all.text);
+    let made = of(&all.made);
+    let real = of(&all.real);
+    let skating = of(&all.skating);
     let ranking = Ranking { pools: &plan.settings.pools, kept: plan.kept(), shuffled: plan.settings.shuffled };
     let mut metrics = plan.of.in_space(repeat, (&text, &made, &real), &ranking);
     let rows = plan.of.kept(repeat, plan.kept());

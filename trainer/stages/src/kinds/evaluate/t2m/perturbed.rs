@@ -58,7 +58,8 @@ pub(super) fn said_otherwise(caption: &str, probability: f64, stream: &mut Strea
         let lower = bare.to_lowercase();
         let Some(group) = GROUPS.iter().find(|group| group.contains(&lower.as_str())) else { return word.to_owned() };
         // Drawn for each such word, so that a higher probability replaces the same words and more.
-        let (share, which) = (stream.uniform(), stream.below(group.len() - 1));
+        let share = stream.uniform();
+        let which = stream.below(group.len() - 1);
         let others: Vec<&str> = group.iter().copied().filter(|other| *other != lower).collect();
         if share < probability { word.replacen(bare, others[which], 1) } else { word.to_owned() }
     };
