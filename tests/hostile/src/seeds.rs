@@ -2,7 +2,7 @@
 
 use std::io::{Cursor, Write as _};
 
-use mocap::rotations::Rig;
+use mocap::rig::Rig;
 use motion::{features, npy, synthetic};
 use protocol::Seed;
 use protocol::stage::DataSynthetic;

@@ -6,7 +6,7 @@ use std::sync::Once;
 use mocap::bvh::Bvh;
 use mocap::html::{Page, Panel, Section};
 use mocap::joint_map::JointMap;
-use mocap::rotations::Rig;
+use mocap::rig::Rig;
 use mocap::take::{Reading, Take, resample};
 use mocap::{Body, arrays, captions, glb, requests};
 use motion::text::Caption;

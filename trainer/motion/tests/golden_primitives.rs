@@ -34,7 +34,7 @@ impl Tensors<'_> {
 
 #[test]
 fn golden_primitives() {
-    for folder in shared::golden("primitives") {
+    for folder in fixtures::golden("primitives") {
         check_primitives(&folder);
     }
 }

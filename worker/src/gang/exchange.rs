@@ -8,12 +8,12 @@
 //! Drain requests precede the parts. All members OR them over the same messages, so that all stop after the same step.
 
 use std::ops::Range;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use bytemuck::cast_slice;
 use protocol::message::LossCause;
 
-use super::frame::{Frame, Head, Kind, MAX_PAYLOAD, PIECE, Payload};
+use super::frame::{Frame, Head, Kind, PIECE, Payload};
 use super::mesh::{Halt, Mesh};
 use super::tree::{self, Node};
 

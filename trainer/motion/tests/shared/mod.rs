@@ -6,7 +6,7 @@ use motion::DataPath;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-pub(crate) use fixtures::{data, golden};
+pub(crate) use fixtures::data;
 use motion::npy::{self, Array};
 
 /// Reads f32 or f64.
