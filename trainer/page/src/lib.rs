@@ -61,7 +61,7 @@ macro_rules! files {
 }
 
 /// Everything that lies in `static` but licences.
-static FILES: [(&str, &[u8]); 41] = files![
+static FILES: [(&str, &[u8]); 42] = files![
     "index.html",
     "icon.svg",
     "style.css",
@@ -77,6 +77,7 @@ static FILES: [(&str, &[u8]); 41] = files![
     "log.js",
     "rates.js",
     "viewer.js",
+    "character.js",
     "motions.js",
     "floor.js",
     "drawing.js",
@@ -101,7 +102,7 @@ static FILES: [(&str, &[u8]); 41] = files![
     "views/store.js",
     "views/login.js",
     "vendor/lit-html.js",
-    "vendor/uPlot.esm.js",
+    "vendor/uPlot.iife.min.js",
     "vendor/uPlot.min.css",
 ];
 
