@@ -16,6 +16,15 @@ use protocol::Digest;
 pub const CONTENT_POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self' blob:; \
      base-uri 'none'; form-action 'none'; frame-ancestors 'none'; require-trusted-types-for 'script'; trusted-types lit-html";
 
+/// The content policy of the document, whose scripts may also open a WebSocket to `stream`.
+#[must_use]
+pub fn content_policy(stream: Option<&str>) -> String {
+    match stream {
+        Some(stream) => CONTENT_POLICY.replace("connect-src 'self'", &format!("connect-src 'self' {stream}")),
+        None => CONTENT_POLICY.to_owned(),
+    }
+}
+
 /// A file of the page.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct File {
@@ -61,7 +70,7 @@ macro_rules! files {
 }
 
 /// Everything that lies in `static` but licences.
-static FILES: [(&str, &[u8]); 42] = files![
+static FILES: [(&str, &[u8]); 43] = files![
     "index.html",
     "icon.svg",
     "style.css",
@@ -81,6 +90,7 @@ static FILES: [(&str, &[u8]); 42] = files![
     "motions.js",
     "floor.js",
     "drawing.js",
+    "stream.js",
     "thumbnails.js",
     "features.js",
     "viewer.css",

@@ -13,7 +13,7 @@
 /** @typedef {[number, number, number]} Point */
 /** @typedef {{x: number, y: number, scale: number, depth: number}} Dot */
 /** What `characters` gives: see character.js. @typedef {import("./character.js").Character} Character */
-/** @typedef {{whole?: boolean, onTime?: (seconds: number) => void, characters?: () => Promise<{read: (bytes: ArrayBuffer) => Promise<Character>}>}} Options */
+/** `live`: frames are appended, and the newest one is shown. @typedef {{whole?: boolean, live?: boolean, onTime?: (seconds: number) => void, characters?: () => Promise<{read: (bytes: ArrayBuffer) => Promise<Character>}>}} Options */
 /** How figures are drawn; kept for the next figures of the page. @type {{body: string, character: Character | null}} */
 const chosen = { body: "capsules", character: null };
 
@@ -29,6 +29,8 @@ const COLOURS = ["panel", "grid", "trail", "shadow", "body", "left", "right", "t
 const [LEG, ARM] = [[0.095, 0.085, 0.055, 0.04, 0.03], [0.075, 0.055, 0.042, 0.034, 0.028]];
 /** Light across a capsule: place, and part of white or, below zero, of black. */
 const LIGHT = /** @type {[number, number][]} */ ([[0, 0], [0.3, 0.34], [0.6, 0], [1, -0.38]]);
+/** Frames of a stream that are kept. */
+const LIVE = 600;
 const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 4];
 
 const clamp = (/** @type {number} */ value, /** @type {number} */ low, /** @type {number} */ high) => Math.min(Math.max(value, low), high);
@@ -164,8 +166,9 @@ function prepare(motion, body, canvas) {
 
 /** @typedef {ReturnType<typeof prepare>} Panel */
 
-/** The controls, made as elements so that no text becomes markup. @param {Element} bar @param {boolean} several @param {boolean} ownCharacters */
-function controls(bar, several, ownCharacters) {
+/** The controls, made as elements so that no text becomes markup. @param {Element} bar @param {boolean} several @param {Options} options */
+function controls(bar, several, options) {
+  const ownCharacters = options.characters !== undefined;
   /** @template {keyof HTMLElementTagNameMap} K @param {K} tag @param {string} name @param {string} [text] @param {Record<string, string>} [more] @returns {HTMLElementTagNameMap[K]} */
   const make = (tag, name, text = "", more = {}) => {
     const element = document.createElement(tag);
@@ -199,7 +202,8 @@ function controls(bar, several, ownCharacters) {
   character.append(file);
   const wrong = make("output", "wrong", "", { role: "alert", hidden: "" });
   const own = ownCharacters ? [character, wrong] : [];
-  bar.replaceChildren(play, time, clock, from, to, all, labelled("Speed", speed), labelled("Follow", follow), ...(several ? [labelled("Over each other", over)] : []), labelled("Body", body), ...own, reset);
+  const overTime = options.live ? [] : [play, time, clock, from, to, all, labelled("Speed", speed)];
+  bar.replaceChildren(...overTime, labelled("Follow", follow), ...(several ? [labelled("Over each other", over)] : []), labelled("Body", body), ...own, reset);
   return { play, time, clock, speed, follow, over, from, to, all, body, file, wrong, reset };
 }
 
@@ -215,10 +219,15 @@ export function mount(root, motions, options = {}) {
   const fastest = Math.max(...panels.map((panel) => panel.fps));
   const duration = Math.max(...panels.map((panel) => (panel.frames - 1) / panel.fps));
   const bar = root.querySelector(".viewer-bar") ?? root.appendChild(document.createElement("div"));
-  const ui = controls(bar, panels.length > 1, options.characters !== undefined);
+  const ui = controls(bar, panels.length > 1, options);
   const view = { ...START };
   let [time, playing, speed, last, asked] = [0, false, 1, 0, false];
   let [begin, end] = [0, duration];
+  if (options.live) for (const panel of panels) {
+    panel.feet = [];
+    panel.strip.remove();
+    panel.measures.remove();
+  }
   /** @type {Record<string, string>} */
   let colours = {};
 
@@ -628,6 +637,28 @@ export function mount(root, motions, options = {}) {
     duration,
     goTo,
     play: setPlaying,
+    /** Adds a frame to a stream. @param {number[][]} points metres */
+    append(points) {
+      const panel = panels[0];
+      const [x = 0, , z = 0] = points[0] ?? [];
+      if (!panel) return;
+      if (panel.joints.length < LIVE * panel.width) {
+        const room = new Float32Array(LIVE * panel.width);
+        room.set(panel.joints);
+        panel.joints = room;
+      }
+      if (panel.frames === LIVE) {
+        panel.joints.copyWithin(0, (LIVE / 2) * panel.width);
+        panel.course.splice(0, LIVE / 2);
+        panel.frames = LIVE / 2;
+      }
+      panel.joints.set(points.flat(), panel.frames * panel.width);
+      const [x0, z0] = panel.course[panel.frames - 1] ?? [x, z];
+      panel.course.push([x0 + 0.15 * (x - x0), z0 + 0.15 * (z - z0)]);
+      panel.frames += 1;
+      time = (panel.frames - 1) / panel.fps;
+      update();
+    },
     /** Ends it; the figures stay as they are. */
     close() {
       ended.abort();
