@@ -34,7 +34,7 @@ use super::events::EventsQuery;
 use super::extract::Query;
 use super::failure::Failure;
 use super::openapi::document;
-use super::queries::{HistoryCall, LogQuery, PointQuery, RunsQuery, Submitted};
+use super::queries::{HistoryCall, LogQuery, PointQuery, RunsQuery, Storage, Submitted};
 use super::records::StageMetrics;
 use super::route::Route;
 use super::session_calls::Who;
@@ -129,6 +129,8 @@ fn table() -> Vec<Entry> {
             described::<Query<HistoryCall>, Nothing, Json<Vec<HistoryRow>>>("Lists events, or waits for them")),
         entry("GET",  "/v1/events",                &[Read],         CALL,                     SHORT, events::events,
             described::<Query<EventsQuery>, Nothing, EventStream>("Streams events as they come").with(RESUME)),
+        entry("GET",  "/v1/storage",               &[Admin],        CALL,                     SHORT, queries::storage,
+            described::<Nothing, Nothing, Json<Storage>>("Shows the store's bytes by kind, and checks of its folder")),
         entry("GET",  "/v1/runs",                  &[Read],         CALL,                     SHORT, queries::runs,
             described::<Query<RunsQuery>, Nothing, Json<Listing<RunSummary>>>("Lists runs in short")),
         entry("GET",  "/v1/runs/{run}",            &[Read],         CALL,                     SHORT, queries::run,
