@@ -7,6 +7,7 @@ import re
 import secrets
 import shutil
 import signal
+import socket
 import subprocess
 import time
 from collections.abc import Iterator
@@ -63,13 +64,18 @@ class World:
         tokens = self.folder / "tokens"
         tokens.touch(mode=0o600)
         tokens.write_text(f"maker read,submit,worker,promote,admin {self.token}\nlooker read {self.reader}\n")
+        (self.folder / "viewers").touch(mode=0o600)
+        (self.folder / "viewers").write_text(f"viewer read {secrets.token_hex(32)}\n")
+        with socket.create_server(("127.0.0.1", 0)) as free:
+            self.stream_at = f"127.0.0.1:{free.getsockname()[1]}"
         self.serve("127.0.0.1:0")
         self.server = stride.connect(self.url, token=self.token)
 
     def serve(self, bind: str) -> None:
         """Starts a server and waits for it to listen."""
         log = self.folder / "serve.log"
-        self.start("serve", ["serve", "--store", str(self.folder / "store"), "--bind", bind, "--token-file", "tokens"])
+        stream = ["--stream", f"ws://{self.stream_at}", "--stream-token-file", "viewers"]
+        self.start("serve", ["serve", "--store", str(self.folder / "store"), "--bind", bind, "--token-file", "tokens", *stream])
         until = time.monotonic() + 120
         while not (found := re.search(r"http://127\.0\.0\.1:\d+", log.read_text())):
             assert time.monotonic() < until and self.processes["serve"].poll() is None, log.read_text()
@@ -86,6 +92,15 @@ class World:
 
     def join(self, name: str) -> None:
         self.start(name, ["worker", "join", self.url, "--name", name, "--token", self.token])
+
+    def stream(self, model: str) -> None:
+        """Starts the stream that the page offers, and waits for it to listen."""
+        listens = ["--listen", self.stream_at, "--listen-token-file", "viewers", "--streams", "2"]
+        self.start("stream", ["generate", "--stream", "--model", model, "--server", self.url, "--token", self.token, *listens])
+        until = time.monotonic() + 120
+        while "/v1/stream" not in (said := (self.folder / "stream.log").read_text()):
+            assert time.monotonic() < until and self.processes["stream"].poll() is None, said
+            time.sleep(0.1)
 
     def kill(self, name: str) -> None:
         self.processes[name].send_signal(signal.SIGKILL)

@@ -7,3 +7,4 @@ mod files;
 pub(crate) mod http;
 mod in_browser;
 mod sessions;
+mod tickets;
