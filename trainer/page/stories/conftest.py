@@ -261,12 +261,23 @@ def from_folder(route: Route) -> None:
         route.continue_()
 
 
+def document_from_folder(route: Route) -> None:
+    """Answers with the document of STRIDE_PAGE, which names the files' folder of the server's build."""
+    if route.request.resource_type != "document":
+        return route.fallback()
+    answer = route.fetch()
+    folder = re.search(r"/page/([0-9a-f]+)/", answer.text())
+    text = (Path(os.environ["STRIDE_PAGE"]) / "index.html").read_text()
+    route.fulfill(response=answer, body=text.replace("FOLDER", folder.group(1) if folder else "FOLDER"))
+
+
 def enter(chromium: Browser, world: World, way: Way, token: str | None = None) -> BrowserContext:
     """A browser that is signed in."""
     scheme: Any = "dark" if way.dark else "light"
     context = chromium.new_context(viewport=way.size, has_touch=way.touch, is_mobile=way.touch, color_scheme=scheme)
     context.set_default_timeout(PATIENCE_S * 1000)
     if "STRIDE_PAGE" in os.environ:
+        context.route("**/*", document_from_folder)
         context.route("**/page/**", from_folder)
     page = context.new_page()
     page.goto(world.url)
