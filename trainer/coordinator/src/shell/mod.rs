@@ -23,6 +23,7 @@ mod events;
 mod extract;
 mod failure;
 mod launchers;
+mod lines;
 mod listener;
 mod meters;
 mod openapi;

@@ -187,7 +187,9 @@ pub(crate) async fn workers(
     State(actor_handle): State<Arc<ActorHandle>>,
     Extension(caller): Extension<Arc<Caller>>,
 ) -> Json<Vec<WorkerView>> {
-    Json(actor_handle.records_for(caller.sees()).workers())
+    let mut workers = actor_handle.records_for(caller.sees()).workers();
+    actor_handle.lines.mark(&mut workers, actor_handle.now());
+    Json(workers)
 }
 
 /// A permit for a client's call that waits for a decision.
