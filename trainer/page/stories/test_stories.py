@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import statistics
 import time
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -92,6 +93,32 @@ def test_a_sweep_names_its_winner(hand: Hand) -> None:
     expect(hand.page.locator(".winner")).to_contain_text("best")
     hand.within(presses=1)
     hand.keep("sweep")
+
+
+def test_a_gate_that_is_not_met_wants_a_person(hand: Hand) -> None:
+    name = f"gated-{hand.way}"
+    ends = model("gated", "1e-3").replace("promote: {to: staging}", "promote: {to: staging, require: [latent_fid < 0]}")
+    if name not in hand.world.runs:
+        hand.world.submit(name, pipeline("gated", ends=ends)).wait()
+    hand.open("/")
+    card = hand.page.locator(".want.bad", has_text=hand.world.runs[name].name)
+    expect(card).to_contain_text("cannot be promoted to")
+    expect(card).to_contain_text("move the alias by hand")
+    hand.within(presses=0)
+    hand.keep("gate")
+
+
+def test_an_empty_store_says_how_to_begin(hand: Hand, chromium: Browser, tmp_path: Path) -> None:
+    empty = World(tmp_path)
+    try:
+        context = enter(chromium, empty, hand.way)
+        page = context.new_page()
+        page.goto(empty.url)
+        for command in ("trainer submit configs/quickstart.yaml --server", "trainer worker join"):
+            expect(page.locator(".empty .command", has_text=command)).to_be_visible()
+        context.close()
+    finally:
+        empty.stop()
 
 
 @pytest.fixture(scope="module")
