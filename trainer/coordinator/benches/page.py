@@ -145,7 +145,7 @@ def watched(stride: Stride) -> bool:
 
 
 def main() -> None:
-    print(f"{cpu()}, {time.strftime('%Y-%m-%d')}, load {os.getloadavg()[0]:.1f}, {os.environ['STRIDE_TRAINER']}")
+    print(f"{cpu()}, {time.strftime('%Y-%m-%d')}, load {os.getloadavg()[0]:.1f}")
     with tempfile.TemporaryDirectory() as name, sync_playwright() as playwright:
         stride = Stride(Path(name))
         program = os.environ.get("STRIDE_BROWSER") or shutil.which("chromium")

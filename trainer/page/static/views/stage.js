@@ -3,7 +3,7 @@
 import { get, runPath } from "../api.js";
 import { OTHERWISE, whatToDo } from "../advice.js";
 import { Chart, curves, inOrder, inWords, series } from "../chart.js";
-import { count, date, duration, grouped, number, plain, short, time } from "../format.js";
+import { count, date, duration, grouped, number, plain, rate, short, time } from "../format.js";
 import { attemptsOf, History } from "../history.js";
 import { Log } from "../log.js";
 import { badge, bar, command, fact, firstLine, isOver, joinCommand, left, pace, prose, share } from "../parts.js";
@@ -136,6 +136,7 @@ export function stage(context, name, stageName) {
         <dl class="facts">
           ${fact("Progress", it.progress.total > 0 ? pace(it, it.state === "running" ? perSecond : undefined) : "")}
           ${fact("Left", it.state === "running" ? left(it, perSecond) : "")}
+          ${fact("Speed", it.state === "ran" && it.wall_s > 0 && it.progress.total > 1 ? rate(it.progress.total / it.wall_s, it.progress.unit) : "")}
           ${fact("Time", it.wall_s > 0 ? duration(it.wall_s) : "")}
           ${fact("Why", because)}
           ${fact("Attempt", it.attempt > 0 ? String(it.attempt) : "")}
