@@ -79,7 +79,7 @@ pub(crate) async fn ticket(Extension(gate): Extension<Arc<Gate>>, headers: Heade
             .hint("start it with `--stream`; programs show a token to `trainer generate --listen` themselves"));
     };
     let origin = headers.get(header::ORIGIN).and_then(|origin| origin.to_str().ok());
-    let origin = origin.ok_or_else(|| Failure::invalid("a ticket is for a page, which sends `Origin`"))?;
+    let origin = origin.ok_or_else(|| Failure::invalid("a ticket is for a page, which sends `Origin`".to_owned()))?;
     let until_ms = wall_clock().0.saturating_add(LASTS_MS);
     let nonce = Token::random().secret()[..32].to_owned();
     let proof = secrets(offer.token.digest()).of_ticket(origin, until_ms, &nonce);
