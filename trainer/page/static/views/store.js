@@ -56,14 +56,14 @@ export function store(context) {
     <td class="num">${entry.status}${(entry.count ?? 1) > 1 ? html` <span class="dim">× ${grouped(entry.count ?? 1)}</span>` : nothing}</td><td class="wide dim">${entry.from}</td></tr>`;
 
   function kinds() {
-    const all = [...(sizes?.kinds ?? []), { kind: "database", count: 1, bytes: sizes?.database_bytes ?? 0 }];
+    const all = [...(sizes?.kinds ?? []), { kind: "database", count: 1, bytes: sizes?.database_bytes ?? 0 }].sort((a, b) => b.bytes - a.bytes);
     const most = Math.max(1, ...all.map(({ bytes }) => bytes));
     return html`<section aria-labelledby="kinds"><h2 id="kinds">Bytes by kind</h2><div class="card table" tabindex="0" role="group" aria-label="Bytes by kind"><table><caption class="unseen">Artifacts of stages by kind, and the database</caption><thead><tr><th scope="col">Kind</th><th scope="col" class="num">Number</th><th scope="col" class="num">Bytes</th><th scope="col" class="wide"><span class="unseen">Part of the largest</span></th></tr></thead>
       <tbody>${all.map(({ kind, count: many, bytes }) => html`<tr><th scope="row">${kind}</th><td class="num">${grouped(many)}</td><td class="num">${size(bytes)}</td><td class="wide reach">${bar(bytes / most, `${kind}, part of the largest`)}</td></tr>`)}</tbody></table></div></section>`;
   }
 
   /** What the doctor finds. */
-  const findings = () => html`<ul class="gates">${(sizes?.findings ?? []).map(({ state, what, found, hint }) => html`<li class=${{ ok: "good", warn: "", fail: "bad" }[state]}><span aria-hidden="true">${{ ok: "●", warn: "◌", fail: "○" }[state]}</span> <b>${what}</b> <span dir="auto">${prose(found)}</span>${hint ? html` <span class="dim">${prose(hint)}</span>` : nothing}</li>`)}</ul>`;
+  const findings = () => html`<ul class="gates">${(sizes?.findings ?? []).map(({ state, what, found, hint }) => html`<li class=${{ ok: "good", warn: "", fail: "bad" }[state]}><span aria-hidden="true">${{ ok: "●", warn: "◌", fail: "○" }[state]}</span> <b>${what}</b> <span dir="auto">${prose(found)}</span>${hint ? html`<span class="dim">; ${prose(hint)}</span>` : nothing}</li>`)}</ul>`;
 
   function render() {
     const who = currentWho();
