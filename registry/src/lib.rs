@@ -15,6 +15,7 @@ pub mod catalog;
 pub mod cli;
 mod clock;
 mod curve;
+pub mod doctor;
 mod error;
 pub mod failpoints;
 mod folder;
@@ -43,7 +44,7 @@ mod write;
 pub use blob::BlobStore;
 pub use blob::place::Place;
 pub use catalog::{
-    CheckpointRow, EndedRow, HistoryQuery, HistoryRow, LineageNode, LogRow, Recovery, RunListQuery, RunOrder, RunPage,
+    CheckpointRow, EndedRow, HistoryQuery, HistoryRow, KindSize, LineageNode, LogRow, Recovery, RunListQuery, RunOrder, RunPage,
     RunRow, StageResultRow, Usage,
 };
 pub use curve::{Axis, Buckets, Curve, Page, Point, Window};

@@ -13,7 +13,7 @@ use protocol::{Alias, Digest, Group, ModelName, RunId, StageName, TaskId};
 
 use crate::QueryError;
 use crate::catalog::{
-    CheckpointRow, EndedRow, HistoryQuery, HistoryRow, LineageNode, LogRow, Needs, Records, Recovery, RunListQuery,
+    CheckpointRow, EndedRow, HistoryQuery, HistoryRow, KindSize, LineageNode, LogRow, Needs, Records, Recovery, RunListQuery,
     RunPage, RunRow, StageResultRow, Usage,
 };
 use crate::curve::{Buckets, Curve, Page, Window};
@@ -135,6 +135,11 @@ impl Records for ScopedRecords {
 
     async fn usage(&self, run: &RunId) -> Result<Usage> {
         if self.sees_run(run).await? { self.all.usage(run).await } else { Ok(Usage::default()) }
+    }
+
+    async fn kind_sizes(&self) -> Result<Vec<KindSize>> {
+        // Sizes of the whole store are not for one group.
+        Ok(Vec::new())
     }
 
     async fn points(

@@ -31,7 +31,7 @@ use protocol::stage::Keep;
 use protocol::{Alias, Digest, Group, ModelName, RunId, StageName, TaskId};
 
 pub use rows::{
-    CheckpointRow, EndedRow, HistoryQuery, HistoryRow, LineageNode, LogRow, Needs, Recovery, Root, RunListQuery,
+    CheckpointRow, EndedRow, HistoryQuery, HistoryRow, KindSize, LineageNode, LogRow, Needs, Recovery, Root, RunListQuery,
     RunOrder, RunPage, RunRow, StageResultRow, Usage,
 };
 
@@ -113,6 +113,9 @@ pub trait Records: Debug + Send + Sync {
 
     /// Returns the amounts that count against a run's limits.
     async fn usage(&self, run: &RunId) -> Result<Usage>;
+
+    /// Returns the sizes of all artifacts by kind, largest first.
+    async fn kind_sizes(&self) -> Result<Vec<KindSize>>;
 
     /// The points of a stage's curves by key; of all keys, or of `keys`.
     async fn points(

@@ -157,6 +157,17 @@ pub struct Usage {
     pub values: u64,
 }
 
+/// The artifacts of one kind that the store knows.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, JsonSchema)]
+pub struct KindSize {
+    /// The kind, such as `model`.
+    pub kind: String,
+    /// Number of artifacts.
+    pub count: u64,
+    /// Their bytes; files that several have count for each.
+    pub bytes: u64,
+}
+
 /// A stored log line.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct LogRow {

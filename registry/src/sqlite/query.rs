@@ -17,7 +17,7 @@ use super::statement::json;
 use super::{curves, history, logs, models, owners, retention, run_list, usage};
 use crate::QueryError;
 use crate::catalog::{
-    CheckpointRow, EndedRow, HistoryQuery, HistoryRow, LineageNode, LogRow, Needs, Records, Recovery, RunListQuery,
+    CheckpointRow, EndedRow, HistoryQuery, HistoryRow, KindSize, LineageNode, LogRow, Needs, Records, Recovery, RunListQuery,
     RunPage, RunRow, StageResultRow, Usage,
 };
 use crate::curve::{Buckets, Curve, Page, Window};
@@ -180,6 +180,10 @@ impl Records for SqliteRecords {
 
     async fn usage(&self, run: &RunId) -> Result<Usage> {
         usage::read(&mut *self.connection().await?, run).await
+    }
+
+    async fn kind_sizes(&self) -> Result<Vec<KindSize>> {
+        usage::kind_sizes(&mut *self.connection().await?).await
     }
 
     async fn timeline(&self, asked: &HistoryQuery) -> Result<Vec<HistoryRow>> {

@@ -110,6 +110,11 @@ impl Tokens {
         self.callers.get(&digest)
     }
 
+    /// Digests of all tokens.
+    pub fn digests(&self) -> impl Iterator<Item = Digest> {
+        self.callers.keys().copied()
+    }
+
     /// Restricts `alias` to tokens of these names and of `admin`.
     pub fn protect(&mut self, alias: Alias, names: impl IntoIterator<Item = String>) {
         self.protected.entry(alias).or_default().extend(names);

@@ -16,6 +16,15 @@ use protocol::Digest;
 pub const CONTENT_POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self' blob:; \
      base-uri 'none'; form-action 'none'; frame-ancestors 'none'; require-trusted-types-for 'script'; trusted-types lit-html";
 
+/// The content policy of the document, whose scripts may also open a WebSocket to `stream`.
+#[must_use]
+pub fn content_policy(stream: Option<&str>) -> String {
+    match stream {
+        Some(stream) => CONTENT_POLICY.replace("connect-src 'self'", &format!("connect-src 'self' {stream}")),
+        None => CONTENT_POLICY.to_owned(),
+    }
+}
+
 /// A file of the page.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct File {
@@ -61,7 +70,7 @@ macro_rules! files {
 }
 
 /// Everything that lies in `static` but licences.
-static FILES: [(&str, &[u8]); 41] = files![
+static FILES: [(&str, &[u8]); 43] = files![
     "index.html",
     "icon.svg",
     "style.css",
@@ -77,9 +86,11 @@ static FILES: [(&str, &[u8]); 41] = files![
     "log.js",
     "rates.js",
     "viewer.js",
+    "character.js",
     "motions.js",
     "floor.js",
     "drawing.js",
+    "stream.js",
     "thumbnails.js",
     "features.js",
     "viewer.css",
@@ -101,7 +112,7 @@ static FILES: [(&str, &[u8]); 41] = files![
     "views/store.js",
     "views/login.js",
     "vendor/lit-html.js",
-    "vendor/uPlot.esm.js",
+    "vendor/uPlot.iife.min.js",
     "vendor/uPlot.min.css",
 ];
 

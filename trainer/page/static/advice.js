@@ -5,6 +5,7 @@ const ADVICE = [
   [/out of memory|memory (was|is) exhausted|stage-memory|beyond its memory/i, "Give the stage fewer examples at once (`batch.global`, or more `slices`), or its worker more memory (`--stage-memory`). Resume goes on from the newest checkpoint."],
   [/not finite|diverged|NaN/i, "Look at the loss and the gradient's norm before the step. A lower `lr`, a longer `warmup` or a stricter clip mostly helps; that is a changed stage, so run the pipeline again with `--set`."],
   [/no space|space left|disk is full|not writable|read-only|store is full/i, "Free some space on the store's disk, then resume: it goes on from the newest checkpoint. The Store view says what can go."],
+  [/cannot be promoted to/i, "The version is not good enough for the alias by the gates of its pipeline. Look at it in Models: train longer, or move the alias by hand with other gates and a reason."],
   [/differ(s)? from what|another copy|digest of|changed since/i, "The files differ from those that the run was submitted with. Bring them back, or submit the pipeline again for the new ones."],
   [/data.root/i, "The worker reads below its data roots alone: start it with `--data-root DIR` for the folder that the pipeline names, then resume."],
   [/no such file|does not exist|cannot (open|read)|not found/i, "Look whether the path is there on the worker's machine, and readable for it. Then resume."],

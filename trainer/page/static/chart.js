@@ -5,7 +5,6 @@
 
 import { get } from "./api.js";
 import { date, grouped, number, plain } from "./format.js";
-import uPlot from "./vendor/uPlot.esm.js";
 
 /** Points that a chart asks for: about two a pixel. */
 const POINTS = 800;

@@ -85,6 +85,12 @@ export class Clips {
     this.index = read;
   }
 
+  /** What was left out, and why; empty if nothing is known about it. @param {AbortSignal} [signal] */
+  async report(signal) {
+    const file = this.files["report.txt"];
+    return file && file.bytes <= MOST ? new TextDecoder().decode(await blob(file.digest, signal)) : "";
+  }
+
   /** The frames of an entry. @param {Entry} entry @returns {Promise<import("./viewer.js").Motions>} */
   async motions(entry) {
     const format = FORMATS[this.index?.format ?? ""];

@@ -32,6 +32,19 @@ export class History {
   }
 }
 
+/** Attempts at a stage's tasks, oldest first: who had it, from when until when, and how it ended. @param {HistoryRow[]} rows Oldest first. @param {string} stage */
+export function attemptsOf(rows, stage) {
+  /** @type {{number: number | undefined, task: string, worker: string, from: number, to: number | null, end: string}[]} */
+  const attempts = [];
+  for (const row of rows) {
+    if (row.stage !== stage) continue;
+    const open = attempts.filter((attempt) => attempt.to === null && (!row.task || attempt.task === row.task) && (!row.worker || attempt.worker === row.worker));
+    if (row.kind === "granted" || row.kind === "adopted") attempts.push({ number: row.attempt, task: row.task ?? "", worker: row.worker ?? "", from: row.at_ms, to: null, end: "" });
+    else if (["released", "retried", "finished", "failed"].includes(row.kind)) for (const attempt of open) Object.assign(attempt, { to: row.at_ms, end: inWords(row) });
+  }
+  return attempts;
+}
+
 /** @type {Record<string, string>} */
 const WORDS = {
   submitted: "submitted", paused: "paused", resumed: "resumed", joined: "joined", returned: "came back", lost: "was lost", left: "left",

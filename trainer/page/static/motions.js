@@ -48,7 +48,7 @@ export class Figures {
     bar.setAttribute("role", "group");
     bar.setAttribute("aria-label", "Playback");
     this.element.replaceChildren(row, bar);
-    this.shown = mount(this.element, motions);
+    this.shown = mount(this.element, motions, { characters: () => import("./character.js") });
     this.shown.play(!matchMedia("(prefers-reduced-motion: reduce)").matches);
   }
 }

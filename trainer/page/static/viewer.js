@@ -12,7 +12,10 @@
 /** @typedef {{bodies: Body[], motions: Motion[]}} Motions */
 /** @typedef {[number, number, number]} Point */
 /** @typedef {{x: number, y: number, scale: number, depth: number}} Dot */
-/** @typedef {{whole?: boolean, onTime?: (seconds: number) => void}} Options */
+/** What `characters` gives: see character.js. @typedef {import("./character.js").Character} Character */
+/** `live`: frames are appended, and the newest one is shown. @typedef {{whole?: boolean, live?: boolean, onTime?: (seconds: number) => void, characters?: () => Promise<{read: (bytes: ArrayBuffer) => Promise<Character>}>}} Options */
+/** How figures are drawn; kept for the next figures of the page. @type {{body: string, character: Character | null}} */
+const chosen = { body: "capsules", character: null };
 
 const START = { yaw: -0.65, pitch: 0.26, zoom: 1 };
 /** Seconds that the end is shown before the motion begins again. */
@@ -22,9 +25,21 @@ const [DOWN, SLIDES] = [0.05, 0.5];
 /** Distances from a waypoint in metres that are near, and that are far. */
 const [NEAR, FAR] = [0.05, 0.2];
 const COLOURS = ["panel", "grid", "trail", "shadow", "body", "left", "right", "told", "stands", "slides"];
+/** Radii in metres along a leg and an arm, from the trunk. */
+const [LEG, ARM] = [[0.095, 0.085, 0.055, 0.04, 0.03], [0.075, 0.055, 0.042, 0.034, 0.028]];
+/** Light across a capsule: place, and part of white or, below zero, of black. */
+const LIGHT = /** @type {[number, number][]} */ ([[0, 0], [0.3, 0.34], [0.6, 0], [1, -0.38]]);
+/** Frames of a stream that are kept. */
+const LIVE = 600;
 const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 4];
 
 const clamp = (/** @type {number} */ value, /** @type {number} */ low, /** @type {number} */ high) => Math.min(Math.max(value, low), high);
+
+/** A colour `#rrggbb` nearer to white, or below zero to black. @param {string} colour @param {number} part */
+function lit(colour, part) {
+  const mixed = [1, 3, 5].map((at) => Math.round(parseInt(colour.slice(at, at + 2), 16) * (1 - Math.abs(part)) + (part > 0 ? 255 * part : 0)));
+  return mixed.some(Number.isNaN) ? colour : `rgb(${mixed.join()})`;
+}
 
 /** Metres, `[frames, joints, 3]`. @param {Motion} motion */
 export function decode(motion) {
@@ -49,6 +64,24 @@ function feetOf(body, joints, frames) {
   });
 }
 
+/** Radii of each bone's ends in metres, for a height of 1.7 m: legs and arms grow thinner outwards. @param {Body} body @param {Float32Array} joints @param {number} frames @returns {[number, number][]} */
+function radiiOf(body, joints, frames) {
+  const dense = body.parents.length > 30 ? 0.7 : 1;
+  const legs = new Set();
+  for (const foot of feetOf(body, joints, frames)) for (let at = foot; body.sides[at] !== "m" && !legs.has(at); at = body.parents[at] ?? 0) legs.add(at);
+  const deep = (/** @type {number} */ joint) => {
+    let count = 0;
+    for (let at = joint; body.sides[at] !== "m" && body.parents[at] !== at; at = body.parents[at] ?? 0) count += 1;
+    return count;
+  };
+  return body.parents.map((_, joint) => {
+    if (body.sides[joint] === "m") return joint === body.head ? [0.05 * dense, 0.05 * dense] : [0.115 * dense, 0.105 * dense];
+    const thick = (/** @type {number} */ order) => dense * ((legs.has(joint) ? LEG : ARM)[Math.min(LEG.length - 1, order)] ?? 0);
+    // The bone that leaves the trunk is as thick as the trunk's edge.
+    return [thick(Math.max(0, deep(joint) - 1)), thick(deep(joint))];
+  });
+}
+
 /** For each foot and step: 0 in the air, 1 on the ground, 2 sliding over it. @param {Body} body @param {Float32Array} joints @param {number} frames @param {number} fps @returns {Uint8Array[]} */
 export function contacts(body, joints, frames, fps) {
   const count = body.parents.length;
@@ -63,6 +96,9 @@ export function contacts(body, joints, frames, fps) {
     });
   });
 }
+
+/** Places above the last bone of a neck, in parts of it. @param {Point[]} points @param {number} from @param {number} to */
+const headOf = (points, from, to) => (/** @type {number} */ part) => /** @type {Point} */ ((points[to] ?? [0, 0, 0]).map((at, k) => at + part * (at - (points[from]?.[k] ?? 0))));
 
 /** A motion with all that drawing it needs. @param {Motion} motion @param {Body} body @param {HTMLCanvasElement} canvas */
 function prepare(motion, body, canvas) {
@@ -118,6 +154,7 @@ function prepare(motion, body, canvas) {
   canvas.after(strip, measures);
   return {
     canvas, strip, measures, body, joints, count, width, course, feet, sliding, misses, fps, frames, waypoints,
+    radii: radiiOf(body, joints, frames),
     bones: body.parents.map((parent, joint) => /** @type {[number, number]} */ ([parent, joint])).filter(([parent, joint]) => parent !== joint),
     height: clamp(top - Math.min(0, bottom), 1.2, 2.4),
     wide: clamp(wide, 0.3, 3),
@@ -129,8 +166,9 @@ function prepare(motion, body, canvas) {
 
 /** @typedef {ReturnType<typeof prepare>} Panel */
 
-/** The controls, made as elements so that no text becomes markup. @param {Element} bar @param {boolean} several */
-function controls(bar, several) {
+/** The controls, made as elements so that no text becomes markup. @param {Element} bar @param {boolean} several @param {Options} options */
+function controls(bar, several, options) {
+  const ownCharacters = options.characters !== undefined;
   /** @template {keyof HTMLElementTagNameMap} K @param {K} tag @param {string} name @param {string} [text] @param {Record<string, string>} [more] @returns {HTMLElementTagNameMap[K]} */
   const make = (tag, name, text = "", more = {}) => {
     const element = document.createElement(tag);
@@ -156,8 +194,17 @@ function controls(bar, several) {
   const to = make("button", "to", "to here", { type: "button", "aria-keyshortcuts": "o" });
   const all = make("button", "all", "All of it", { type: "button", "aria-keyshortcuts": "u", hidden: "" });
   const reset = make("button", "reset", "Reset view", { type: "button", "aria-keyshortcuts": "0" });
-  bar.replaceChildren(play, time, clock, from, to, all, labelled("Speed", speed), labelled("Follow", follow), ...(several ? [labelled("Over each other", over)] : []), reset);
-  return { play, time, clock, speed, follow, over, from, to, all, reset };
+  const body = make("select", "body");
+  for (const value of ["capsules", "bones", ...(chosen.character && ownCharacters ? ["character"] : [])]) body.append(make("option", "", value, value === chosen.body ? { selected: "" } : {}));
+  const file = make("input", "file", "", { type: "file", accept: ".glb,.vrm" });
+  const character = make("label", "own", "Your character");
+  character.title = "A GLB file with a skeleton. It stays in this browser.";
+  character.append(file);
+  const wrong = make("output", "wrong", "", { role: "alert", hidden: "" });
+  const own = ownCharacters ? [character, wrong] : [];
+  const overTime = options.live ? [] : [play, time, clock, from, to, all, labelled("Speed", speed)];
+  bar.replaceChildren(...overTime, labelled("Follow", follow), ...(several ? [labelled("Over each other", over)] : []), labelled("Body", body), ...own, reset);
+  return { play, time, clock, speed, follow, over, from, to, all, body, file, wrong, reset };
 }
 
 /** Shows motions in the figures of an element, until it is closed. @param {HTMLElement} root @param {Motions} motions @param {Options} [options] */
@@ -172,10 +219,15 @@ export function mount(root, motions, options = {}) {
   const fastest = Math.max(...panels.map((panel) => panel.fps));
   const duration = Math.max(...panels.map((panel) => (panel.frames - 1) / panel.fps));
   const bar = root.querySelector(".viewer-bar") ?? root.appendChild(document.createElement("div"));
-  const ui = controls(bar, panels.length > 1);
+  const ui = controls(bar, panels.length > 1, options);
   const view = { ...START };
   let [time, playing, speed, last, asked] = [0, false, 1, 0, false];
   let [begin, end] = [0, duration];
+  if (options.live) for (const panel of panels) {
+    panel.feet = [];
+    panel.strip.remove();
+    panel.measures.remove();
+  }
   /** @type {Record<string, string>} */
   let colours = {};
 
@@ -220,7 +272,9 @@ export function mount(root, motions, options = {}) {
       const local = (scale * distance) / Math.max(distance - depth, 0.05 * distance);
       return { x: size[0] / 2 + local * right, y: size[1] / 2 - local * (dy * up - near * tip), scale: local, depth };
     };
-    return { project, x0, z0, radius: 1.25 * span };
+    /** @type {import("./character.js").Lens} */
+    const lens = { at: [x0, y0, z0], turn: [sin, cos, up, tip], scale, distance };
+    return { project, lens, x0, z0, radius: 1.25 * span };
   };
 
   /** A canvas of the right size and its context, or nothing if it is not shown. @param {HTMLCanvasElement} canvas */
@@ -242,7 +296,7 @@ export function mount(root, motions, options = {}) {
     if (!shown) return;
     const { context, size } = shown;
     const { points, frame, centre } = pose(panel);
-    const { project, x0, z0, radius } = camera(panel, centre, size);
+    const { project, lens, x0, z0, radius } = camera(panel, centre, size);
     context.lineCap = "round";
     const colour = (/** @type {string} */ name) => colours[name] ?? "";
     /** @param {Dot} a @param {Dot} b @param {number} width @param {string} name */
@@ -294,6 +348,26 @@ export function mount(root, motions, options = {}) {
     });
     context.globalAlpha = 1;
 
+    /** A bone with round ends, lit from above. @param {Dot} a @param {Dot} b @param {[number, number]} radii @param {string} name */
+    const capsule = (a, b, radii, name) => {
+      const [ra, rb] = [radii[0] * a.scale, radii[1] * b.scale];
+      const along = Math.atan2(b.y - a.y, b.x - a.x);
+      const shape = new Path2D();
+      shape.arc(a.x, a.y, ra, along + Math.PI / 2, along - Math.PI / 2);
+      shape.arc(b.x, b.y, rb, along - Math.PI / 2, along + Math.PI / 2);
+      shape.closePath();
+      const [x, y, thick] = [(a.x + b.x) / 2, (a.y + b.y) / 2, Math.max(ra, rb)];
+      const up = Math.cos(along) < 0 ? -1 : 1;
+      const [dx, dy] = [Math.sin(along) * thick * up, -Math.cos(along) * thick * up];
+      const light = context.createLinearGradient(x + dx, y + dy, x - dx, y - dy);
+      for (const [at, part] of LIGHT) light.addColorStop(at, lit(colour(name), part));
+      context.fillStyle = light;
+      context.fill(shape);
+      context.strokeStyle = colour("panel");
+      context.lineWidth = 1;
+      context.stroke(shape);
+    };
+
     /** Far bones first, each with an edge of the background, so that one passes visibly in front of another. @param {Panel} figure @param {Point[]} points @param {boolean} ghost */
     const body = (figure, points, ghost) => {
       /** @type {Record<string, string>} */
@@ -302,16 +376,23 @@ export function mount(root, motions, options = {}) {
       const origin = /** @type {Point} */ ([0, 0, 0]);
       const bones = figure.bones.map(([from, to]) => ({ a: project(points[from] ?? origin), b: project(points[to] ?? origin), from, to }));
       bones.sort((one, two) => one.a.depth + one.b.depth - two.a.depth - two.b.depth);
+      const solid = !ghost && ui.body.value === "capsules";
       for (const bone of bones) {
         const side = figure.body.sides[bone.to] ?? "m";
         const name = ghost ? "told" : names[side] ?? "body";
+        const radii = figure.radii[bone.to] ?? [0, 0];
+        if (solid) {
+          capsule(bone.a, bone.b, [radii[0] * (figure.height / 1.7), radii[1] * (figure.height / 1.7)], name);
+          if (bone.to !== figure.body.head) continue;
+          const crown = headOf(points, bone.from, bone.to);
+          capsule(project(crown(0.1)), project(crown(0.6)), [0.1 * (figure.height / 1.7), 0.095 * (figure.height / 1.7)], name);
+          continue;
+        }
         const width = ((figure.count > 30 ? 0.6 : 1) * (side === "m" ? 0.1 : 0.085) * small * (bone.a.scale + bone.b.scale)) / 2;
         if (!ghost) line(bone.a, bone.b, width + 2, "panel");
         line(bone.a, bone.b, ghost ? 0.6 * width : width, name);
         if (bone.to !== figure.body.head) continue;
-        const [from, to] = [points[bone.from] ?? origin, points[bone.to] ?? origin];
-        const lift = /** @type {Point} */ (to.map((at, k) => at + 0.35 * (at - (from[k] ?? 0))));
-        disc(project(lift), 0.115 * (figure.height / 1.7) * bone.b.scale, name);
+        disc(project(headOf(points, bone.from, bone.to)(0.35)), 0.115 * (figure.height / 1.7) * bone.b.scale, name);
       }
     };
     if (ui.over.checked) {
@@ -319,7 +400,8 @@ export function mount(root, motions, options = {}) {
       for (const other of panels) if (other !== panel) body(other, pose(other).points, true);
       context.globalAlpha = 1;
     }
-    body(panel, points, false);
+    if (ui.body.value === "character" && chosen.character?.fits(panel.body)) chosen.character.paint(context, size, lens, panel.body, points);
+    else body(panel, points, false);
     drawStrip(panel);
     panel.dirty = false;
   };
@@ -434,6 +516,29 @@ export function mount(root, motions, options = {}) {
   const loopTo = () => loop(begin < time ? begin : 0, Math.min(time, duration));
   const loopAll = () => loop(0, duration);
 
+  /** Reads the chosen file, here in the browser. */
+  const dress = async () => {
+    const file = ui.file.files?.[0];
+    if (!file || !options.characters) return;
+    let wrong = "";
+    try {
+      const character = await (await options.characters()).read(await file.arrayBuffer());
+      if (!panels.some((panel) => character.fits(panel.body))) wrong = "these motions have another skeleton than a person's";
+      // Drawn once here, so that a browser without the graphics for it says so.
+      else character.ready();
+      if (wrong === "") Object.assign(chosen, { character, body: "character" });
+    } catch (error) {
+      wrong = error instanceof Error ? error.message : String(error);
+    }
+    if (signal.aborted) return;
+    ui.wrong.hidden = wrong === "";
+    ui.wrong.textContent = wrong && `${file.name}: ${wrong}.`;
+    if (wrong) return;
+    if (![...ui.body.options].some((option) => option.value === "character")) ui.body.add(new Option("character"));
+    ui.body.value = "character";
+    update();
+  };
+
   /** @param {EventTarget} target @param {string} name @param {(event: any) => void} act @param {AddEventListenerOptions} [more] */
   const on = (target, name, act, more = {}) => target.addEventListener(name, act, { signal, ...more });
   on(ui.play, "click", () => setPlaying(!playing));
@@ -441,6 +546,11 @@ export function mount(root, motions, options = {}) {
   on(ui.speed, "change", () => setSpeed(0));
   on(ui.follow, "change", update);
   on(ui.over, "change", update);
+  on(ui.body, "change", () => {
+    chosen.body = ui.body.value;
+    update();
+  });
+  on(ui.file, "change", () => void dress());
   on(ui.from, "click", loopFrom);
   on(ui.to, "click", loopTo);
   on(ui.all, "click", loopAll);
@@ -527,6 +637,28 @@ export function mount(root, motions, options = {}) {
     duration,
     goTo,
     play: setPlaying,
+    /** Adds a frame to a stream. @param {number[][]} points metres */
+    append(points) {
+      const panel = panels[0];
+      const [x = 0, , z = 0] = points[0] ?? [];
+      if (!panel) return;
+      if (panel.joints.length < LIVE * panel.width) {
+        const room = new Float32Array(LIVE * panel.width);
+        room.set(panel.joints);
+        panel.joints = room;
+      }
+      if (panel.frames === LIVE) {
+        panel.joints.copyWithin(0, (LIVE / 2) * panel.width);
+        panel.course.splice(0, LIVE / 2);
+        panel.frames = LIVE / 2;
+      }
+      panel.joints.set(points.flat(), panel.frames * panel.width);
+      const [x0, z0] = panel.course[panel.frames - 1] ?? [x, z];
+      panel.course.push([x0 + 0.15 * (x - x0), z0 + 0.15 * (z - z0)]);
+      panel.frames += 1;
+      time = (panel.frames - 1) / panel.fps;
+      update();
+    },
     /** Ends it; the figures stay as they are. */
     close() {
       ended.abort();

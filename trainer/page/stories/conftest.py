@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import re
+import secrets
 import shutil
 import signal
+import socket
 import subprocess
 import time
 from collections.abc import Iterator
@@ -53,20 +55,36 @@ SWEEP = f"    sweep: {{metric: latent_fid, trials: 2, rungs: {{first: 4}}, space
 class World:
     folder: Path
     url: str = ""
-    token: str = ""
+    token: str = field(default_factory=lambda: secrets.token_hex(32))
+    reader: str = field(default_factory=lambda: secrets.token_hex(32))
     processes: dict[str, subprocess.Popen[bytes]] = field(default_factory=dict)
     runs: dict[str, stride.Run] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        tokens = self.folder / "tokens"
+        tokens.touch(mode=0o600)
+        tokens.write_text(f"maker read,submit,worker,promote,admin {self.token}\nlooker read {self.reader}\n")
+        (self.folder / "viewers").touch(mode=0o600)
+        (self.folder / "viewers").write_text(f"viewer read {secrets.token_hex(32)}\n")
+        with socket.create_server(("127.0.0.1", 0)) as free:
+            self.stream_at = f"127.0.0.1:{free.getsockname()[1]}"
+        self.serve("127.0.0.1:0")
+        self.server = stride.connect(self.url, token=self.token)
+
+    def serve(self, bind: str) -> None:
+        """Starts a server and waits for it to listen."""
         log = self.folder / "serve.log"
-        self.start("serve", ["serve", "--store", str(self.folder / "store"), "--bind", "127.0.0.1:0"])
+        stream = ["--stream", f"ws://{self.stream_at}", "--stream-token-file", "viewers"]
+        self.start("serve", ["serve", "--store", str(self.folder / "store"), "--bind", bind, "--token-file", "tokens", *stream])
         until = time.monotonic() + 120
         while not (found := re.search(r"http://127\.0\.0\.1:\d+", log.read_text())):
             assert time.monotonic() < until and self.processes["serve"].poll() is None, log.read_text()
             time.sleep(0.1)
         self.url = found.group()
-        self.token = (self.folder / "store" / "token").read_text().strip()
-        self.server = stride.connect(self.url, token=self.token)
+
+    def end(self, name: str) -> None:
+        self.processes[name].terminate()
+        self.processes[name].wait(60)
 
     def start(self, name: str, arguments: list[str]) -> None:
         with (self.folder / f"{name}.log").open("w") as out:
@@ -74,6 +92,15 @@ class World:
 
     def join(self, name: str) -> None:
         self.start(name, ["worker", "join", self.url, "--name", name, "--token", self.token])
+
+    def stream(self, model: str) -> None:
+        """Starts the stream that the page offers, and waits for it to listen."""
+        listens = ["--listen", self.stream_at, "--listen-token-file", "viewers", "--streams", "2"]
+        self.start("stream", ["generate", "--stream", "--model", model, "--server", self.url, "--token", self.token, *listens])
+        until = time.monotonic() + 120
+        while "/v1/stream" not in (said := (self.folder / "stream.log").read_text()):
+            assert time.monotonic() < until and self.processes["stream"].poll() is None, said
+            time.sleep(0.1)
 
     def kill(self, name: str) -> None:
         self.processes[name].send_signal(signal.SIGKILL)
@@ -142,13 +169,27 @@ class Hand:
     """Presses what is on a page, and counts."""
 
     def __init__(self, page: Page, way: Way, world: World) -> None:
-        self.page, self.way, self.world, self.presses = page, way, world, 0
+        self.page, self.way, self.world = page, way, world
+        self.begin()
+
+    def begin(self) -> None:
+        self.presses, self.keys, self.took = 0, 0, ""
 
     def open(self, path: str) -> None:
+        self.begun = time.monotonic()
         self.page.goto(self.world.url + path)
         self.page.wait_for_selector("main h1:not([class=skeleton])")
         until(self.page, "!document.querySelector('.skeleton')")
-        self.presses = 0
+        self.begin()
+
+    def within(self, presses: int, seconds: float | None = None, since: float | None = None) -> None:
+        """Ends a story: it took no more presses, and no more time, than a person has patience for."""
+        took = time.monotonic() - (since or self.begun)
+        word = "tap" if self.way.touch else "press"
+        many = f"{self.presses} {word}" + ("" if self.presses == 1 else "s" if self.way.touch else "es")
+        self.took = f"{many}{f' of {self.keys} keys' if self.keys > self.presses else ''}, {took:.1f} s"
+        assert self.presses <= presses, f"{self.presses} presses; expected at most {presses}"
+        assert seconds is None or took <= seconds, f"{took:.2f} s; expected at most {seconds}"
 
     def reach(self, target: Locator) -> None:
         """Has the keyboard's focus on it, by Tab alone."""
@@ -159,6 +200,7 @@ class Hand:
                 assert outline != "nonenone", "the focus is seen"
                 return
             self.page.keyboard.press("Tab")
+            self.keys += 1
         raise AssertionError(f"Tab does not reach {target}")
 
     def press(self, target: Locator) -> None:
@@ -166,6 +208,7 @@ class Hand:
         if not self.way.touch:
             self.reach(target)
             self.page.keyboard.press("Enter")
+            self.keys += 1
             return
         target.wait_for()
         # The bar at the lower edge lies over what has only just come into view.
@@ -218,16 +261,27 @@ def from_folder(route: Route) -> None:
         route.continue_()
 
 
-def enter(chromium: Browser, world: World, way: Way) -> BrowserContext:
+def document_from_folder(route: Route) -> None:
+    """Answers with the document of STRIDE_PAGE, which names the files' folder of the server's build."""
+    if route.request.resource_type != "document":
+        return route.fallback()
+    answer = route.fetch()
+    folder = re.search(r"/page/([0-9a-f]+)/", answer.text())
+    text = (Path(os.environ["STRIDE_PAGE"]) / "index.html").read_text()
+    route.fulfill(response=answer, body=text.replace("FOLDER", folder.group(1) if folder else "FOLDER"))
+
+
+def enter(chromium: Browser, world: World, way: Way, token: str | None = None) -> BrowserContext:
     """A browser that is signed in."""
     scheme: Any = "dark" if way.dark else "light"
     context = chromium.new_context(viewport=way.size, has_touch=way.touch, is_mobile=way.touch, color_scheme=scheme)
     context.set_default_timeout(PATIENCE_S * 1000)
     if "STRIDE_PAGE" in os.environ:
+        context.route("**/*", document_from_folder)
         context.route("**/page/**", from_folder)
     page = context.new_page()
     page.goto(world.url)
-    page.fill("#token", world.token)
+    page.fill("#token", token or world.token)
     page.keyboard.press("Enter")
     page.wait_for_selector("nav.places")
     page.close()
@@ -246,3 +300,27 @@ def hand(request: pytest.FixtureRequest, chromium: Browser, world: World) -> Ite
     yield Hand(page, request.param, world)
     context.close()
     assert not wrong, wrong
+
+
+STORIES: dict[str, dict[str, str]] = {}
+"""Presses and time of each story, by way."""
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> Any:
+    report = yield
+    hand = getattr(item, "funcargs", {}).get("hand")
+    if report.when == "call" and hand is not None:
+        row = STORIES.setdefault(item.name.partition("[")[0].removeprefix("test_").replace("_", " "), {})
+        row[str(hand.way)] = hand.took or "shown" if report.passed else "MISSED"
+    return report
+
+
+def pytest_terminal_summary(terminalreporter: Any) -> None:
+    if not STORIES:
+        return
+    wide = max(map(len, STORIES))
+    terminalreporter.section("stories")
+    terminalreporter.line("  ".join(["story".ljust(wide), *(str(way).ljust(27) for way in WAYS)]))
+    for story, row in STORIES.items():
+        terminalreporter.line("  ".join([story.ljust(wide), *(row.get(str(way), "not run").ljust(27) for way in WAYS)]))

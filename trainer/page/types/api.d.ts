@@ -32,7 +32,7 @@ interface WorkerRow { worker: string; incarnation: number; pid: number; backend:
 interface LogLine { id: number; task: string; attempt: number; worker: string; line: number; at_ms: number; text: string }
 interface Curve { total: number; x: number[]; mean: (number | null)[]; min?: (number | null)[]; max?: (number | null)[]; count?: number[]; nan?: number[]; key?: string }
 interface Checkpoint { stage: string; step: number; at_ms: number; digest: string; draws: boolean }
-interface Who { name: string; project?: string; scopes: string[]; until_ms?: number; now_ms: number; store: string; version: string }
+interface Who { name: string; project?: string; scopes: string[]; until_ms?: number; now_ms: number; store: string; version: string; streams: boolean }
 interface Model { model: string; metric: string | null; mode: string | null; versions: number; best: number | null; aliases: Record<string, number> }
 interface Version { model: string; version: number; artifact: string; metrics: Record<string, number>; source: Record<string, unknown> | null; created_ms: number; aliases: string[] }
 interface GateResult { gate: string; value: number | null; bound: number | null; holds: boolean; message: string }

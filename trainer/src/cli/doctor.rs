@@ -6,16 +6,12 @@ use std::os::unix::fs::PermissionsExt as _;
 use std::path::{Path, PathBuf};
 
 use clap::Args;
+use registry::doctor::{Finding, State, disk, permissions};
 use registry::{OpenError, ReadStore, RunListQuery};
-use serde::Serialize;
 
 use crate::client::{Client, Target, shown};
 use crate::report::print::{self, Output};
 use crate::report::problem::{Result, exit};
-
-/// Free space below which a training may fill the disk, and below which nothing can be stored.
-const LITTLE: u64 = 5 << 30;
-const NONE: u64 = 200 << 20;
 
 #[derive(Debug, Args)]
 #[command(after_help = "\
@@ -28,39 +24,6 @@ pub(crate) struct DoctorArgs {
     /// Format of the findings
     #[arg(short, long, value_enum, default_value_t)]
     pub(super) output: Output,
-}
-
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "lowercase")]
-enum State {
-    Ok,
-    Warn,
-    Fail,
-}
-
-/// Result of one check.
-#[derive(Debug, Serialize)]
-struct Finding {
-    state: State,
-    what: &'static str,
-    found: String,
-    /// Advice for a problem.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    hint: Option<String>,
-}
-
-impl Finding {
-    fn ok(what: &'static str, found: impl Into<String>) -> Self {
-        Self { state: State::Ok, what, found: found.into(), hint: None }
-    }
-
-    fn warn(what: &'static str, found: impl Into<String>, hint: impl Into<String>) -> Self {
-        Self { state: State::Warn, what, found: found.into(), hint: Some(hint.into()) }
-    }
-
-    fn fail(what: &'static str, found: impl Into<String>, hint: impl Into<String>) -> Self {
-        Self { state: State::Fail, what, found: found.into(), hint: Some(hint.into()) }
-    }
 }
 
 /// Runs all checks. Returns exit code 1 if one fails.
@@ -137,37 +100,8 @@ async fn store(dir: &Path) -> Vec<Finding> {
             findings.push(Finding::fail("store", error.to_string(), hint));
         }
     }
-    let mode = std::fs::metadata(dir).map_or(0, |found| found.permissions().mode());
-    if mode & 0o022 != 0 {
-        let found = format!("other users may write to `{name}`");
-        findings.push(Finding::warn("store", found, format!("`chmod go-w {name}` prevents that")));
-    }
+    findings.extend(permissions(dir, &name));
     findings
-}
-
-/// Checks the disk of the store, or of the folder in which it would be created.
-fn disk(dir: &Path) -> Finding {
-    let absolute = std::path::absolute(dir).unwrap_or_else(|_| dir.to_owned());
-    let existing = absolute.ancestors().find(|folder| folder.exists()).unwrap_or(Path::new("/"));
-    match nix::sys::statvfs::statvfs(existing) {
-        Ok(found) => {
-            let free = found.blocks_available() * found.fragment_size();
-            space(free, existing)
-        }
-        Err(error) => {
-            Finding::fail("disk", format!("`{}`: {error}", existing.display()), "choose another folder with --store")
-        }
-    }
-}
-
-fn space(free: u64, folder: &Path) -> Finding {
-    let found = format!("{:.1} GiB are free in `{}`", free as f64 / f64::from(1 << 30), folder.display());
-    let hint = "`trainer registry gc` removes unneeded data; --store selects a folder on another disk";
-    match free {
-        0..NONE => Finding::fail("disk", found, hint),
-        NONE..LITTLE => Finding::warn("disk", found, hint),
-        _ => Finding::ok("disk", found),
-    }
 }
 
 fn token_file(path: Option<&Path>) -> Option<Finding> {
@@ -218,10 +152,9 @@ mod tests {
 
     #[test]
     fn a_line_says_state_finding_and_what_to_do() {
-        let [full, little, fine] = [1 << 20, 1 << 30, 1 << 40].map(|free| space(free, Path::new("/x")));
-        assert_eq!([full.state, little.state, fine.state], [State::Fail, State::Warn, State::Ok]);
-        assert_eq!(line(&fine), "ok    disk     1024.0 GiB are free in `/x`");
-        assert!(line(&full).starts_with("FAIL  disk     0.0 GiB") && line(&full).contains("; `trainer registry gc`"));
+        let (fine, full) = (Finding::ok("disk", "9 GiB are free"), Finding::fail("disk", "0 GiB are free", "remove some"));
+        assert_eq!(line(&fine), "ok    disk     9 GiB are free");
+        assert_eq!(line(&full), "FAIL  disk     0 GiB are free; remove some");
     }
 
     #[test]

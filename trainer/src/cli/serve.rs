@@ -4,8 +4,9 @@ use std::io::IsTerminal as _;
 use std::net::{Ipv4Addr, SocketAddr};
 use std::path::PathBuf;
 
-use access::{Scopes, TokenOptions, Tokens};
+use access::{Scopes, Token, TokenOptions, Tokens};
 use clap::Args;
+use coordinator::shell::StreamOffer;
 use coordinator::{Coordinator, Handle};
 use registry::{Holder, Store};
 use tokio::signal::unix::{SignalKind, signal};
@@ -48,6 +49,12 @@ pub(crate) struct ServeArgs {
     /// run ends or stands still and when a model is promoted
     #[arg(long, env = "STRIDE_WEBHOOKS", value_name = "FILE")]
     webhooks: Option<PathBuf>,
+    /// Address of a `trainer generate --stream --listen`: the page offers its stream to those who may submit
+    #[arg(long, env = "STRIDE_STREAM", value_name = "ws://HOST:PORT", requires = "stream_token_file")]
+    stream: Option<String>,
+    /// File with a token of that process, closed to other users
+    #[arg(long, env = "STRIDE_STREAM_TOKEN_FILE", value_name = "FILE")]
+    stream_token_file: Option<PathBuf>,
     #[command(flatten)]
     blobs: super::args::BlobArgs,
     #[command(flatten)]
@@ -76,6 +83,12 @@ impl ServeArgs {
 
     fn hooks(&self) -> Result<Hooks> {
         Ok(self.webhooks.as_deref().map(Hooks::read).transpose()?.unwrap_or_default())
+    }
+
+    /// The stream that the page offers.
+    fn stream(&self) -> Result<Option<StreamOffer>> {
+        let Some((url, file)) = self.stream.as_deref().zip(self.stream_token_file.as_deref()) else { return Ok(None) };
+        StreamOffer::new(url, Token::from_file(file)?).map(Some).map_err(Problem::usage)
     }
 
     /// Reads the files of the certificate, tokens and webhooks again. A file with an error changes nothing.
@@ -119,6 +132,7 @@ pub(crate) async fn serve(args: ServeArgs) -> Result<u8> {
     let mut config = args.endpoint.config(args.bind, args.tokens()?, args.insecure)?;
     args.allowances.set(&mut config);
     config.hooks = args.hooks()?;
+    config.stream = args.stream()?;
     // Report errors before the store is created.
     config.check()?;
     let open = config.tokens.is_empty();

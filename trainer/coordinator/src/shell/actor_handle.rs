@@ -17,6 +17,7 @@ use super::allowances::Allowances;
 use super::blocking::blocking;
 use super::clock::{Clock, wall_clock, wall_ms};
 use super::launchers::Launchers;
+use super::lines::Lines;
 use super::meters::Meters;
 use super::records::{Records, read};
 use super::secrets::Secrets;
@@ -99,6 +100,7 @@ pub(crate) struct ActorHandle {
     pub(crate) meters: Meters,
     pub(crate) streams: Streams,
     pub(crate) launchers: Launchers,
+    pub(crate) lines: Lines,
 }
 
 impl ActorHandle {
@@ -134,6 +136,7 @@ impl ActorHandle {
             meters: Meters::default(),
             streams: Streams::default(),
             launchers: Launchers::default(),
+            lines: Lines::default(),
         };
         (handle, queue)
     }

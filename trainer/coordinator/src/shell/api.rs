@@ -34,13 +34,15 @@ use super::events::EventsQuery;
 use super::extract::Query;
 use super::failure::Failure;
 use super::openapi::document;
-use super::queries::{HistoryCall, LogQuery, PointQuery, RunsQuery, Submitted};
+use super::queries::{HistoryCall, LogQuery, PointQuery, RunsQuery, Storage, Submitted};
 use super::records::StageMetrics;
 use super::route::Route;
 use super::session_calls::Who;
 use super::settings::RunSettings;
+use super::tickets::Ticket;
 use super::{
-    bundles, checkpoints, curves, draws, events, page_files, polls, queries, scrape, session_calls, settings, uploads,
+    bundles, checkpoints, curves, draws, events, page_files, polls, queries, scrape, session_calls, settings,
+    tickets, uploads,
 };
 use crate::view::WorkerView;
 
@@ -119,12 +121,16 @@ fn table() -> Vec<Entry> {
             described::<Nothing, Json<message::Submit>, Json<Submitted>>("Submits a pipeline").with(SUBMISSION)),
         entry("POST", "/v1/draws",                 &[Submit],       CALL,                     SHORT, draws::draw,
             described::<Nothing, Json<Draw>, Json<Drawing>>("Draws motions of models for sentences").with(SUBMISSION)),
+        entry("POST", "/v1/tickets",               &[Submit],       CALL,                     SHORT, tickets::ticket,
+            described::<Nothing, Nothing, Json<Ticket>>("Makes a ticket by which a browser enters a stream once")),
         entry("GET",  "/metrics",                  &[Read],         CALL,                     SHORT, scrape::metrics,
             described::<Nothing, Nothing, OpenMetrics>("Shows the server's own numbers to Prometheus")),
         entry("GET",  "/v1/history",               &[Read],         CALL,                     SHORT, queries::history,
             described::<Query<HistoryCall>, Nothing, Json<Vec<HistoryRow>>>("Lists events, or waits for them")),
         entry("GET",  "/v1/events",                &[Read],         CALL,                     SHORT, events::events,
             described::<Query<EventsQuery>, Nothing, EventStream>("Streams events as they come").with(RESUME)),
+        entry("GET",  "/v1/storage",               &[Admin],        CALL,                     SHORT, queries::storage,
+            described::<Nothing, Nothing, Json<Storage>>("Shows the store's bytes by kind, and checks of its folder")),
         entry("GET",  "/v1/runs",                  &[Read],         CALL,                     SHORT, queries::runs,
             described::<Query<RunsQuery>, Nothing, Json<Listing<RunSummary>>>("Lists runs in short")),
         entry("GET",  "/v1/runs/{run}",            &[Read],         CALL,                     SHORT, queries::run,
@@ -184,7 +190,7 @@ pub(crate) fn router(actor_handle: Arc<ActorHandle>, gate: &Arc<Gate>) -> Router
         .route("/v1/health", get(queries::health))
         // As does the list of calls.
         .route("/v1/openapi.json", get(described_calls))
-        .merge(page_files::router())
+        .merge(page_files::router(gate.stream.as_ref()))
         .fallback(absent)
         .method_not_allowed_fallback(no_such_method)
         .layer(middleware::from_fn_with_state(Arc::clone(&actor_handle), until_failed))

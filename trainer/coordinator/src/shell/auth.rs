@@ -24,6 +24,7 @@ use super::rate::Rates;
 use super::revocable::Revocable;
 use super::route::Route;
 use super::sessions::{self, Current, Holder, Sessions};
+use super::tickets::{StreamOffer, Tickets};
 use super::token_table::{Standing, TokenTable, Unknown};
 
 /// The header of every call of the page; its value does not matter.
@@ -38,6 +39,10 @@ pub(crate) struct Gate {
     pub(crate) audit: Arc<Audit>,
     /// Sessions of browsers; `None` where there is no page.
     pub(crate) sessions: Option<Arc<Sessions>>,
+    /// The stream for which the page gets tickets.
+    pub(crate) stream: Option<StreamOffer>,
+    /// Tickets that others made; `None` where no browser enters with one.
+    tickets: Option<Tickets>,
     /// Accepted host names; IP addresses are always accepted.
     hosts: Vec<String>,
     /// Kibibytes of request bodies that may be in memory.
@@ -56,12 +61,26 @@ impl Gate {
         }
         names.extend(hosts.iter().cloned());
         let bodies = Arc::new(Semaphore::new(limits::CALLS_BYTES >> 10));
-        Self { tokens, audit: Arc::default(), sessions: None, hosts: names, bodies, rates: Rates::new(calls) }
+        Self {
+            tokens,
+            audit: Arc::default(),
+            sessions: None,
+            stream: None,
+            tickets: None,
+            hosts: names,
+            bodies,
+            rates: Rates::new(calls),
+        }
     }
 
-    /// The same, for browsers too.
-    pub(crate) fn with_sessions(self, sessions: Arc<Sessions>) -> Self {
-        Self { sessions: Some(sessions), ..self }
+    /// The same, for browsers with tickets of other servers too.
+    pub(crate) fn with_tickets(self) -> Self {
+        Self { tickets: Some(Tickets::default()), ..self }
+    }
+
+    /// The same, for browsers too, whose page may offer a stream.
+    pub(crate) fn with_sessions(self, sessions: Arc<Sessions>, stream: Option<StreamOffer>) -> Self {
+        Self { sessions: Some(sessions), stream, ..self }
     }
 
     /// The caller of a request to `route`, by its token or its session.
@@ -71,7 +90,7 @@ impl Gate {
             Some(shown) => (self.shown(shown, route), None),
             None => match self.session(request)? {
                 Some(session) => (self.token_of(session.holder), Some(session)),
-                None => (None, None),
+                None => (self.tickets.as_ref().and_then(|tickets| tickets.redeem(headers, &self.tokens.current())), None),
             },
         };
         let token = token.ok_or_else(|| unauthorized(&Unknown::Nobody))?;
@@ -138,6 +157,9 @@ impl Gate {
         let origin = text(header::ORIGIN)?;
         let authority = origin.split_once("://").filter(|(scheme, _)| matches!(*scheme, "http" | "https"));
         if authority.is_some_and(|(_, authority)| authority.eq_ignore_ascii_case(host)) {
+            return None;
+        }
+        if self.tickets.as_ref().is_some_and(|tickets| tickets.vouches(headers, &self.tokens.current())) {
             return None;
         }
         let message = format!("a page of `{origin}` may not call this server");

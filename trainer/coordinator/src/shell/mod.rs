@@ -23,6 +23,7 @@ mod events;
 mod extract;
 mod failure;
 mod launchers;
+mod lines;
 mod listener;
 mod meters;
 mod openapi;
@@ -44,6 +45,7 @@ mod settings;
 mod start_error;
 mod storage;
 mod streams;
+mod tickets;
 mod token_table;
 mod turn;
 mod uploads;
@@ -89,6 +91,7 @@ use self::secrets::Secrets;
 use self::sessions::Sessions;
 pub use self::settings::{RunSettings, SettingsOfStage};
 pub use self::start_error::StartError;
+pub use self::tickets::{STREAM_PROTOCOL, StreamOffer};
 pub use self::token_table::Standing;
 use self::token_table::TokenTable;
 pub use self::versions::resolve_versions;
@@ -114,6 +117,8 @@ pub struct Config {
     pub hooks: Hooks,
     /// Time before the first repetition of a message to a hook; each further one takes six times as long.
     pub hook_retry: Duration,
+    /// The stream that the page offers.
+    pub stream: Option<StreamOffer>,
     pub policy: Policy,
     /// Treats all workers of an earlier coordinator as gone. `trainer run` sets it, because it starts its own workers.
     pub alone: bool,
@@ -139,6 +144,7 @@ impl Config {
             allowances: Allowances::default(),
             hooks: Hooks::default(),
             hook_retry: Duration::from_secs(5),
+            stream: None,
             policy: Policy::default(),
             alone: false,
             park: false,
@@ -212,7 +218,7 @@ impl Coordinator {
         let (stop, stopped) = watch::channel(false);
         let tick = effects::tick(actor_handle.clone(), config.policy.tick_ms, stopped.clone());
         let clock = actor_handle.spawn("the clock", tick);
-        let gate = Gate::new(tokens, &config.hosts, config.allowances.calls).with_sessions(Arc::clone(&sessions));
+        let gate = Gate::new(tokens, &config.hosts, config.allowances.calls).with_sessions(Arc::clone(&sessions), config.stream.clone());
         let gate = Arc::new(gate);
         let audit = actor_handle.spawn("the audit log", audit::write(Arc::clone(&gate.audit), log, stopped.clone()));
         let router = api::router(actor_handle.clone(), &gate);

@@ -10,6 +10,7 @@ use axum::routing::get;
 use super::actor_handle::ActorHandle;
 use super::extract::Path;
 use super::failure::Failure;
+use super::tickets::StreamOffer;
 
 /// A file under the name of its build never changes.
 const FOR_EVER: &str = "public, max-age=31536000, immutable";
@@ -18,18 +19,19 @@ const ASK_AGAIN: &str = "no-cache";
 /// Content policy of API answers: browsers must not execute stored content.
 const DATA_POLICY: &str = "default-src 'none'; frame-ancestors 'none'; sandbox";
 
-pub(super) fn router() -> Router<Arc<ActorHandle>> {
-    let router = page::VIEWS.iter().fold(Router::new(), |router, view| router.route(view, get(document)));
+pub(super) fn router(stream: Option<&StreamOffer>) -> Router<Arc<ActorHandle>> {
+    let policy: Arc<str> = page::content_policy(stream.map(StreamOffer::origin)).into();
+    let document = get(move |headers: HeaderMap| {
+        let policy = Arc::clone(&policy);
+        async move { answer(page::index(), &headers, ASK_AGAIN, &policy) }
+    });
+    let router = page::VIEWS.iter().fold(Router::new(), |router, view| router.route(view, document.clone()));
     router.route("/page/{folder}/{*name}", get(file))
-}
-
-async fn document(headers: HeaderMap) -> Response {
-    answer(page::index(), &headers, ASK_AGAIN)
 }
 
 async fn file(Path((folder, name)): Path<(String, String)>, headers: HeaderMap) -> Response {
     match page::find(&folder, &name) {
-        Some(file) => answer(file, &headers, FOR_EVER),
+        Some(file) => answer(file, &headers, FOR_EVER, page::CONTENT_POLICY),
         None => {
             let message = "this build of the server has no such file of the page".to_owned();
             Failure::new(StatusCode::NOT_FOUND, "not-found", message).hint("load the page again").into_response()
@@ -37,14 +39,14 @@ async fn file(Path((folder, name)): Path<(String, String)>, headers: HeaderMap) 
     }
 }
 
-fn answer(file: &'static page::File, headers: &HeaderMap, cache: &'static str) -> Response {
+fn answer(file: &'static page::File, headers: &HeaderMap, cache: &'static str, policy: &str) -> Response {
     let text = |name: HeaderName| headers.get(name).and_then(|value| value.to_str().ok()).unwrap_or_default();
     let known = text(header::IF_NONE_MATCH).split(',').any(|tag| tag.trim().trim_start_matches("W/") == file.tag);
     let common = [
         (header::ETAG, file.tag.as_str()),
         (header::CACHE_CONTROL, cache),
         (header::VARY, "accept-encoding"),
-        (header::CONTENT_SECURITY_POLICY, page::CONTENT_POLICY),
+        (header::CONTENT_SECURITY_POLICY, policy),
         (header::REFERRER_POLICY, "no-referrer"),
         (HeaderName::from_static("cross-origin-opener-policy"), "same-origin"),
         (HeaderName::from_static("cross-origin-resource-policy"), "same-origin"),

@@ -13,6 +13,7 @@ use super::actor_handle::ActorHandle;
 use super::body::Message;
 use super::extract::Path;
 use super::failure::Failure;
+use super::lines::Line;
 use super::secrets::Proof;
 use crate::event::{Effect, Event};
 use crate::rejected::Rejected;
@@ -47,8 +48,21 @@ pub(crate) async fn poll(
     proof: Proof,
     Message(poll, _): Message<Poll>,
 ) -> Result<Json<DesiredAssignments>, Failure> {
-    let (incarnation, version) = (poll.incarnation, poll.version);
-    proof.of_process(&actor_handle.state(), &Process { worker: worker.clone(), incarnation })?;
+    let process = Process { worker, incarnation: poll.incarnation };
+    proof.of_process(&actor_handle.state(), &process)?;
+    let line = Line::new(Arc::clone(&actor_handle), process.clone());
+    let answer = desired(&actor_handle, &proof, process, poll).await;
+    line.answered();
+    answer
+}
+
+async fn desired(
+    actor_handle: &ActorHandle,
+    proof: &Proof,
+    Process { worker, incarnation }: Process,
+    poll: Poll,
+) -> Result<Json<DesiredAssignments>, Failure> {
+    let version = poll.version;
     let mut changes = actor_handle.changes();
     let mut stopped = actor_handle.stopped();
     let deadline = tokio::time::Instant::now() + Duration::from_millis(actor_handle.state().policy.poll_ms);

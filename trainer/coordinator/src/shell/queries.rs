@@ -11,7 +11,8 @@ use axum::{Extension, Json};
 use protocol::message::{Listing, RunState, RunSummary, RunView, Submit};
 use protocol::{Alias, Group, ModelRef, RunId, StageName, WorkerId, limits};
 use registry::cli::{Answer, Command};
-use registry::{HistoryQuery, HistoryRow, LogRow, Page, RunListQuery, RunOrder};
+use registry::doctor::{self, Finding};
+use registry::{HistoryQuery, HistoryRow, KindSize, LogRow, Page, RunListQuery, RunOrder};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::json;
@@ -155,11 +156,40 @@ pub(crate) async fn health(State(actor_handle): State<Arc<ActorHandle>>) -> Json
     Json(Health { status: "ok", storage, version: env!("CARGO_PKG_VERSION") })
 }
 
+/// The answer to `GET /v1/storage`.
+#[derive(Debug, Serialize, JsonSchema)]
+pub(crate) struct Storage {
+    /// Artifacts by kind, largest first.
+    kinds: Vec<KindSize>,
+    /// Bytes of the database, with what it has not written into its file yet.
+    database_bytes: u64,
+    /// Checks of the store's folder and of what holds its blobs.
+    findings: Vec<Finding>,
+}
+
+pub(crate) async fn storage(State(actor_handle): State<Arc<ActorHandle>>) -> Result<Json<Storage>, Failure> {
+    let dir = actor_handle.store.dir().to_owned();
+    let kinds = actor_handle.store.kind_sizes().await?;
+    let away = actor_handle.storage().map(|problem| {
+        Finding::fail("blobs", problem.what, "look whether the disk has space or the bucket answers; training goes on meanwhile")
+    });
+    let (database_bytes, mut findings) = blocking(move || {
+        let size = |name: &str| std::fs::metadata(dir.join(name)).map_or(0, |found| found.len());
+        let findings = [doctor::disk(&dir)].into_iter().chain(doctor::permissions(&dir, &dir.display().to_string()));
+        (size("stride.db") + size("stride.db-wal"), findings.collect::<Vec<_>>())
+    })
+    .await;
+    findings.push(away.unwrap_or_else(|| Finding::ok("blobs", "what is to be stored is, and what is stored can be read")));
+    Ok(Json(Storage { kinds, database_bytes, findings }))
+}
+
 pub(crate) async fn workers(
     State(actor_handle): State<Arc<ActorHandle>>,
     Extension(caller): Extension<Arc<Caller>>,
 ) -> Json<Vec<WorkerView>> {
-    Json(actor_handle.records_for(caller.sees()).workers())
+    let mut workers = actor_handle.records_for(caller.sees()).workers();
+    actor_handle.lines.mark(&mut workers, actor_handle.now());
+    Json(workers)
 }
 
 /// A permit for a client's call that waits for a decision.

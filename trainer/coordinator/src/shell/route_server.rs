@@ -56,7 +56,7 @@ impl RouteServer {
             Listener::bind(config.listen, config.tls.as_ref().map(ServerTls::config)).await.map_err(failed)?;
         let address = listener.address().map_err(failed)?;
         let tokens = Arc::new(TokenTable::new(config.tokens.clone(), Vec::new()));
-        let gate = Arc::new(Gate::new(tokens, &config.hosts, config.allowances.calls));
+        let gate = Arc::new(Gate::new(tokens, &config.hosts, config.allowances.calls).with_tickets());
         Ok(Self { listener, address, tls: config.tls.is_some(), connections: config.connections.clone(), gate })
     }
 

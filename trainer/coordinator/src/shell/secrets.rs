@@ -70,6 +70,16 @@ impl Secrets {
     pub(crate) fn is_session(&self, token: Option<Digest>, until_ms: u64, nonce: &str, shown: &str) -> bool {
         is(self.mac(&("session", token, until_ms, nonce)), shown)
     }
+
+    /// Proof that a page of `origin` may enter a stream once, until a time, under a name of its own.
+    pub(crate) fn of_ticket(&self, origin: &str, until_ms: u64, nonce: &str) -> String {
+        text(self.mac(&("ticket", origin, until_ms, nonce)))
+    }
+
+    /// Returns true if `shown` is that proof.
+    pub(crate) fn is_ticket(&self, origin: &str, until_ms: u64, nonce: &str, shown: &str) -> bool {
+        is(self.mac(&("ticket", origin, until_ms, nonce)), shown)
+    }
 }
 
 fn upload<'a>(caller: &'a str, grant: &'a Grant, digest: Digest) -> impl Serialize + use<'a> {

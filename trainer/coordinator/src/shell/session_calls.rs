@@ -32,9 +32,11 @@ pub(crate) struct Who {
     /// The name of the store's folder.
     store: String,
     version: &'static str,
+    /// True if the page may stream motions.
+    streams: bool,
 }
 
-fn who(caller: &Caller, until_ms: Option<u64>, actor_handle: &ActorHandle) -> Json<Who> {
+fn who(caller: &Caller, until_ms: Option<u64>, gate: &Gate, actor_handle: &ActorHandle) -> Json<Who> {
     let scopes = Scope::ALL.into_iter().filter(|scope| caller.scopes.allow(*scope)).map(Scope::name).collect();
     let dir = std::path::absolute(actor_handle.store.dir()).unwrap_or_default();
     // A store is mostly called `.stride`; the folder that it lies in says more.
@@ -47,6 +49,7 @@ fn who(caller: &Caller, until_ms: Option<u64>, actor_handle: &ActorHandle) -> Js
         now_ms: wall_clock().0,
         store: named.map(|part| part.to_string_lossy().into_owned()).unwrap_or_default(),
         version: env!("CARGO_PKG_VERSION"),
+        streams: gate.stream.is_some(),
     })
 }
 
@@ -54,9 +57,10 @@ fn who(caller: &Caller, until_ms: Option<u64>, actor_handle: &ActorHandle) -> Js
 pub(crate) async fn look(
     State(actor_handle): State<Arc<ActorHandle>>,
     Extension(caller): Extension<Arc<Caller>>,
+    Extension(gate): Extension<Arc<Gate>>,
     session: Option<Extension<Current>>,
 ) -> Json<Who> {
-    who(&caller, session.map(|Extension(session)| session.until_ms), &actor_handle)
+    who(&caller, session.map(|Extension(session)| session.until_ms), &gate, &actor_handle)
 }
 
 type Answer<T> = Result<([(HeaderName, String); 1], Extension<Object>, T), Failure>;
@@ -77,7 +81,7 @@ pub(crate) async fn begin(
     let name = sessions::cookie_name(request.headers(), encrypted);
     let cookie = sessions::set_cookie(&name, &value, LASTS_S, encrypted);
     let object = Extension(Object::Changed("sign in".to_owned()));
-    Ok(([(header::SET_COOKIE, cookie)], object, who(&caller, Some(session.until_ms), &actor_handle)))
+    Ok(([(header::SET_COOKIE, cookie)], object, who(&caller, Some(session.until_ms), &gate, &actor_handle)))
 }
 
 /// Ends the caller's session.

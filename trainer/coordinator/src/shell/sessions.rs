@@ -125,7 +125,7 @@ impl Sessions {
 }
 
 /// Adds what is over at a time, and forgets what is over now.
-fn remember<K: std::hash::Hash + Eq + Clone>(list: &mut HashMap<K, u64>, what: K, until_ms: u64) {
+pub(super) fn remember<K: std::hash::Hash + Eq + Clone>(list: &mut HashMap<K, u64>, what: K, until_ms: u64) {
     let now_ms = wall_clock().0;
     list.retain(|_, until| *until > now_ms);
     if list.len() >= REMEMBERED

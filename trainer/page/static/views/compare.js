@@ -1,11 +1,12 @@
 //! Runs beside each other: curves in one chart with one cursor, the settings that differ, and what came of them.
 
-import { get, runPath } from "../api.js";
+import { CallError, get, registry, runPath } from "../api.js";
 import { Chart, inOrder, inWords, series } from "../chart.js";
 import { count, number, plain } from "../format.js";
 import { lineClass, swatch } from "../marks.js";
 import { badge, isDone, isOver, mainStages, runState } from "../parts.js";
 import { address, remember } from "../router.js";
+import { may } from "../session.js";
 import { flat, inText, settingsOf } from "../settings.js";
 import { html, nothing } from "../vendor/lit-html.js";
 
@@ -26,6 +27,8 @@ export function compare(context) {
   let curves = [];
   /** @type {Map<string, Chart>} */
   const charts = new Map();
+  /** The newest version that each run made. @type {Map<string, string>} */
+  const made = new Map();
   let beats = 0;
   let asked = "";
 
@@ -39,7 +42,29 @@ export function compare(context) {
       curves = await series({ runs: names, axis, points: names.length > 8 ? 300 : 600, keys: await keysOf(signal) }, signal);
       asked = question;
     }
+    if (beats === 0) await versions(signal);
     beats += 1;
+  }
+
+  /** Finds the versions of models that the runs made. @param {AbortSignal} signal */
+  async function versions(signal) {
+    const models = new Set([...settings.values()].flatMap((known) => known.stages).flatMap(({ settings: values }) => (typeof values?.model === "string" && values.from !== undefined ? [values.model] : [])));
+    for (const model of [...models].slice(0, 8)) {
+      try {
+        const shown = /** @type {{versions: Version[]}} */ (await registry({ command: "show", reference: model }, signal));
+        for (const { version, source } of shown.versions) if (typeof source?.run === "string" && names.includes(source.run)) made.set(source.run, `${model}:${version}`);
+      } catch (error) {
+        // A model that was not registered yet.
+        if (!(error instanceof CallError) || error.isAway) throw error;
+      }
+    }
+  }
+
+  /** Motions of each with one seed are drawn in the playground. */
+  function motions() {
+    const models = names.flatMap((name) => made.get(name) ?? []).slice(0, 4);
+    if (models.length === 0 || !may("submit")) return nothing;
+    return html`<section aria-labelledby="motions"><h2 id="motions">Motions</h2><p class="card row"><span class="dim grow">${models.join(", ")}, side by side with one sentence and one seed</span><a class="button main" href=${`/draw?${models.map((model) => `model=${encodeURIComponent(model)}`).join("&")}`}>Draw with each</a></p></section>`;
   }
 
   /** Keys of the charts in sight: those of many runs in full would be more than a server gives at once. @param {AbortSignal} signal */
@@ -178,7 +203,7 @@ export function compare(context) {
         const run = runs.find((run) => run.run === name);
         return html`<li class=${lineClass(at)}>${swatch(at)}<a href=${address("runs", name)}>${name}</a>${run ? badge(runState(run)) : nothing}<button type="button" class="quiet" aria-label=${`Leave out ${name}`} @click=${() => drop(name)}>✕</button></li>`;
       })}</ul>
-      ${curveSection()}${results()}${settingSection()}`;
+      ${curveSection()}${results()}${motions()}${settingSection()}`;
   }
 
   const close = () => {

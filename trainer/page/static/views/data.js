@@ -42,13 +42,14 @@ export function dataset(context, digest) {
   let [words, split, shown] = [query.get("q") ?? "", query.get("split") ?? "all", PAGE];
   /** @type {string} */
   let playing = query.get("clip") ?? "";
-  let [wrong, busy, drawn, begun] = ["", "", false, false];
+  let [wrong, busy, drawn, begun, report] = ["", "", false, false, ""];
 
   /** @param {AbortSignal} signal */
   async function load(signal) {
     if (begun) return;
     try {
       await clips.open(signal);
+      report = await clips.report(signal);
     } catch (error) {
       if (error instanceof CallError || signal.aborted) throw error;
       wrong = error instanceof Error ? error.message : String(error);
@@ -107,6 +108,7 @@ export function dataset(context, digest) {
       <p class="dim" role="status">${count(found.length, "example")}</p>
       ${found.length === 0 ? nothing : html`<ul class="list card clips">${found.slice(0, shown).map((entry) => html`<li class=${entry.id === playing ? "playing" : ""}><button type="button" class="quiet" aria-label=${`Play ${plain(entry.id)}`} ?disabled=${busy === entry.id} @click=${() => play(entry)}>▸</button>
         <div class="grow"><p dir="auto">${captionsOf(entry).slice(0, 3).map((text, at) => html`${at > 0 ? html`<span class="dim"> · </span>` : nothing}${plain(text)}`)}</p><p class="dim small">${plain(entry.id)} · ${number(entry.len / fps)} s · ${entry.split}${entry.captions.length > 3 ? ` · ${entry.captions.length} captions` : ""}</p></div></li>`)}</ul>`}
+      ${report ? html`<details class="values" ?open=${/left out: [1-9]/.test(report)}><summary>What was left out, and why</summary><pre class="source" tabindex="0">${plain(report)}</pre></details>` : nothing}
       ${found.length > shown ? html`<p class="center"><button type="button" @click=${() => { shown += PAGE; context.draw(); }}>More</button></p>` : nothing}`;
   }
 

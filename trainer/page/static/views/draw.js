@@ -9,7 +9,8 @@ import { count, number, plain } from "../format.js";
 import { Figures, together } from "../motions.js";
 import { badge, command, failed, firstLine, isDone, joinCommand, prose } from "../parts.js";
 import { address, remember } from "../router.js";
-import { may } from "../session.js";
+import { currentWho, may } from "../session.js";
+import { Stream } from "../stream.js";
 import { html, nothing } from "../vendor/lit-html.js";
 
 /** Limits of a draw. */
@@ -44,6 +45,8 @@ export function draw(context) {
   let pages = [];
   let [busy, wrong, hint, drawn] = [false, "", "", false];
   let left = false;
+  const stream = new Stream(context.draw);
+  let words = "";
 
   /** @param {AbortSignal} signal */
   async function load(signal) {
@@ -157,6 +160,40 @@ export function draw(context) {
     </form>`;
   }
 
+  /** Says a sentence to the stream, which is opened for the first one. */
+  async function speak() {
+    const sentence = words.trim() || lines()[0];
+    if (!sentence) return;
+    try {
+      if (stream.socket) stream.say(sentence);
+      else await stream.open(sentence);
+    } catch (error) {
+      if (!(error instanceof CallError)) throw error;
+      stream.wrong = error.message;
+    }
+    context.draw();
+  }
+
+  function live() {
+    if (!currentWho()?.streams || !may("submit")) return nothing;
+    const on = stream.socket !== null;
+    /** @param {SubmitEvent} event */
+    const submit = (event) => {
+      event.preventDefault();
+      void speak();
+    };
+    const stop = () => {
+      stream.close();
+      context.draw();
+    };
+    return html`<section aria-labelledby="live"><h2 id="live">Live</h2>
+      <form class="card row" @submit=${submit}><label class="field grow"><span class="unseen">Next sentence</span><input maxlength="1000" autocomplete="off" placeholder=${lines()[0] ?? "a person walks"} .value=${words} @input=${(/** @type {Event} */ event) => (words = /** @type {HTMLInputElement} */ (event.currentTarget).value)}></label>
+        <button type="submit" class="main">${on ? "Say it" : "Start"}</button>${on ? html`<button type="button" @click=${stop}>Stop</button>` : nothing}</form>
+      ${stream.wrong ? html`<p class="wrong" role="alert">${prose(stream.wrong)}</p>` : nothing}
+      <p class="dim" role="status" dir="auto">${!on ? "Motion without end: each sentence takes over from the one before." : stream.sentence ? `${plain(stream.sentence)} · took over after ${number(stream.delay)} s` : "Opening…"}</p>
+      ${stream.shown ? stream.element : nothing}</section>`;
+  }
+
   function progress() {
     if (wrong) return html`<p class="wrong" role="alert">${prose(wrong)}${hint ? html` <span class="dim">${prose(hint)}</span>` : nothing}</p>`;
     const run = shown?.run;
@@ -188,7 +225,7 @@ export function draw(context) {
         : may("submit")
           ? form()
           : html`<p class="card dim">Drawing needs a token with the scope <code>submit</code>. Here a command draws: <code>trainer generate</code>.</p>`}
-      ${progress()}${drawn ? figures.element : nothing}
+      ${progress()}${drawn ? figures.element : nothing}${live()}
       ${drawn ? html`<section aria-labelledby="take"><h2 id="take">Take it along</h2>
         <p>Under each motion are its files. A page with all of them: ${pages.map(({ text, digest, name }, at) => html`${at > 0 ? ", " : ""}<a href=${`/v1/blobs/${encodeURIComponent(digest)}`} download=${name}>${text}</a>`)}.</p>
         <p class="dim">A link to this page draws the same again${byCommand ? ", as does the command:" : "."}</p>${byCommand && shown ? command(asCommand(shown), context) : nothing}</section>` : nothing}`;
@@ -196,6 +233,7 @@ export function draw(context) {
 
   const close = () => {
     left = true;
+    stream.close();
     figures.close();
   };
   return { title: "Draw", every: 0, load, render, close };

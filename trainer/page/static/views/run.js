@@ -290,6 +290,13 @@ export function run(context, name) {
         <tbody>${made.flatMap((stage) => Object.entries(stage.outputs).map(([output, digest]) => html`<tr><th scope="row"><a href=${address("runs", run.run, stage.name)}>${stage.name}</a></th><td>${output}</td><td><code title=${digest}>${short(digest)}</code></td></tr>`))}</tbody></table></div></section>`;
   }
 
+  /** Links to the models that its stages made versions of. @param {Run} run */
+  function registered(run) {
+    const made = (settings?.stages ?? []).filter(({ stage }) => run.stages.some((other) => other.name === stage && other.kind === "register" && isDone(other)));
+    const models = [...new Set(made.map(({ settings }) => settings).flatMap((values) => (typeof values?.model === "string" ? [values.model] : [])))];
+    return models.length === 0 ? "" : models.map((model, at) => html`${at > 0 ? ", " : ""}<a href=${address("models", model)}>${model}</a>`);
+  }
+
   /** Time on the clock, which is more than the work if it waited, and less if stages ran side by side. @param {Run} run */
   function took(run) {
     const { started_ms: from, ended_ms: to } = run.times ?? {};
@@ -308,7 +315,7 @@ export function run(context, name) {
       <div class="row head"><h1 tabindex="-1">${run.run}</h1>${badge(state)}<span class="grow"></span>${buttons(run)}</div>
       ${cause(run)}${waits(run)}
       <div class="card summary">${isOver(run) ? nothing : bar(part, "All stages")}
-        <dl class="facts">${fact("Stages", `${done} of ${all}`)}${fact("Submitted", run.times?.created_ms ? html`<span title=${date(run.times.created_ms)}>${ago(run.times.created_ms, serverNow())}</span>` : "")}${fact("Took", took(run))}${fact("Work", seconds > 0 ? duration(seconds) : "")}${fact("Pipeline", run.pipeline)}${fact("Owner", run.owner?.project ? `${run.owner.name} (${run.owner.project})` : (run.owner?.name ?? ""))}${fact("Now", isOver(run) || !reason(run) ? "" : prose(reason(run)))}</dl></div>
+        <dl class="facts">${fact("Stages", `${done} of ${all}`)}${fact("Submitted", run.times?.created_ms ? html`<span title=${date(run.times.created_ms)}>${ago(run.times.created_ms, serverNow())}</span>` : "")}${fact("Took", took(run))}${fact("Work", seconds > 0 ? duration(seconds) : "")}${fact("Pipeline", run.pipeline)}${fact("Owner", run.owner?.project ? `${run.owner.name} (${run.owner.project})` : (run.owner?.name ?? ""))}${fact("Made", registered(run))}${fact("Now", isOver(run) || !reason(run) ? "" : prose(reason(run)))}</dl></div>
       ${sweeps(run)}
       <section aria-labelledby="stages"><h2 id="stages">Stages</h2>
         ${stages.length > 1 && stages.length <= MOST && stages.some((stage) => stage.needs?.length) ? graph(run, stages, why) : nothing}

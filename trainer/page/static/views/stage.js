@@ -3,12 +3,13 @@
 import { get, runPath } from "../api.js";
 import { OTHERWISE, whatToDo } from "../advice.js";
 import { Chart, curves, inOrder, inWords, series } from "../chart.js";
-import { count, duration, grouped, number, plain, short } from "../format.js";
-import { History } from "../history.js";
+import { count, date, duration, grouped, number, plain, rate, short, time } from "../format.js";
+import { attemptsOf, History } from "../history.js";
 import { Log } from "../log.js";
 import { badge, bar, command, fact, firstLine, isOver, joinCommand, left, pace, prose, share } from "../parts.js";
 import { Rates } from "../rates.js";
 import { address } from "../router.js";
+import { serverNow } from "../session.js";
 import { inWords as whyInWords, reasons, settingsOf } from "../settings.js";
 import { Thumbnails } from "../thumbnails.js";
 import { html, nothing } from "../vendor/lit-html.js";
@@ -110,6 +111,14 @@ export function stage(context, name, stageName) {
       <div class="card"><dl class="facts numbers">${names.map((name) => fact(name, number(it.metrics[name])))}</dl></div></section>`;
   }
 
+  function attempts() {
+    const all = attemptsOf(history?.rows ?? [], stageName).slice(-ROWS).reverse();
+    if (all.length === 0) return nothing;
+    return html`<section aria-labelledby="attempts"><h2 id="attempts">Attempts</h2><div class="card table" tabindex="0" role="group" aria-label="Attempts"><table><caption class="unseen">Attempts at ${stageName}, newest first</caption>
+      <thead><tr><th scope="col">Attempt</th><th scope="col">Worker</th><th scope="col">Began</th><th scope="col" class="num">Took</th><th scope="col">Ended</th></tr></thead>
+      <tbody>${all.map(({ number: attempt, worker, from, to, end }) => html`<tr><th scope="row">${attempt ?? ""}</th><td>${worker}</td><td class="dim" title=${date(from)}>${time(from)}</td><td class="num">${duration(((to ?? serverNow()) - from) / 1000)}</td><td dir="auto">${to === null ? html`<span class="dim">at work</span>` : html`<span class="clamp">${prose(plain(end))}</span>`}</td></tr>`)}</tbody></table></div></section>`;
+  }
+
   function render() {
     const it = find();
     if (!run) return nothing;
@@ -127,6 +136,7 @@ export function stage(context, name, stageName) {
         <dl class="facts">
           ${fact("Progress", it.progress.total > 0 ? pace(it, it.state === "running" ? perSecond : undefined) : "")}
           ${fact("Left", it.state === "running" ? left(it, perSecond) : "")}
+          ${fact("Speed", it.state === "ran" && it.wall_s > 0 && it.progress.total > 1 ? rate(it.progress.total / it.wall_s, it.progress.unit) : "")}
           ${fact("Time", it.wall_s > 0 ? duration(it.wall_s) : "")}
           ${fact("Why", because)}
           ${fact("Attempt", it.attempt > 0 ? String(it.attempt) : "")}
@@ -138,7 +148,7 @@ export function stage(context, name, stageName) {
           ${Object.entries(it.outputs).map(([output, digest]) => fact(`Gives ${output}`, html`<code title=${digest}>${short(digest)}</code>`))}
           ${fact("State", it.state !== "failed" && !it.wants_workers ? firstLine(it.message) : "")}
         </dl></div>
-      ${curvesOf()}${thumbnails.render()}${numbers(it)}${log.render()}`;
+      ${curvesOf()}${thumbnails.render()}${numbers(it)}${attempts()}${log.render()}`;
   }
 
   const close = () => {

@@ -234,6 +234,8 @@ impl StreamServer {
                 Some("try again when a stream has ended, or start the server with a larger `--streams`".to_owned());
             return refuse(StatusCode::SERVICE_UNAVAILABLE, "busy", message, hint);
         }
+        // A browser expects one of the subprotocols that it asked for.
+        let upgrade = upgrade.protocols([coordinator::shell::STREAM_PROTOCOL]);
         let upgrade = upgrade.max_message_size(MOST_BYTES).max_frame_size(MOST_BYTES);
         upgrade.max_write_buffer_size(WRITE_BYTES).on_upgrade(move |socket| async move {
             self.converse(socket).await;

@@ -115,8 +115,10 @@ fn cases(lab: &Lab, kind: &Kind, method: &'static str, path: &'static str) -> Op
                 case(path.replace("{digest}", &lab.artifacts[&project].to_string()), Value::Null, Expected::Done);
             }
         }
-        // No cases here: `promotion` tests submissions, `draws` tests draws, and `registry` tests bundles.
-        ("POST", "/v1/runs" | "/v1/draws" | "/v1/bundles") => {}
+        ("GET", "/v1/storage") => case(path.to_owned(), Value::Null, admin),
+        // No cases here: `promotion` tests submissions, `draws` tests draws, `registry` tests bundles, and `page` tests
+        // tickets, which name no object.
+        ("POST", "/v1/runs" | "/v1/draws" | "/v1/tickets" | "/v1/bundles") => {}
         ("POST", "/v1/registry") => {
             for project in Project::ALL {
                 let model = project.model();

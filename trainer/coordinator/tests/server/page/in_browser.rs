@@ -49,7 +49,8 @@ pub(super) async fn call<T: Serialize>(
 pub(super) async fn submit(server: &Server, name: &str, lr: &str) -> TestResult<RunId> {
     let text = pipeline(name, lr);
     let pipeline = pipeline::read("p.yaml", &text, &[]).map_err(|mistakes| mistakes.to_string())?;
-    let submit = Submit { pipeline: serde_json::to_value(pipeline)?, source: text, idempotency_key: None, until: None };
+    let source = format!("{text}# {HOSTILE}\n");
+    let submit = Submit { pipeline: serde_json::to_value(pipeline)?, source, idempotency_key: None, until: None };
     let answer = call(server, SECRET, Method::POST, "/v1/runs", &submit).await?;
     Ok(answer["run"].as_str().ok_or("a run")?.into())
 }

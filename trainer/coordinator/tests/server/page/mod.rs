@@ -6,4 +6,6 @@ mod draw;
 mod files;
 pub(crate) mod http;
 mod in_browser;
+mod lines;
 mod sessions;
+mod tickets;

@@ -1,5 +1,5 @@
-/** What the page uses of uPlot. */
-export default class uPlot {
+/** What the page uses of uPlot, which a script of the document makes global. */
+declare class uPlot {
   constructor(options: object, data: (number | null)[][], element: HTMLElement);
   static sync(key: string): { key: string };
   static join(tables: (number | null)[][][]): (number | null)[][];
