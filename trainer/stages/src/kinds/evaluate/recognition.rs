@@ -262,7 +262,7 @@ impl Recognition<'_> {
         let motions: Vec<draw::Row> = first
             .map(|d| draw::Row {
                 title: dataset.captions[d.asked.caption].text.clone(),
-                note: format!("{}, {}", self.0.model, self.0.sampler),
+                note: self.0.sampler.to_string(),
                 joints: recover_joints(&d.rows, skeleton),
             })
             .collect();
