@@ -74,7 +74,8 @@ async fn a_promotion_from_the_first_gate_to_the_rollback() {
     assert_eq!(
         stderr(&refused),
         "error: quickstart:2 cannot be promoted to `prod`: `latent_fid<=0.1`: latent_fid is 0.2, bound 0.1: it misses by 0.1\n\n\
-         hint: nothing was changed; `registry show MODEL` lists every version with its metrics\n"
+         hint: nothing was changed; `registry show MODEL` lists every version with its metrics\n\
+         more: trainer explain gate\n"
     );
     assert!(stdout(&registry(store, &["history", "quickstart"])).contains("no alias of `quickstart` has moved yet"));
 

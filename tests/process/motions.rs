@@ -89,7 +89,10 @@ pub(crate) fn are_written(bench: &Bench) {
     let models = said["models"].as_array().expect("models").len();
     assert!(models >= 3, "teacher and students: {said}");
     let page = fs::read_to_string(at("g.html")).expect("the page");
-    assert_eq!(page.matches("<figure>").count(), 2 * models);
+    assert_eq!(page.matches("<figure>").count(), 2 * models + 1, "two seeds of each model and a real clip");
+    assert!(page.contains("real clip"), "the nearest clip of the training data is beside them");
+    let said = bench.run(&[&gallery[..], &["--no-real"]].concat()).expect_code(0).json();
+    assert_eq!(said["motions"], 2 * models);
 
     for (line, words) in [
         (&["generate", "x", "--model", "smoke@staging", "-o", "x.fbx"][..], "ends in .bvh, .glb"),

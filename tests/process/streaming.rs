@@ -34,7 +34,7 @@ stages:
   fid: {kind: evaluate.latent_fid, model: lcm, teacher: mld, sampler: {steps: 1, guidance: 2}, repeats: 2, components: 4, shards: 1}
   told: {kind: evaluate.control, joints: [pelvis], percent: [25], sampler: {steps: 1, guidance: 2}, repeats: 1, split: test, all_if_small: true, shards: 1}
   base: {kind: register, model: base, from: [lcm], metric: latent_fid, promote: {to: staging}}
-  release: {kind: register, model: motionlcm-control-mini, from: [control], metric: average_error, promote: {to: staging}}
+  release: {kind: register, model: control-quickstart, from: [control], metric: average_error, promote: {to: staging}}
   foreign: {kind: register, model: foreign, from: [other], sampler: {steps: 4, guidance: 2}}
   tokenizer: {kind: train.tokenizer, codes: 16, code_dim: 8, quantizers: 1, network: {width: 16, depth: 2, growth: 2}, window: 16, steps: 10, batch: {global: 4, slices: 1}, lr: 1e-3, warmup: 2}
   tokens: {kind: encode.tokens, tokenizer: tokenizer, shards: 1}
@@ -153,7 +153,7 @@ fn follows_a_path(bench: &Bench) {
 
 /// Refused inputs with their messages.
 fn mistakes(bench: &Bench) {
-    const CONTROL: [&str; 2] = ["--model", "motionlcm-control-mini@staging"];
+    const CONTROL: [&str; 2] = ["--model", "control-quickstart@staging"];
     let path = |rows: &str| {
         fs::write(bench.path().join("path.csv"), format!("t,joint,x,y,z\n{rows}")).expect("written");
     };
@@ -174,7 +174,7 @@ fn mistakes(bench: &Bench) {
     assert!(said.stderr.contains("no control part"), "{}", said.stderr);
     let said = bench.run(&[&base[..], &["--control-from", "foreign:1"]].concat()).expect_code(2);
     assert!(said.stderr.contains("registry show") && said.stderr.contains("denoiser"), "{}", said.stderr);
-    bench.run(&[&base[..], &["--control-part", "motionlcm-control-mini@staging"]].concat()).expect_code(0);
+    bench.run(&[&base[..], &["--control-part", "control-quickstart@staging"]].concat()).expect_code(0);
     let said = bench.run(&["generate", "walks", "--control-scale", "2", "-o", "w.npy", "--model", "base@staging"]);
     assert!(said.expect_code(2).stderr.contains("`--control-scale` has no effect without"));
     let said = bench.run(&["generate", "walks", "--refine", "1001", "-o", "w.npy", "--model", "base@staging"]);
@@ -275,7 +275,7 @@ fn send(socket: &mut Socket, text: &str) {
 
 /// Streams over a WebSocket.
 fn is_served(bench: &Bench) {
-    let model = ["generate", "--stream", "--model", "motionlcm-control-mini@staging"];
+    let model = ["generate", "--stream", "--model", "control-quickstart@staging"];
     let said = bench.run(&[&model[..], &["--listen", "127.0.0.1:0"]].concat()).expect_code(2);
     assert!(said.stderr.contains("--listen-token-file"), "{}", said.stderr);
     let tokens = bench.path().join("stream.tokens");
@@ -343,7 +343,7 @@ fn is_served(bench: &Bench) {
 #[test]
 fn motion_without_end() {
     let bench = bench();
-    goes_on(&bench, &["--model", "motionlcm-control-mini@staging"], "control");
+    goes_on(&bench, &["--model", "control-quickstart@staging"], "control");
     goes_on(&bench, &["--stage", "momask"], "infilling");
     goes_on(&bench, &["--model", "base@staging"], "placement");
     follows_a_path(&bench);
@@ -351,7 +351,7 @@ fn motion_without_end() {
     is_read_as_it_goes(&bench);
     is_served(&bench);
     // The registry shows the base of the control part.
-    let shown = bench.run(&["registry", "show", "motionlcm-control-mini@staging"]).expect_code(0).stdout;
+    let shown = bench.run(&["registry", "show", "control-quickstart@staging"]).expect_code(0).stdout;
     assert!(shown.contains("control for denoiser=") && shown.contains("bases       base:1\n"), "{shown}");
     let shown = bench.run(&["registry", "show", "foreign:1", "-o", "json"]).expect_code(0).json();
     assert!(shown.get("bases").is_none(), "its base is not registered: {shown}");

@@ -10,6 +10,8 @@ use cluster_tests::{book, documented};
 const README: (usize, usize) = (900, 120);
 /// Words of a paragraph.
 const PARAGRAPH: usize = 90;
+/// Words of a sentence: the largest mean, and the largest number.
+const SENTENCE: (f64, usize) = (18.0, 30);
 /// Characters of a line of a table.
 const TABLE_LINE: usize = 200;
 
@@ -138,6 +140,49 @@ fn paragraphs_and_tables_can_be_read() {
         }
     }
     assert!(long.is_empty(), "{}", long.join("\n"));
+}
+
+/// Words of each sentence of README and of the book, with its place. Code counts as one word.
+fn sentence_lengths(path: &Path) -> Vec<(String, usize)> {
+    let mut lengths = Vec::new();
+    for (line, paragraph) in book::paragraphs(&book::expanded(path)) {
+        let code = paragraph.split('`').enumerate();
+        let plain: String = code.map(|(i, part)| if i % 2 == 0 { part } else { "X" }).collect();
+        let mut words = 0;
+        for word in plain.split_whitespace() {
+            words += 1;
+            if word.trim_end_matches([')', '*', '"', ']']).ends_with(['.', '!', '?', ':']) {
+                lengths.push((format!("{}:{line}", path.display()), words));
+                words = 0;
+            }
+        }
+        if words > 0 {
+            lengths.push((format!("{}:{line}", path.display()), words));
+        }
+    }
+    lengths
+}
+
+#[test]
+fn sentences_of_the_readme_and_the_book_are_short() {
+    let root = root();
+    let mut files: BTreeSet<PathBuf> = BTreeSet::from([root.join("README.md")]);
+    files_below(&book::source(&root), &mut files);
+    // Decisions and the threat model are documents for developers, which the book includes.
+    files.retain(|path| !path.ends_with("decisions.md") && !path.ends_with("threat-model.md"));
+    let all: Vec<(String, usize)> = files.iter().flat_map(|path| sentence_lengths(path)).collect();
+    assert!(all.len() > 700, "{} sentences", all.len());
+    let long: Vec<&(String, usize)> = all.iter().filter(|(_, words)| *words > SENTENCE.1).collect();
+    assert!(long.is_empty(), "sentences of over {} words: {long:#?}", SENTENCE.1);
+    #[expect(clippy::cast_precision_loss, reason = "counts of words")]
+    let mean = all.iter().map(|(_, words)| *words).sum::<usize>() as f64 / all.len() as f64;
+    assert!(mean <= SENTENCE.0, "{mean:.1} words a sentence");
+
+    let folder = tempfile::tempdir().expect("a folder");
+    let document = folder.path().join("a.md");
+    fs::write(&document, "# A title\n\nOne `a b c` two. Three:\n\n- four five\n\n| six |\n").expect("written");
+    let lengths: Vec<usize> = sentence_lengths(&document).into_iter().map(|(_, words)| words).collect();
+    assert_eq!(lengths, [3, 1, 3], "code is a word, and an item has its mark");
 }
 
 #[test]

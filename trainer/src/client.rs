@@ -113,6 +113,7 @@ impl Client {
         };
         let mut problem = Problem::new(code, anyhow::anyhow!("{}", error.message));
         problem.hint = error.hint;
+        problem.code = Some(error.code);
         Err(problem)
     }
 

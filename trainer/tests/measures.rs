@@ -93,7 +93,7 @@ fn models_of_motion_are_models(bench: &Bench, generate: &dyn Fn(&[&str]) -> serd
     bench.run(&[&["run", &config], &sets[..]].concat()).expect_code(0);
     let own = generate(&["--model", "motion@staging", "--frames", "44"]);
     assert_eq!((&own["frames"], &own["sampler"]["steps"]), (&44.into(), &4.into()), "{own}");
-    generate(&["--stage", "smf", "--frames", "44", "--steps", "3", "--solver", "ddim"]);
+    generate(&["--stage", "smf", "--frames", "44", "--steps", "3", "--sampler", "solver=ddim"]);
     let shown = bench.run(&["registry", "show", "motion@staging"]).expect_code(0).stdout;
     assert!(shown.contains("feature-diffusion, humanml3d") && shown.contains("denoiser="), "{shown}");
     let time = ["time", "motion@staging", "--sentences", "2", "--frames", "40", "-o", "json"];
@@ -201,15 +201,16 @@ fn models_are_drawn_as_they_were_measured(bench: &Bench) {
 
     let teacher = generate(&["--stage", "mld"]);
     assert_eq!((&teacher["sampler"]["steps"], &teacher["sampler"]["guidance"]), (&4.into(), &3.0.into()), "{teacher}");
-    let started = generate(&["--stage", "lcm", "--timesteps", "799"]);
+    let started = generate(&["--stage", "lcm", "--sampler", "timesteps=799"]);
     assert_eq!(
         started["sampler"],
         serde_json::json!({"steps": 1, "guidance": 2.5, "timesteps": [799], "solver": "own", "footing": false}),
         "{started}"
     );
-    let refused = bench.run(&["generate", "x", "--stage", "pcm", "--timesteps", "799", "-o", "x.npy"]).expect_code(2);
+    let refused =
+        bench.run(&["generate", "x", "--stage", "pcm", "--sampler", "timesteps=799", "-o", "x.npy"]).expect_code(2);
     assert!(refused.stderr.contains("LCM students"), "{}", refused.stderr);
-    let solved = generate(&["--stage", "mld", "--solver", "dpm-solver++"]);
+    let solved = generate(&["--stage", "mld", "--sampler", "solver=dpm-solver++"]);
     assert_eq!(solved["sampler"]["solver"], "dpm-solver++", "{solved}");
     models_of_motion_are_models(bench, &generate);
     motion_goes_where_it_is_told(bench, &generate);

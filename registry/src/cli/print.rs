@@ -35,14 +35,15 @@ pub(super) fn show(answer: &Answer, output: Output) -> io::Result<()> {
     answer.error.as_ref().map_or(Ok(()), |error| show_error(error, output))
 }
 
-/// Prints an error to stderr: message, empty line and hint, or one JSON object.
+/// Prints an error to stderr: message, empty line, hint and the command that explains it, or one JSON object.
 pub fn show_error(error: &ApiError, output: Output) -> io::Result<()> {
     let mut stderr = io::stderr().lock();
     match output {
         Output::Json => writeln!(stderr, "{}", printable(&format!("{:#}", json!({ "error": error })))),
         Output::Table => {
             writeln!(stderr, "error: {}", printable(&error.message))?;
-            error.hint.as_ref().map_or(Ok(()), |hint| writeln!(stderr, "\nhint: {}", printable(hint)))
+            let hint = error.hint.as_ref().map(|hint| format!("hint: {}\n", printable(hint))).unwrap_or_default();
+            writeln!(stderr, "\n{hint}more: trainer explain {}", printable(&error.code))
         }
     }
 }

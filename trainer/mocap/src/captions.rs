@@ -62,6 +62,33 @@ pub fn sentence(text: &str) -> Result<Caption, String> {
     }
 }
 
+/// Makes a sentence of a file's name: its words without numbers, in small letters. It is empty if the name has none.
+pub fn from_name(stem: &str) -> String {
+    let mut words = String::new();
+    let mut before = ' ';
+    for c in stem.chars() {
+        // `WalkFast` is two words.
+        if !c.is_alphabetic() || (c.is_uppercase() && before.is_lowercase()) {
+            words.push(' ');
+        }
+        if c.is_alphabetic() {
+            words.extend(c.to_lowercase());
+        }
+        before = c;
+    }
+    words.split_whitespace().collect::<Vec<_>>().join(" ")
+}
+
+/// Writes a table of captions, one row per clip and sentence, that [`of_table`] reads.
+pub fn to_table(rows: &[(String, String)]) -> String {
+    let quoted = |text: &str| match text.contains([',', '"', '\n']) {
+        true => format!("\"{}\"", text.replace('"', "\"\"")),
+        false => text.to_owned(),
+    };
+    let rows = rows.iter().map(|(clip, caption)| format!("{},{}\n", quoted(clip), quoted(caption)));
+    std::iter::once("clip,caption\n".to_owned()).chain(rows).collect()
+}
+
 /// Reads the captions of a text file.
 ///
 /// # Errors
@@ -280,6 +307,19 @@ fn swap_words(text: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn names_of_files_become_captions_that_can_be_read_back() {
+        let names = ["walk_forward-02", "WalkFast", "000003", "Subject1 jumps, twice"];
+        let rows: Vec<(String, String)> = names.map(|name| (name.to_owned(), from_name(name))).to_vec();
+        let sentences: Vec<&str> = rows.iter().map(|(_, sentence)| sentence.as_str()).collect();
+        assert_eq!(sentences, ["walk forward", "walk fast", "", "subject jumps twice"]);
+        let refused = of_table(Path::new("c.csv"), &to_table(&rows)).unwrap_err();
+        assert!(refused.contains("c.csv:4: the caption is empty"), "{refused}");
+        let filled: Vec<(String, String)> = rows.into_iter().filter(|(_, sentence)| !sentence.is_empty()).collect();
+        let read = of_table(Path::new("c.csv"), &to_table(&filled)).unwrap();
+        assert_eq!((read[2].clip.as_str(), read[2].captions[0].text.as_str()), (names[3], "subject jumps twice"));
+    }
 
     #[test]
     fn tables_say_what_their_rows_say() {

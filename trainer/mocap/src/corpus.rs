@@ -55,6 +55,51 @@ pub struct Made {
     pub features: Vec<f32>,
 }
 
+/// Reason for leaving out a clip, a part of it or a caption.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+pub enum Why {
+    TooShort,
+    TooLong,
+    NoCaption,
+    /// The span of a caption has too few or too many frames.
+    CaptionSpan,
+    /// The folder's own lists do not have the clip.
+    NotListed,
+    /// The file cannot be read.
+    Broken,
+}
+
+impl Why {
+    /// The reason in words, after a count.
+    pub fn words(self) -> &'static str {
+        match self {
+            Self::TooShort => "too short to train on",
+            Self::TooLong => "too long; `cut: true` cuts such recordings",
+            Self::NoCaption => {
+                "without a caption; `trainer data captions FOLDER` writes captions by file name to correct"
+            }
+            Self::CaptionSpan => "captions of a span that is too short or too long",
+            Self::NotListed => "in none of train.txt, val.txt and test.txt",
+            Self::Broken => "that cannot be read",
+        }
+    }
+}
+
+/// A clip, a part of it or a caption that was left out.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct LeftOut {
+    pub why: Why,
+    /// Its name, and numbers.
+    pub what: String,
+}
+
+impl LeftOut {
+    /// Creates an entry.
+    pub fn new(why: Why, what: String) -> Self {
+        Self { why, what }
+    }
+}
+
 /// Result of one file.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct FromFile {
@@ -63,8 +108,8 @@ pub struct FromFile {
     pub said: String,
     /// The upward axis of the file.
     pub up: String,
-    /// Reasons for leaving out the file or a part of it.
-    pub left_out: Vec<String>,
+    /// Parts that were left out.
+    pub left_out: Vec<LeftOut>,
 }
 
 /// Reads the joints of `file` as `[T, J, 3]`, mapped to the skeleton of the recipe's format and resampled to its frame
@@ -157,15 +202,16 @@ pub fn clips_of(file: &ClipFile, recipe: &Recipe) -> Result<FromFile, String> {
     let frames = (joints.len() / width).saturating_sub(1);
     let mut made = FromFile { said, up: up.to_string(), ..FromFile::default() };
     if frames < skeleton.min_frames {
-        made.left_out
-            .push(format!("{}: {frames} frames at {} fps, needs {}", file.id, skeleton.fps, skeleton.min_frames));
+        let what = format!("{}: {frames} frames at {} fps, needs {}", file.id, skeleton.fps, skeleton.min_frames);
+        made.left_out.push(LeftOut::new(Why::TooShort, what));
         return Ok(made);
     }
     // The largest length of an example.
     let most = skeleton.max_frames - skeleton.unit;
     let parts = if frames < skeleton.max_frames { 1 } else { frames.div_ceil(most) };
     if parts > 1 && !recipe.cut {
-        made.left_out.push(format!("{}: {frames} frames, must be below {}", file.id, skeleton.max_frames));
+        let what = format!("{}: {frames} frames, must be below {}", file.id, skeleton.max_frames);
+        made.left_out.push(LeftOut::new(Why::TooLong, what));
         return Ok(made);
     }
     for part in 0..parts {
@@ -176,7 +222,7 @@ pub fn clips_of(file: &ClipFile, recipe: &Recipe) -> Result<FromFile, String> {
         let captions =
             captions_within(&file.captions, start as f64 / skeleton.fps, end as f64 / skeleton.fps, parts > 1);
         if captions.is_empty() {
-            made.left_out.push(format!("{id}: no caption"));
+            made.left_out.push(LeftOut::new(Why::NoCaption, format!("{id}: no caption")));
             continue;
         }
         let versions = [false, true].into_iter().filter(|twin| !twin || recipe.mirror);
@@ -232,7 +278,7 @@ pub struct Report {
     pub read: BTreeMap<String, (usize, String)>,
     /// Number of files by upward axis, with an example of each.
     pub axes: BTreeMap<String, (usize, String)>,
-    pub left_out: Vec<String>,
+    pub left_out: Vec<LeftOut>,
     pub notes: Vec<String>,
     /// Number of recordings and clips of each split.
     pub splits: BTreeMap<Split, (usize, usize)>,
@@ -250,11 +296,26 @@ impl fmt::Display for Report {
             writeln!(f, "note: {note}")?;
         }
         writeln!(f, "left out: {}", self.left_out.len())?;
-        self.left_out.iter().try_for_each(|what| writeln!(f, "  {what}"))
+        for (why, (count, _)) in self.reasons() {
+            writeln!(f, "  {count} {}", why.words())?;
+        }
+        if !self.left_out.is_empty() {
+            writeln!(f, "each of them:")?;
+        }
+        self.left_out.iter().try_for_each(|left| writeln!(f, "  {}", left.what))
     }
 }
 
 impl Report {
+    /// The number of omissions by reason, with an example of each.
+    pub fn reasons(&self) -> BTreeMap<Why, (usize, &str)> {
+        let mut reasons = BTreeMap::new();
+        for left in &self.left_out {
+            reasons.entry(left.why).or_insert((0, left.what.as_str())).0 += 1;
+        }
+        reasons
+    }
+
     /// Counts a file, and adds its omissions.
     pub fn add(&mut self, id: &str, file: &FromFile) {
         self.read.entry(file.said.clone()).or_insert_with(|| (0, id.to_owned())).0 += 1;
@@ -290,7 +351,7 @@ pub fn assemble(
     let mut sources: BTreeMap<Split, BTreeSet<String>> = BTreeMap::new();
     for (made, split) in made.into_iter().zip(splits) {
         let Some(split) = split else {
-            report.left_out.push(format!("{}: in none of train.txt, val.txt and test.txt", made.id));
+            report.left_out.push(LeftOut::new(Why::NotListed, format!("{}: not listed", made.id)));
             continue;
         };
         let clip = dataset.clips.len();
@@ -300,10 +361,10 @@ pub fn assemble(
         let before = dataset.entries.len();
         for Unusable { line, start, end } in dataset.add_entries(clip, split, &lines) {
             let what = format!("{}: caption {line} describes frames {start} to {end}, too few or too many", made.id);
-            report.left_out.push(what);
+            report.left_out.push(LeftOut::new(Why::CaptionSpan, what));
         }
         if dataset.entries.len() == before {
-            report.left_out.push(format!("{}: no usable caption", made.id));
+            report.left_out.push(LeftOut::new(Why::NoCaption, format!("{}: no usable caption", made.id)));
             continue;
         }
         sources.entry(split).or_default().insert(made.source);

@@ -363,9 +363,15 @@ pub fn write_all(title: &str, sections: &[(String, Vec<&Motion>)], path: &Path) 
             if motions().any(|motion| motion.skeleton != first.skeleton) {
                 return refuse("motions of one skeleton");
             }
-            let rows: Vec<(String, Vec<f32>)> = motions().map(|m| (m.caption.clone(), m.joints.clone())).collect();
+            let row = |title: &str, m: &Motion| draw::Row {
+                title: if m.caption.contains(title) { m.caption.clone() } else { format!("{title}: {}", m.caption) },
+                note: m.note.clone(),
+                joints: m.joints.clone(),
+            };
+            let rows: Vec<draw::Row> =
+                sections.iter().flat_map(|(title, motions)| motions.iter().map(|m| row(title, m))).collect();
             let given = draw::Given { waypoints: &first.waypoints, kept: &first.kept };
-            draw::strip_png_along(&rows, POSES, first.skeleton, given, path).map_err(io)?;
+            draw::sheet(&rows, POSES, first.skeleton, given, path).map_err(io)?;
         }
         Form::Bvh | Form::Glb | Form::Gif | Form::Npy | Form::Mp4 => {
             let Some(first) = motions().next().filter(|_| count == 1) else { return refuse("one") };

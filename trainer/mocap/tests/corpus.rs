@@ -203,8 +203,10 @@ fn long_takes_are_cut_and_short_ones_left_out() {
     assert_eq!(ids, [("long-1", 150, 1), ("long-2", 150, 2), ("long-3", 150, 1)]);
     assert_eq!((made[1].captions[1].from_s, made[1].captions[1].to_s), (0.5, 6.5));
     assert!(made.iter().all(|clip| clip.source == "long"));
-    assert!(report.left_out.iter().any(|s| s.contains("short: 29 frames")), "{report}");
-    assert!(report.left_out.iter().any(|s| s.contains("bare: no caption")), "{report}");
+    let text = report.to_string();
+    assert!(text.contains("  1 too short to train on\n") && text.contains("  short: 29 frames"), "{text}");
+    assert!(text.contains("  1 without a caption; `trainer data captions FOLDER`"), "{text}");
+    assert!(text.contains("  bare: no caption"), "{text}");
     let uncut = Recipe { cut: false, ..recipe(DataFormat::Humanml3d, None) };
     assert!(make(&listing, &uncut).0.is_empty());
     // The same recordings as 21 joints of KIT-ML, whose target skeleton must be given.

@@ -24,7 +24,13 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         })
         .collect::<Result<_, &str>>()?;
     for (i, part) in motions.chunks(7).enumerate() {
-        draw::strip_png(part, 10, skeleton, &folder.join(format!("sheet-{first}-{i}.png")))?;
+        let row = |(title, joints): &(String, Vec<f32>)| draw::Row {
+            title: title.clone(),
+            note: String::new(),
+            joints: joints.clone(),
+        };
+        let rows: Vec<draw::Row> = part.iter().map(row).collect();
+        draw::sheet(&rows, 10, skeleton, draw::Given::default(), &folder.join(format!("sheet-{first}-{i}.png")))?;
     }
     for (name, joints) in motions.iter().take(4) {
         draw::gif(joints, skeleton, name, &folder.join(format!("{}.gif", &name[..6])))?;

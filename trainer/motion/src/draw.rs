@@ -1,7 +1,7 @@
 //! Pictures of motion: an animated stick figure, and a sheet of poses over time.
 //!
-//! A small rasteriser of our own: orthographic projection from a 3/4 view, anti-aliased thick lines, a built-in 5x7
-//! font. Joints are `[T, J, 3]` in the skeleton's units with y up.
+//! Orthographic projection from a 3/4 view, anti-aliased lines and letters. A sheet has the time below each pose and the
+//! way from above behind each row. Joints are `[T, J, 3]` in the skeleton's units with y up.
 
 mod colours;
 mod font;
@@ -13,7 +13,7 @@ use std::io::{self, BufWriter, Write};
 use std::ops::Range;
 use std::path::Path;
 
-use colours::{BODY, GRID, INK, LEFT, PAPER, RIGHT, SHADOW, TOLD, TRAIL};
+use colours::{BODY, FAINT, GRID, INK, LEFT, PAPER, RIGHT, SHADOW, TOLD, TRAIL};
 use raster::{Canvas, Colour};
 
 use crate::skeleton::Skeleton;
@@ -56,6 +56,27 @@ fn colour_of(skeleton: &Skeleton, joint: usize) -> Colour {
         RIGHT
     } else {
         BODY
+    }
+}
+
+/// Height of the letters of titles, notes and small labels in pixels.
+const TITLE: f64 = 17.0;
+const NOTE: f64 = 13.0;
+const SMALL: f64 = 11.5;
+
+/// Draws the key of colours from `at` to the right. `kept` adds the pale figures of kept frames, `told` the targets.
+fn key(canvas: &mut Canvas, at: [f64; 2], kept: bool, told: bool) {
+    let all = [
+        (LEFT, "left side", true),
+        (RIGHT, "right side", true),
+        (SHADOW, "kept", kept),
+        (TOLD, "drawn", kept),
+        (TOLD, "target", told && !kept),
+    ];
+    let mut x = at[0];
+    for (colour, word, _) in all.into_iter().filter(|(_, _, shown)| *shown) {
+        canvas.line([x + 2.0, at[1] + 7.5], [x + 14.0, at[1] + 7.5], 5.0, colour);
+        x += 22.0 + font::draw(canvas, word, [x + 22.0, at[1]], SMALL, INK) + 16.0;
     }
 }
 
@@ -127,7 +148,7 @@ fn film(
 ) -> io::Result<()> {
     let [width, height] = FILM;
     let frames = frames_of(joints, skeleton)?;
-    let lines = font::wrap(title, width / 12 - 2);
+    let lines = font::wrap(title, TITLE, width as f64 - 24.0);
     let path: Vec<[f64; 3]> = (0..frames).map(|t| frame(joints, skeleton, t)[0]).collect();
     for t in 0..frames {
         let pose = frame(joints, skeleton, t);
@@ -138,17 +159,17 @@ fn film(
         };
         let mut canvas = Canvas::new(width, height, PAPER);
         ground(&mut canvas, &view, 3.5);
-        for pair in path[..=t].windows(2) {
-            let flat = |p: [f64; 3]| view.project([p[0], 0.0, p[2]]).0;
-            canvas.line(flat(pair[0]), flat(pair[1]), 2.5, TRAIL);
-        }
+        canvas.lines(path[..=t].iter().map(|p| view.project([p[0], 0.0, p[2]]).0), 2.5, TRAIL);
         told(&mut canvas, &view, waypoints, t);
         figure(&mut canvas, &view, skeleton, &pose, 1.0);
         for (i, line) in lines.iter().enumerate() {
-            font::draw(&mut canvas, line, [12.0, 12.0 + 20.0 * i as f64], 2, INK);
+            font::draw(&mut canvas, line, [12.0, 10.0 + 21.0 * i as f64], TITLE, INK);
         }
-        let clock = format!("{:.1} s", t as f64 / skeleton.fps);
-        font::draw(&mut canvas, &clock, [width as f64 - 60.0, height as f64 - 20.0], 1, INK);
+        let bottom = height as f64 - 24.0;
+        key(&mut canvas, [12.0, bottom], false, !waypoints.is_empty());
+        let clock = format!("{:.1} s of {:.1}", t as f64 / skeleton.fps, frames as f64 / skeleton.fps);
+        let x = width as f64 - 12.0 - font::width(&clock, SMALL);
+        font::draw(&mut canvas, &clock, [x, bottom], SMALL, INK);
         each(&canvas, t)?;
     }
     Ok(())
@@ -165,7 +186,7 @@ pub fn rgb_along_to(
     waypoints: &[Waypoint],
     mut out: impl Write,
 ) -> io::Result<()> {
-    film(joints, skeleton, title, waypoints, |canvas, _| out.write_all(canvas.bytes()))
+    film(joints, skeleton, title, waypoints, |canvas, _| out.write_all(&canvas.bytes()))
 }
 
 /// Writes an animated GIF: the motion at its own speed, with the camera following the root and `title` above.
@@ -242,17 +263,15 @@ fn frames_of(joints: &[f32], skeleton: &Skeleton) -> io::Result<usize> {
     Ok(joints.len() / width)
 }
 
-/// Writes a PNG with one row per motion: its name, and `poses` poses spread over its time, side by side.
-///
-/// # Errors
-/// If `out` fails, or a motion is not a whole number of frames.
-pub fn strip_png_to(
-    motions: &[(String, Vec<f32>)],
-    poses: usize,
-    skeleton: &Skeleton,
-    out: impl Write,
-) -> io::Result<()> {
-    strip_png_along_to(motions, poses, skeleton, Given::default(), out)
+/// A motion of a sheet.
+#[derive(Debug, Clone)]
+pub struct Row {
+    /// Its sentence or name.
+    pub title: String,
+    /// Its origin, such as model, sampler and seed; may be empty.
+    pub note: String,
+    /// Positions `[T, J, 3]`.
+    pub joints: Vec<f32>,
 }
 
 /// Inputs of generated motions besides the text.
@@ -264,65 +283,88 @@ pub struct Given<'a> {
     pub kept: &'a [Range<usize>],
 }
 
-/// Like [`strip_png_to`]. Poses of kept frames are pale, and a line below each row marks their time. With waypoints,
-/// the first motion and its waypoints are shown from above at the bottom.
+/// Pixels between the poses of a sheet.
+const CELL: usize = 110;
+/// Height of a row of a sheet in pixels.
+const ROW: usize = 226;
+/// Width of the way from above behind each row.
+const WAY: usize = 176;
+/// Height of the key below the last row.
+const KEY: usize = 32;
+
+/// Width and height of a sheet in pixels.
+pub fn sheet_size(rows: usize, poses: usize, with_waypoints: bool) -> [usize; 2] {
+    [CELL * poses + 24 + WAY, ROW * rows + KEY + if with_waypoints { plan::HEIGHT } else { 0 }]
+}
+
+/// Writes a PNG with one row per motion: title and note, `poses` poses spread over its time with their seconds, and its
+/// way from above. Poses of kept frames are pale, and a line below each row marks their time. With waypoints, the first
+/// motion and its waypoints are shown from above at the bottom.
 ///
 /// # Errors
-/// As [`strip_png_to`].
-pub fn strip_png_along_to(
-    motions: &[(String, Vec<f32>)],
-    poses: usize,
-    skeleton: &Skeleton,
-    Given { waypoints, kept }: Given<'_>,
-    out: impl Write,
-) -> io::Result<()> {
-    const ROW: usize = 210;
-    let below = if waypoints.is_empty() { 0 } else { plan::HEIGHT };
-    let (width, height) = (CELL * poses + 24, ROW * motions.len() + below);
+/// If `out` fails, or a motion is not a whole number of frames.
+pub fn sheet_to(rows: &[Row], poses: usize, skeleton: &Skeleton, given: Given<'_>, out: impl Write) -> io::Result<()> {
+    let Given { waypoints, kept } = given;
+    let [width, height] = sheet_size(rows.len(), poses, !waypoints.is_empty());
     let mut canvas = Canvas::new(width, height, PAPER);
-    for (row, (name, joints)) in motions.iter().enumerate() {
-        let frames = frames_of(joints, skeleton)?;
-        let top = (row * ROW) as f64;
-        font::draw(&mut canvas, name, [12.0, top + 8.0], 2, INK);
-        for column in 0..poses {
-            let t = column * (frames - 1) / poses.saturating_sub(1).max(1);
-            let pose = frame(joints, skeleton, t);
-            let view = View {
-                scale: 78.0,
-                centre: [12.0 + CELL as f64 * (column as f64 + 0.5), top + 126.0],
-                looking_at: [pose[0][0], 0.85, pose[0][2]],
-            };
-            let floor = |dx: f64, dz: f64| view.project([pose[0][0] + dx, 0.0, pose[0][2] + dz]).0;
-            for (a, b) in [
-                ((-0.5, -0.5), (0.5, -0.5)),
-                ((0.5, -0.5), (0.5, 0.5)),
-                ((0.5, 0.5), (-0.5, 0.5)),
-                ((-0.5, 0.5), (-0.5, -0.5)),
-            ] {
-                canvas.line(floor(a.0, a.1), floor(b.0, b.1), 1.0, GRID);
-            }
-            let stayed = kept.iter().any(|span| span.contains(&t));
-            figure(&mut canvas, &view, skeleton, &pose, if stayed { 0.4 } else { 1.0 });
-        }
-        timeline(&mut canvas, top + ROW as f64, (frames, poses), kept);
+    for (i, row) in rows.iter().enumerate() {
+        sheet_row(&mut canvas, row, poses, skeleton, (ROW * i) as f64, kept)?;
     }
-    if let (Some((_, joints)), true) = (motions.first(), below > 0) {
-        let at = |t: usize, joint: usize| frame(joints, skeleton, t)[joint];
-        let frames = frames_of(joints, skeleton)?;
-        plan::draw(&mut canvas, (ROW * motions.len()) as f64, (frames, &at), waypoints);
+    let bottom = (ROW * rows.len()) as f64;
+    key(&mut canvas, [12.0, bottom + 8.0], !kept.is_empty(), !waypoints.is_empty());
+    if let (Some(row), false) = (rows.first(), waypoints.is_empty()) {
+        let at = |t: usize, joint: usize| frame(&row.joints, skeleton, t)[joint];
+        let frames = frames_of(&row.joints, skeleton)?;
+        plan::draw(&mut canvas, bottom + KEY as f64, (frames, &at), waypoints);
     }
     let mut encoder = png::Encoder::new(out, width as u32, height as u32);
     encoder.set_color(png::ColorType::Rgb);
     encoder.set_depth(png::BitDepth::Eight);
     let failed = |e: png::EncodingError| io::Error::other(e.to_string());
-    encoder.write_header().and_then(|mut w| w.write_image_data(canvas.bytes())).map_err(failed)
+    encoder.write_header().and_then(|mut w| w.write_image_data(&canvas.bytes())).map_err(failed)
 }
 
-/// Pixels between the poses of a sheet.
-const CELL: usize = 110;
+/// Draws a row of a sheet below `top`.
+fn sheet_row(
+    canvas: &mut Canvas,
+    Row { title, note, joints }: &Row,
+    poses: usize,
+    skeleton: &Skeleton,
+    top: f64,
+    kept: &[Range<usize>],
+) -> io::Result<()> {
+    let frames = frames_of(joints, skeleton)?;
+    let wide = canvas.width as f64 - 24.0;
+    let title = font::fit(title, TITLE, wide * 0.62);
+    let used = font::draw(canvas, &title, [12.0, top + 6.0], TITLE, INK);
+    let note = font::fit(note, NOTE, wide - used - 16.0);
+    font::draw(canvas, &note, [28.0 + used, top + 9.5], NOTE, FAINT);
+    for column in 0..poses {
+        let t = column * (frames - 1) / poses.saturating_sub(1).max(1);
+        let pose = frame(joints, skeleton, t);
+        let middle = 12.0 + CELL as f64 * (column as f64 + 0.5);
+        let [x, _, z] = pose[0];
+        let view = View { scale: 78.0, centre: [middle, top + 130.0], looking_at: [x, 0.85, z] };
+        let corners = [(-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5), (-0.5, -0.5)];
+        canvas.lines(corners.map(|(dx, dz)| view.project([x + dx, 0.0, z + dz]).0), 1.0, GRID);
+        let stayed = kept.iter().any(|span| span.contains(&t));
+        figure(canvas, &view, skeleton, &pose, if stayed { 0.4 } else { 1.0 });
+        if kept.is_empty() {
+            let clock = format!("{:.1} s", t as f64 / skeleton.fps);
+            let x = middle - font::width(&clock, SMALL) / 2.0;
+            font::draw(canvas, &clock, [x, top + ROW as f64 - 18.0], SMALL, FAINT);
+        }
+    }
+    timeline(canvas, top + ROW as f64, (frames, poses), skeleton.fps, kept);
+    let way: Vec<[f64; 2]> = (0..frames).map(|t| frame(joints, skeleton, t)[0]).map(|[x, _, z]| [x, z]).collect();
+    let left = (12 + CELL * poses + 8) as f64;
+    plan::trail(canvas, &way, skeleton.fps, [left, top + 24.0], (WAY - 12) as f64);
+    Ok(())
+}
 
-/// Draws a line above `bottom` that marks the kept and the generated frames of a row; nothing without kept frames.
-fn timeline(canvas: &mut Canvas, bottom: f64, (frames, poses): (usize, usize), kept: &[Range<usize>]) {
+/// Draws a line above `bottom` that marks the kept and the generated frames of a row with their seconds; nothing without
+/// kept frames.
+fn timeline(canvas: &mut Canvas, bottom: f64, (frames, poses): (usize, usize), fps: f64, kept: &[Range<usize>]) {
     if kept.is_empty() {
         return;
     }
@@ -334,31 +376,19 @@ fn timeline(canvas: &mut Canvas, bottom: f64, (frames, poses): (usize, usize), k
         let to = (from..frames).find(|t| stayed(*t) != stayed(from)).unwrap_or(frames);
         let (colour, word) = if stayed(from) { (SHADOW, "kept") } else { (TOLD, "drawn") };
         canvas.line([x(from), bottom - 6.0], [x(to - 1), bottom - 6.0], 4.0, colour);
-        font::draw(canvas, word, [x(from), bottom - 20.0], 1, if stayed(from) { BODY } else { TOLD });
+        let label = format!("{word} {:.1} to {:.1} s", from as f64 / fps, to as f64 / fps);
+        let ink = if stayed(from) { BODY } else { TOLD };
+        font::draw(canvas, &font::fit(&label, SMALL, x(to) - x(from)), [x(from), bottom - 23.0], SMALL, ink);
         from = to;
     }
 }
 
-/// Writes a PNG with [`strip_png_to`] to a file.
+/// Writes a PNG with [`sheet_to`] to a file.
 ///
 /// # Errors
 /// If the file cannot be written, or a motion is not a whole number of frames.
-pub fn strip_png(motions: &[(String, Vec<f32>)], poses: usize, skeleton: &Skeleton, path: &Path) -> io::Result<()> {
-    strip_png_along(motions, poses, skeleton, Given::default(), path)
-}
-
-/// Writes a PNG with [`strip_png_along_to`] to a file.
-///
-/// # Errors
-/// As [`strip_png`].
-pub fn strip_png_along(
-    motions: &[(String, Vec<f32>)],
-    poses: usize,
-    skeleton: &Skeleton,
-    given: Given<'_>,
-    path: &Path,
-) -> io::Result<()> {
+pub fn sheet(rows: &[Row], poses: usize, skeleton: &Skeleton, given: Given<'_>, path: &Path) -> io::Result<()> {
     let mut file = BufWriter::new(File::create(path)?);
-    strip_png_along_to(motions, poses, skeleton, given, &mut file)?;
+    sheet_to(rows, poses, skeleton, given, &mut file)?;
     file.flush()
 }

@@ -1,5 +1,6 @@
 //! Pictures decode, have the motion's length, and show a figure in both colours.
 
+use motion::draw::{Given, Row};
 use motion::features::recover_joints;
 use motion::{Skeleton, draw, synthetic};
 use protocol::Seed;
@@ -55,32 +56,55 @@ fn what_was_told_is_drawn() {
         let found = pixels.chunks(3).filter(|p| **p == [140, 60, 160]).count();
         (found, reader.info().height)
     };
-    let (mut plain, mut along) = (vec![], vec![]);
-    draw::strip_png_to(&[(title.clone(), joints.clone())], 6, skeleton, &mut plain).unwrap();
-    let given = draw::Given { waypoints: &waypoints, ..draw::Given::default() };
-    draw::strip_png_along_to(&[(title.clone(), joints.clone())], 6, skeleton, given, &mut along).unwrap();
-    assert_eq!(purple(plain), (0, 210));
-    let (found, height) = purple(along);
-    assert!(found > 60 && height > 400, "{found} pixels of waypoints, {height} high");
+    let row = || [Row { title: title.clone(), note: String::new(), joints: joints.clone() }];
+    let sheet = |given: Given<'_>| {
+        let mut bytes = vec![];
+        draw::sheet_to(&row(), 6, skeleton, given, &mut bytes).unwrap();
+        bytes
+    };
+    let [_, plain] = draw::sheet_size(1, 6, false).map(|pixels| pixels as u32);
+    assert_eq!(purple(sheet(Given::default())), (0, plain));
+    let (found, height) = purple(sheet(Given { waypoints: &waypoints, ..Given::default() }));
+    assert!(found > 60 && height > plain + 200, "{found} pixels of waypoints, {height} high");
     // Poses between kept frames have the colour of generated frames, and add no height.
-    let mut edited = vec![];
-    let given = draw::Given { kept: &[0..5, 15..21], ..draw::Given::default() };
-    draw::strip_png_along_to(&[(title.clone(), joints.clone())], 6, skeleton, given, &mut edited).unwrap();
-    let (found, height) = purple(edited);
-    assert!(found > 60 && height == 210, "{found} pixels of what was drawn, {height} high");
+    let (found, height) = purple(sheet(Given { kept: &[0..5, 15..21], ..Given::default() }));
+    assert!(found > 60 && height == plain, "{found} pixels of what was drawn, {height} high");
     let (mut plain, mut along) = (vec![], vec![]);
     draw::gif_to(&joints, skeleton, &title, &mut plain).unwrap();
     draw::gif_along_to(&joints, skeleton, &title, &waypoints, &mut along).unwrap();
     assert_ne!(plain, along);
 }
 
-#[test]
-fn a_sheet_has_a_row_a_motion() {
-    let skeleton = Skeleton::of(DataFormat::Humanml3d);
+/// Pixels of a sheet.
+fn pixels(rows: &[Row]) -> (Vec<u8>, [usize; 2]) {
     let mut bytes = vec![];
-    draw::strip_png_to(&[motion(), motion()], 6, skeleton, &mut bytes).unwrap();
-    let reader = png::Decoder::new(std::io::Cursor::new(bytes)).read_info().unwrap();
-    assert_eq!((reader.info().width, reader.info().height), (684, 420));
-    let error = draw::gif_to(&[0.0; 65], skeleton, "", vec![]).unwrap_err().to_string();
+    draw::sheet_to(rows, 6, Skeleton::of(DataFormat::Humanml3d), Given::default(), &mut bytes).unwrap();
+    let mut reader = png::Decoder::new(std::io::Cursor::new(bytes)).read_info().unwrap();
+    let mut pixels = vec![0; reader.output_buffer_size().unwrap()];
+    reader.next_frame(&mut pixels).unwrap();
+    (pixels, [reader.info().width as usize, reader.info().height as usize])
+}
+
+#[test]
+fn a_sheet_has_a_row_a_motion_with_its_note_and_its_way_from_above() {
+    let (title, joints) = motion();
+    let row = |note: &str, joints: &[f32]| Row { title: title.clone(), note: note.into(), joints: joints.to_vec() };
+    let (plain, size) = pixels(&[row("", &joints), row("", &joints)]);
+    assert_eq!(size, draw::sheet_size(2, 6, false));
+    let (noted, _) = pixels(&[row("", &joints), row("pcm, 1 step, seed 7", &joints)]);
+    let differ = |other: &[u8], columns: std::ops::Range<usize>| {
+        let rows = plain.chunks(3 * size[0]).zip(other.chunks(3 * size[0]));
+        rows.filter(|(a, b)| a[3 * columns.start..3 * columns.end] != b[3 * columns.start..3 * columns.end]).count()
+    };
+    assert!((5..20).contains(&differ(&noted, 0..size[0])), "a note is one line: {}", differ(&noted, 0..size[0]));
+    // The same poses along another way differ only from above.
+    let mut turned = joints.clone();
+    for (t, frame) in turned.chunks_mut(66).enumerate() {
+        frame.chunks_mut(3).for_each(|joint| joint[0] += t as f32 * 0.02);
+    }
+    let (turned, _) = pixels(&[row("", &turned), row("", &joints)]);
+    let (poses, way) = (differ(&turned, 0..684), differ(&turned, 684..size[0]));
+    assert!(way > 60 && poses < 8, "{way} lines of the way and {poses} of the poses");
+    let error = draw::gif_to(&[0.0; 65], Skeleton::of(DataFormat::Humanml3d), "", vec![]).unwrap_err().to_string();
     assert!(error.contains("65 coordinates"), "{error}");
 }

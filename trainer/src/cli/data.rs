@@ -1,10 +1,11 @@
-//! `trainer data`: inspects recordings, writes sample recordings and fetches published ones.
+//! `trainer data`: inspects recordings and names their motions, writes sample recordings and fetches published ones.
 
 use std::path::{Path, PathBuf};
 
 use clap::{Args, Subcommand, ValueEnum};
 use mocap::arrays;
 use mocap::bvh::Bvh;
+use mocap::captions;
 use mocap::detect::Up;
 use mocap::joint_map::JointMap;
 use mocap::take::{self, Reading};
@@ -19,11 +20,14 @@ use crate::report::problem::{Problem, Result};
 #[derive(Debug, Subcommand)]
 pub(crate) enum DataVerb {
     /// Shows what a recording (.bvh, .npy, .npz) contains and how it would be read, and proposes a joint map
-    #[command(after_help = "Example:\n  trainer data inspect recordings/clip-000.bvh")]
+    #[command(after_help = "Example:\n  trainer data inspect recordings/000000.bvh")]
     Inspect(InspectArgs),
     /// Writes synthetic clips as recordings with their captions
     #[command(after_help = "Example:\n  trainer data sample recordings --format bvh --clips 4")]
     Sample(SampleArgs),
+    /// Writes a table of captions for recordings without one, by their file names, to correct
+    #[command(after_help = "Example:\n  trainer data captions recordings")]
+    Captions(CaptionsArgs),
     /// Lists published sets of motion
     #[command(after_help = "Example:\n  trainer data list")]
     List(ListArgs),
@@ -36,7 +40,7 @@ impl DataVerb {
     pub(super) fn output(&self) -> Output {
         match self {
             Self::Inspect(args) => args.output,
-            Self::Sample(_) => Output::Table,
+            Self::Sample(_) | Self::Captions(_) => Output::Table,
             Self::List(args) => args.output,
             Self::Fetch(args) => args.output,
         }
@@ -53,6 +57,15 @@ pub(crate) struct InspectArgs {
     /// Format of the answer; as a table, the map is YAML on stdout and the rest is on stderr
     #[arg(short, long, value_enum, default_value_t)]
     output: Output,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct CaptionsArgs {
+    /// The folder of recordings
+    folder: PathBuf,
+    /// The table to write [default: captions.csv in the folder]
+    #[arg(short = 'o', long = "out", value_name = "FILE.csv")]
+    out: Option<PathBuf>,
 }
 
 #[derive(Debug, Args)]
@@ -79,6 +92,7 @@ enum SampleFormat {
 pub(crate) fn data(verb: &DataVerb) -> Result<u8> {
     match verb {
         DataVerb::Inspect(args) => inspect(args),
+        DataVerb::Captions(args) => write_captions(args),
         DataVerb::Sample(args) => sample(args),
         DataVerb::List(args) => Ok(datasets::list(args)),
         DataVerb::Fetch(args) => datasets::fetch(args),
@@ -137,6 +151,42 @@ fn inspect_array(file: &Path, output: Output) -> Result<u8> {
         let guess = if found.sure_of_up { "" } else { " (a guess: the figure does not stand upright)" };
         print::out(&format!("unit {} (legs of {:.2}), {up} up{guess}", found.unit, found.leg));
     }
+    Ok(0)
+}
+
+/// Writes a table with a row for each recording that has no caption.
+fn write_captions(args: &CaptionsArgs) -> Result<u8> {
+    let listing = mocap::listing::list(&DataPath::local(&args.folder), None).map_err(Problem::usage)?;
+    let path = args.out.clone().unwrap_or_else(|| args.folder.join("captions.csv"));
+    let bare: Vec<(String, String)> = listing
+        .clips
+        .iter()
+        .filter(|clip| clip.captions.is_empty())
+        .map(|clip| {
+            let stem = clip.path.shown().file_stem().unwrap_or_default().to_string_lossy();
+            (clip.id.clone(), captions::from_name(&stem))
+        })
+        .collect();
+    if bare.is_empty() {
+        let count = listing.clips.len();
+        print::out(&format!("{}: each of the {count} recordings has a caption", args.folder.display()));
+        return Ok(0);
+    }
+    let mut file = std::fs::File::create_new(&path).map_err(|error| {
+        let problem = Problem::usage(format!("cannot write `{}`: {error}", path.display()));
+        problem.hint("a table of captions is never replaced; write another one with `-o FILE.csv` and join them")
+    })?;
+    std::io::Write::write_all(&mut file, captions::to_table(&bare).as_bytes())
+        .map_err(|error| Problem::failed(format!("cannot write `{}`: {error}", path.display())))?;
+    let empty = bare.iter().filter(|(_, caption)| caption.is_empty()).count();
+    print::out(&format!(
+        "{}: {} of {} recordings had no caption; {} have one from their file name, {empty} are empty\nCorrect the \
+         sentences, as in `a person walks forward`. A row without a sentence is refused.",
+        path.display(),
+        bare.len(),
+        listing.clips.len(),
+        bare.len() - empty
+    ));
     Ok(0)
 }
 

@@ -1,10 +1,15 @@
-//! `trainer gallery`: one page with the motions of a run's models for the same sentences and seeds, side by side.
+//! `trainer gallery`: one page with the motions of a run's models for the same sentences and seeds, side by side. The
+//! real clip with the nearest caption is beside them.
 
+use std::collections::BTreeSet;
 use std::path::PathBuf;
 
 use clap::Args;
 use mocap::export::{Motion, Outs, write_all};
-use motion::Skeleton;
+use mocap::requests::Request;
+use motion::features::recover_joints;
+use motion::vocabulary::Vocabulary;
+use motion::{Dataset, Skeleton};
 use protocol::Seed;
 use serde_json::json;
 use stages::generate::Generator;
@@ -48,6 +53,9 @@ pub(crate) struct GalleryArgs {
     sampler: SamplerArgs,
     #[command(flatten)]
     sentences: SentenceArgs,
+    /// Leave out the real clips beside the models
+    #[arg(long)]
+    no_real: bool,
     /// Computing backend: flex, ndarray, wgpu or cuda [default: the first that this build and machine have]
     #[arg(long)]
     backend: Option<String>,
@@ -69,7 +77,12 @@ pub(crate) async fn gallery(args: GalleryArgs) -> Result<u8> {
     let run = reader.find(&args.run).await?;
     let all = model::stages(&run);
     let names = if args.stage.is_empty() { all } else { args.stage.iter().map(String::as_str).collect() };
-    let count = requests.len() * seeds.len() * names.len();
+    let real = match args.no_real {
+        true => None,
+        false => model::dataset(&reader, &run).await?,
+    };
+    let beside = usize::from(real.is_some());
+    let count = requests.len() * seeds.len() * (names.len() + beside);
     let form = Outs::new(std::slice::from_ref(&args.out), count).map_err(out::refused)?;
     if !form.wants_all() {
         return Err(Problem::usage(format!("cannot write `{}`: expected .html or .png", args.out.display())));
@@ -82,9 +95,18 @@ pub(crate) async fn gallery(args: GalleryArgs) -> Result<u8> {
     // One row per sentence and seed, one column per model.
     let mut rows: Vec<Vec<Motion>> = vec![Vec::new(); requests.len() * seeds.len()];
     let mut lengths: Vec<Option<usize>> = vec![None; rows.len()];
-    let mut drawn = Vec::new();
+    let real = real.map(|dataset| real_clips(&dataset, &requests)).unwrap_or_default();
+    for (clip, rows) in real.into_iter().zip(rows.chunks_mut(seeds.len().max(1))) {
+        // The other seeds of a sentence have the same real clip.
+        rows.iter_mut().take(1).for_each(|row| row.extend(clip.clone()));
+    }
+    let (mut drawn, mut shown) = (Vec::new(), BTreeSet::new());
     for name in &names {
         let found = model::stage(&reader, &run, name).await?;
+        // Two stages may have the same model, such as a student and its registered version.
+        if !shown.insert(found.artifact) {
+            continue;
+        }
         let generator = Generator::load(&found.manifest, &found.blobs, &device).map_err(Problem::failed)?;
         let sampler = match args.sampler.sampler(args.steps, generator.sampler(), &found.measured) {
             Ok(sampler) => sampler,
@@ -122,6 +144,7 @@ pub(crate) async fn gallery(args: GalleryArgs) -> Result<u8> {
     });
     let sections: Vec<(String, Vec<&Motion>)> = titles.zip(rows.iter().map(|row| row.iter().collect())).collect();
     write_all(&format!("Models of {}", run.run), &sections, &args.out).map_err(out::refused)?;
+    let count: usize = rows.iter().map(Vec::len).sum();
     match args.report {
         Output::Json => print::json(&json!({
             "schema_version": 1,
@@ -141,3 +164,36 @@ pub(crate) async fn gallery(args: GalleryArgs) -> Result<u8> {
     }
     Ok(0)
 }
+
+/// Finds for each sentence the training clip with the nearest caption; two sentences have different clips.
+fn real_clips(dataset: &Dataset, requests: &[Request]) -> Vec<Option<Motion>> {
+    let plain = |text: &str| text.trim().trim_end_matches('.').to_lowercase();
+    let train = dataset.entries_of(protocol::stage::Split::Train);
+    let captions = || {
+        let of = |entry: usize| dataset.entries[entry].captions.iter().map(move |caption| (entry, *caption));
+        train.iter().copied().flat_map(of).map(|(entry, caption)| (entry, dataset.captions[caption].text.as_str()))
+    };
+    let vocabulary = Vocabulary::of(captions().map(|(_, text)| text));
+    let mut taken = BTreeSet::new();
+    let mut nearest = |request: &Request| {
+        let (entry, text) = vocabulary.nearest(&request.caption, NEAREST).into_iter().find_map(|sentence| {
+            captions().find(|(entry, text)| plain(text) == sentence && !taken.contains(&dataset.entries[*entry].clip))
+        })?;
+        let entry = &dataset.entries[entry];
+        taken.insert(entry.clip);
+        let (skeleton, features) = (dataset.skeleton(), dataset.features(entry).to_vec());
+        Some(Motion {
+            caption: "real clip".to_owned(),
+            note: format!("{}: {text}", entry.id),
+            skeleton,
+            joints: recover_joints(&features, skeleton),
+            features: Some(features),
+            waypoints: Vec::new(),
+            kept: Vec::new(),
+        })
+    };
+    requests.iter().map(&mut nearest).collect()
+}
+
+/// Nearest captions among which a real clip is looked for.
+const NEAREST: usize = 8;

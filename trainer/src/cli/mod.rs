@@ -9,6 +9,7 @@ mod datasets;
 mod demo;
 mod doctor;
 mod endpoint_args;
+mod explain;
 mod export;
 mod gallery;
 mod generate;
@@ -122,6 +123,9 @@ enum Verb {
     Devices(config::DevicesArgs),
     /// Checks store, disk, devices and server, with advice for each problem
     Doctor(doctor::DoctorArgs),
+    /// Explains an error by its code: its meaning, and the remedy
+    #[command(after_help = "Examples:\n  trainer explain not-found\n  trainer explain 7\n  trainer explain")]
+    Explain(explain::ExplainArgs),
     /// Prints a script with which a shell completes commands and options
     Completions(shell::CompletionsArgs),
     /// Prints names that may follow on a command line, for the scripts of `completions`
@@ -354,6 +358,7 @@ impl Verb {
             Self::Doctor(args) => args.output,
             Self::Worker(WorkerVerb::List(args)) => args.output,
             Self::Serve(_)
+            | Self::Explain(_)
             | Self::Completions(_)
             | Self::Man(_)
             | Self::Names(_)
@@ -388,6 +393,7 @@ async fn perform(verb: Verb) -> Result<u8> {
         Verb::Time(args) => time::time(args).await,
         Verb::Devices(args) => Ok(config::devices(&args)),
         Verb::Doctor(args) => doctor::doctor(args).await,
+        Verb::Explain(args) => explain::explain(&args),
         Verb::Completions(args) => Ok(shell::completions(&args, Cli::command())),
         Verb::Man(args) => shell::man(&args, Cli::command()),
         Verb::Names(args) => shell::names(&args).await,

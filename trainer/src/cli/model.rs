@@ -184,9 +184,31 @@ pub(super) async fn training_captions(reader: &Reader, dataset: Digest) -> Resul
     Ok(Some(captions.into_iter().map(|caption| caption.text).collect()))
 }
 
+/// The clips that a run learns from; `None` if it has none yet, or too many to fetch for a picture.
+///
+/// # Errors
+/// If the store does not answer, or the artifact is no dataset.
+pub(super) async fn dataset(reader: &Reader, run: &RunView) -> Result<Option<Dataset>> {
+    let Some(digest) = run.stages.iter().find_map(|stage| stage.outputs.get(DATASET)) else { return Ok(None) };
+    let manifest = manifest(reader, *digest).await?;
+    let bytes: u64 = manifest.files.values().map(|file| file.bytes).sum();
+    if manifest.kind != ArtifactKind::Dataset || bytes > LARGEST_DATASET {
+        return Ok(None);
+    }
+    let blobs = Fetched::files(reader, &manifest).await?;
+    let fetch = |name: &str| {
+        let file = manifest.files.get(name).ok_or_else(|| format!("the dataset has no file `{name}`"))?;
+        blobs.get(file.digest).map(|bytes| bytes::Bytes::from(bytes.to_vec())).map_err(|error| error.to_string())
+    };
+    Dataset::from_files(&fetch).map(Some).map_err(Problem::failed)
+}
+
 /// The file of a dataset with its captions, and its largest size to read.
 const INDEX: &str = "dataset.json";
 const LONGEST_INDEX: u64 = 64 << 20;
+/// The output of stages that produce a dataset, and its largest size to fetch for pictures.
+const DATASET: &str = "dataset";
+const LARGEST_DATASET: u64 = 256 << 20;
 /// The output of stages that produce a model.
 const MODEL: &str = "model";
 /// The output of evaluations.

@@ -14,12 +14,13 @@ pub(super) struct SamplerArgs {
     /// root [default: as in the model's evaluation]
     #[arg(long = "sampler", value_name = "KEY=VALUE", value_parser = rare, help_heading = "Sampling")]
     rare: Vec<Rare>,
-    // The names that these settings had before `--sampler`.
-    #[arg(long, value_name = "T", value_delimiter = ',', hide = true)]
-    timesteps: Vec<usize>,
-    #[arg(long, value_name = "SOLVER", value_parser = solver, hide = true)]
+}
+
+/// The settings of `--sampler`; of a repeated one, the last counts.
+#[derive(Debug, Default)]
+struct Asked<'a> {
+    timesteps: &'a [usize],
     solver: Option<Solver>,
-    #[arg(long, value_name = "BOOL", hide = true)]
     footing: Option<bool>,
 }
 
@@ -78,32 +79,14 @@ impl SamplerArgs {
         own: Sampler,
         measured: &[(String, Sampler)],
     ) -> Result<Sampler, String> {
-        self.with_rare().chosen(steps, own, measured)
-    }
-
-    /// The options, with those of `--sampler` in place of the hidden ones.
-    fn with_rare(&self) -> Self {
-        let Self { guidance, timesteps, solver, footing, rare } = self;
-        let (guidance, timesteps) = (*guidance, timesteps.clone());
-        let mut all = Self { guidance, timesteps, solver: *solver, footing: *footing, rare: Vec::new() };
-        for setting in rare {
-            match setting {
-                Rare::Timesteps(timesteps) => all.timesteps.clone_from(timesteps),
-                Rare::Solver(solver) => all.solver = Some(*solver),
-                Rare::Footing(footing) => all.footing = Some(*footing),
-            }
-        }
-        all
-    }
-
-    fn chosen(&self, steps: Option<usize>, own: Sampler, measured: &[(String, Sampler)]) -> Result<Sampler, String> {
-        let steps = steps.or((!self.timesteps.is_empty()).then_some(self.timesteps.len()));
+        let asked = self.asked();
+        let steps = steps.or((!asked.timesteps.is_empty()).then_some(asked.timesteps.len()));
         let as_asked = |sampler: &Sampler| {
             steps.is_none_or(|steps| steps == sampler.steps)
                 && self.guidance.is_none_or(|guidance| guidance == sampler.guidance)
-                && (self.timesteps.is_empty() || self.timesteps == sampler.timesteps)
-                && self.solver.is_none_or(|solver| solver == sampler.solver)
-                && self.footing.is_none_or(|footing| footing == sampler.footing)
+                && (asked.timesteps.is_empty() || asked.timesteps == sampler.timesteps)
+                && asked.solver.is_none_or(|solver| solver == sampler.solver)
+                && asked.footing.is_none_or(|footing| footing == sampler.footing)
         };
         let meant = measured.iter().filter(|(_, sampler)| as_asked(sampler));
         let meant = measured_with(meant.map(|(name, sampler)| (name.as_str(), sampler))).map_err(|differ| {
@@ -116,18 +99,30 @@ impl SamplerArgs {
         let all = measured_with(measured.iter().map(|(name, sampler)| (name.as_str(), sampler)));
         let base = meant.or(all.ok().flatten()).cloned().unwrap_or(own);
         let steps = steps.unwrap_or(base.steps);
-        let timesteps = match self.timesteps.is_empty() {
+        let timesteps = match asked.timesteps.is_empty() {
             // Another number of steps needs other timesteps.
             true if steps == base.steps => base.timesteps,
-            _ => self.timesteps.clone(),
+            _ => asked.timesteps.to_vec(),
         };
         Ok(Sampler {
             steps,
             guidance: self.guidance.unwrap_or(base.guidance),
             timesteps,
-            solver: self.solver.unwrap_or(base.solver),
-            footing: self.footing.unwrap_or(base.footing),
+            solver: asked.solver.unwrap_or(base.solver),
+            footing: asked.footing.unwrap_or(base.footing),
         })
+    }
+
+    fn asked(&self) -> Asked<'_> {
+        let mut asked = Asked::default();
+        for setting in &self.rare {
+            match setting {
+                Rare::Timesteps(timesteps) => asked.timesteps = timesteps,
+                Rare::Solver(solver) => asked.solver = Some(*solver),
+                Rare::Footing(footing) => asked.footing = Some(*footing),
+            }
+        }
+        asked
     }
 }
 
@@ -141,24 +136,22 @@ mod tests {
 
     #[test]
     fn a_model_is_drawn_as_it_was_measured_but_for_what_is_asked() {
-        let args = |guidance, timesteps: &[usize]| SamplerArgs {
-            guidance,
-            timesteps: timesteps.to_vec(),
-            solver: None,
-            footing: None,
-            rare: Vec::new(),
+        let args = |guidance, timesteps: &[usize]| {
+            let rare = (!timesteps.is_empty()).then(|| Rare::Timesteps(timesteps.to_vec()));
+            SamplerArgs { guidance, rare: rare.into_iter().collect() }
         };
+        let with = |rare: &[Rare]| SamplerArgs { guidance: None, rare: rare.to_vec() };
         let own = sampler(2, 6.5, &[999, 499]);
         let of = |args: SamplerArgs, steps| args.sampler(steps, own.clone(), &[]);
         assert_eq!(of(args(None, &[]), None), Ok(own.clone()));
         assert_eq!(of(args(Some(3.0), &[]), Some(2)), Ok(sampler(2, 3.0, &[999, 499])));
         assert_eq!(of(args(None, &[]), Some(4)), Ok(sampler(4, 6.5, &[])), "timesteps are for as many steps");
         assert_eq!(of(args(None, &[699]), None), Ok(sampler(1, 6.5, &[699])), "timesteps say the steps");
-        let asked = SamplerArgs { solver: solver("ddim").ok(), ..args(None, &[]) };
-        assert_eq!(of(asked, None), Ok(Sampler { solver: Solver::Ddim, ..own.clone() }));
-        let asked = SamplerArgs { footing: Some(true), ..args(None, &[]) };
-        assert_eq!(of(asked, None), Ok(Sampler { footing: true, ..own.clone() }));
-        let asked = SamplerArgs { rare: vec![Rare::Solver(Solver::Ddim), Rare::Timesteps(vec![7])], ..args(None, &[]) };
+        let ddim = Rare::Solver(Solver::Ddim);
+        assert_eq!(of(with(std::slice::from_ref(&ddim)), None), Ok(Sampler { solver: Solver::Ddim, ..own.clone() }));
+        let asked = with(&[Rare::Footing(false), Rare::Footing(true)]);
+        assert_eq!(of(asked, None), Ok(Sampler { footing: true, ..own.clone() }), "the last one counts");
+        let asked = with(&[ddim, Rare::Timesteps(vec![7])]);
         assert_eq!(of(asked, None), Ok(Sampler { solver: Solver::Ddim, ..sampler(1, 6.5, &[7]) }));
         assert_eq!(rare("footing=false"), Ok(Rare::Footing(false)));
         assert!(rare("solvr=ddim").unwrap_err().contains("did you mean `solver`?"));

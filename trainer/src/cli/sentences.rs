@@ -51,6 +51,9 @@ fn seeds(text: &str) -> std::result::Result<u16, String> {
 /// Parses seconds with or without their unit: `4` and `4s`.
 fn seconds(text: &str) -> std::result::Result<Length, String> {
     let number = text.strip_suffix('s').unwrap_or(text).trim_end();
+    if number.parse::<f64>().is_err() {
+        return Err("expected seconds, such as 4.5 or 4.5s; --frames takes frames".to_owned());
+    }
     format!("{number}s").parse()
 }
 
@@ -208,7 +211,7 @@ mod tests {
             assert_eq!(seconds(text), Ok(Length::Seconds(4.0)), "{text}");
         }
         assert!(seconds("-4").unwrap_err().contains("expected more than 0"));
-        assert!(seconds("4ss").unwrap_err().contains("not a length"));
+        assert!(seconds("4ss").unwrap_err().contains("expected seconds, such as 4.5"));
     }
 
     #[test]

@@ -67,13 +67,19 @@ pub(crate) fn problem(problem: &Problem, output: Output) {
     }
     let message = plain(&message);
     if output == Output::Json {
-        let value = serde_json::json!({"error": {"code": problem.exit, "message": message, "hint": problem.hint}});
+        let page = problem.code().map(|code| format!("troubleshooting.html#{code}"));
+        let value = serde_json::json!({
+            "error": {"code": problem.exit, "message": message, "hint": problem.hint, "page": page},
+        });
         note(&value.to_string());
         return;
     }
     note(&format!("error: {message}"));
-    if let Some(hint) = &problem.hint {
-        note(&format!("\nhint: {hint}"));
+    let hint = problem.hint.iter().map(|hint| format!("hint: {hint}"));
+    let more = problem.code().into_iter().map(|code| format!("more: trainer explain {code}"));
+    let lines: Vec<String> = hint.chain(more).collect();
+    if !lines.is_empty() {
+        note(&format!("\n{}", lines.join("\n")));
     }
 }
 

@@ -19,6 +19,26 @@ pub(crate) mod exit {
    10  a gate does not hold; nothing was changed
   130  interrupted; the same command continues";
 
+    /// The words by which the troubleshooting page explains the codes.
+    pub(crate) const WORDS: [(u8, &str); 11] = [
+        (FAILED, "failed"),
+        (USAGE, "usage"),
+        (FAULT, "fault"),
+        (CONFLICT, "conflict"),
+        (UNAUTHORISED, "unauthorized"),
+        (UNREACHABLE, "unreachable"),
+        (NOT_FOUND, "not-found"),
+        (CANCELLED, "cancelled"),
+        (INTEGRITY, "damaged"),
+        (GATE, "gate"),
+        (INTERRUPTED, "interrupted"),
+    ];
+
+    /// The word of a code.
+    pub(crate) fn word(code: u8) -> Option<&'static str> {
+        WORDS.iter().find(|(known, _)| *known == code).map(|(_, word)| *word)
+    }
+
     pub(crate) const FAILED: u8 = 1;
     pub(crate) const USAGE: u8 = 2;
     pub(crate) const FAULT: u8 = 3;
@@ -28,6 +48,7 @@ pub(crate) mod exit {
     pub(crate) const UNREACHABLE: u8 = 6;
     pub(crate) const CANCELLED: u8 = 8;
     pub(crate) const INTEGRITY: u8 = 9;
+    pub(crate) const GATE: u8 = 10;
     pub(crate) const INTERRUPTED: u8 = 130;
 }
 
@@ -37,6 +58,8 @@ pub(crate) struct Problem {
     pub(crate) error: anyhow::Error,
     pub(crate) hint: Option<String>,
     pub(crate) exit: u8,
+    /// The server's code, if the error is its refusal.
+    pub(crate) code: Option<String>,
 }
 
 /// Result of most functions of the command.
@@ -44,7 +67,12 @@ pub(crate) type Result<T, E = Problem> = std::result::Result<T, E>;
 
 impl Problem {
     pub(crate) fn new(exit: u8, error: impl Into<anyhow::Error>) -> Self {
-        Self { error: error.into(), hint: None, exit }
+        Self { error: error.into(), hint: None, exit, code: None }
+    }
+
+    /// The code under which the troubleshooting page explains the error.
+    pub(crate) fn code(&self) -> Option<&str> {
+        self.code.as_deref().or(exit::word(self.exit))
     }
 
     /// A wrong argument or a wrong file.

@@ -1,5 +1,6 @@
 //! Pictures of a sweep, as SVG. One shows the metric of every trial over its steps: stopped trials are grey, and the
-//! best one is coloured. The other shows metrics over a searched setting, or over the time of the evaluation.
+//! best one is coloured. A sweep without rungs has a panel for each searched setting instead. The other shows metrics
+//! over a searched setting, or over the time of the evaluation.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write;
@@ -18,8 +19,11 @@ const RIGHT: f64 = 24.0;
 const TOP: f64 = 44.0;
 const BOTTOM: f64 = 56.0;
 
-/// Draws the metric of every trial over its steps.
+/// Draws the metric of every trial over its steps, or over each searched setting if no trial is stopped early.
 pub(crate) fn svg(sweep: &SweepView) -> String {
+    if sweep.rungs.len() < 2 {
+        return scatter(sweep);
+    }
     let values = sweep.trials.iter().flat_map(|trial| trial.results.iter().flatten().copied());
     let x = Axis::new(sweep.rungs.iter().map(|steps| *steps as f64).chain([0.0]), LEFT, WIDTH - RIGHT);
     let y = Axis::new(values, HEIGHT - BOTTOM, TOP);
@@ -77,6 +81,83 @@ pub(crate) fn svg(sweep: &SweepView) -> String {
     }
     line(format_args!("</svg>"));
     out
+}
+
+/// Width and height of a panel of [`scatter`].
+const PANEL: [f64; 2] = [360.0, 280.0];
+
+/// Draws the last result of each trial over each searched setting, in a panel of its own. Values that are words are at
+/// equal distances. The best trial is coloured.
+fn scatter(sweep: &SweepView) -> String {
+    let settings: Vec<&String> = sweep.trials.first().map(|trial| trial.values.keys().collect()).unwrap_or_default();
+    let columns = settings.len().clamp(1, 2);
+    let [width, height] = [PANEL[0] * columns as f64, 40.0 + PANEL[1] * settings.len().div_ceil(2).max(1) as f64];
+    let mut out = String::new();
+    let trials = sweep.trials.len();
+    let title = escape(&format!("sweep of {}: {} of {trials} trials", sweep.stage, sweep.metric));
+    // Writing to a string never fails.
+    let _ = writeln!(
+        out,
+        r##"<svg xmlns="http://www.w3.org/2000/svg" width="{width}" height="{height}" viewBox="0 0 {width} {height}" font-family="sans-serif" font-size="12" fill="#282a30">
+<rect width="{width}" height="{height}" fill="#fafaf8"/>
+<text x="16" y="26" font-size="15">{title}</text>"##
+    );
+    for (i, setting) in settings.iter().enumerate() {
+        let (x, y) = (PANEL[0] * (i % 2) as f64, 40.0 + PANEL[1] * (i / 2) as f64);
+        let _ = writeln!(out, r#"<g transform="translate({x},{y})">"#);
+        scatter_panel(&mut out, sweep, setting);
+        let _ = writeln!(out, "</g>");
+    }
+    out + "</svg>\n"
+}
+
+fn scatter_panel(out: &mut String, sweep: &SweepView, setting: &str) {
+    let (left, right, top, bottom) = (72.0, PANEL[0] - 20.0, 16.0, PANEL[1] - 52.0);
+    let result = |trial: &TrialView| trial.results.last().copied().flatten().filter(|value| value.is_finite());
+    let text = |value: &Value| value.as_str().map_or_else(|| value.to_string(), str::to_owned);
+    let values = || sweep.trials.iter().filter_map(|trial| trial.values.get(setting));
+    let words: BTreeSet<String> =
+        if values().all(Value::is_number) { BTreeSet::new() } else { values().map(text).collect() };
+    let place = |trial: &TrialView| {
+        let value = trial.values.get(setting)?;
+        let word = || words.iter().position(|word| *word == text(value)).map(|at| at as f64);
+        if words.is_empty() { value.as_f64() } else { word() }
+    };
+    let places: Vec<f64> = sweep.trials.iter().filter_map(place).collect();
+    // Points do not lie on the frame.
+    let x = Axis::new(places.iter().copied(), left + 14.0, right - 14.0);
+    let y = Axis::new(sweep.trials.iter().filter_map(result), bottom - 8.0, top + 8.0);
+    let mut line = |text: std::fmt::Arguments<'_>| {
+        let _ = writeln!(out, "{text}");
+    };
+    for mark in y.marks() {
+        let (at, label) = (y.at(mark), print::number(mark));
+        line(format_args!(r##"<line x1="{left}" x2="{right}" y1="{at:.1}" y2="{at:.1}" stroke="#dedfe0"/>"##));
+        line(format_args!(r#"<text x="{:.1}" y="{:.1}" text-anchor="end">{label}</text>"#, left - 8.0, at + 4.0));
+    }
+    let marks: Vec<(f64, String)> = if words.is_empty() {
+        [0, 2, 4].into_iter().filter_map(|i| x.marks().get(i).map(|mark| (*mark, print::number(*mark)))).collect()
+    } else {
+        words.iter().enumerate().map(|(at, word)| (at as f64, word.clone())).collect()
+    };
+    for (mark, label) in marks {
+        let (at, below, label) = (x.at(mark), bottom + 18.0, escape(&label));
+        line(format_args!(r#"<text x="{at:.1}" y="{below}" text-anchor="middle">{label}</text>"#));
+    }
+    let (middle, below, name) = ((left + right) / 2.0, bottom + 38.0, escape(setting));
+    line(format_args!(r#"<text x="{middle}" y="{below}" text-anchor="middle" font-weight="bold">{name}</text>"#));
+    let mut order: Vec<&TrialView> = sweep.trials.iter().collect();
+    order.sort_by_key(|trial| sweep.best == Some(trial.trial));
+    for trial in order {
+        let (Some(at), Some(value)) = (place(trial), result(trial)) else { continue };
+        let best = sweep.best == Some(trial.trial);
+        let (colour, radius) = if best { ("#d65430", 5.5) } else { ("#246ec8", 4.0) };
+        let title = escape(&format!("trial {}: {} {}", trial.trial, sweep.metric, print::number(value)));
+        let (cx, cy) = (x.at(at), y.at(value));
+        line(format_args!(
+            r#"<circle cx="{cx:.1}" cy="{cy:.1}" r="{radius}" fill="{colour}" fill-opacity=".8"><title>{title}</title></circle>"#
+        ));
+    }
 }
 
 /// Horizontal axis of the trials.
@@ -208,6 +289,16 @@ mod tests {
             let y: f64 = circle.split("cy=\"").nth(1).unwrap().split('"').next().unwrap().parse().unwrap();
             assert!((LEFT..=WIDTH - RIGHT).contains(&x) && (TOP..=HEIGHT - BOTTOM).contains(&y), "{x} {y}");
         }
+        let mut flat = sweep();
+        flat.rungs.truncate(1);
+        flat.trials.iter_mut().for_each(|trial| trial.results.truncate(1));
+        let picture = svg(&flat);
+        let settings = flat.trials[0].values.len();
+        let drawn = flat.trials.iter().filter(|trial| trial.results.first().is_some_and(Option::is_some)).count();
+        assert!(settings > 0 && drawn > 1, "{settings} settings of {drawn} trials");
+        assert_eq!(picture.matches("<circle").count(), settings * drawn, "a point for each trial in each panel");
+        assert_eq!(picture.matches("#d65430").count(), settings, "the best one in each panel");
+        assert!(!picture.contains("<polyline") && !picture.contains("NaN"), "{picture}");
         let mut empty = sweep();
         for trial in &mut empty.trials {
             trial.results.clear();

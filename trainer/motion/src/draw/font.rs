@@ -1,89 +1,106 @@
-//! A 5x7 font of our own: small letters, digits and some punctuation. Capitals are drawn as small letters.
+//! Text in Inter, an open font whose letters are outlines. A letter that it lacks is an empty box.
+
+use std::sync::LazyLock;
+
+use tiny_skia::PathBuilder;
+use ttf_parser::{Face, GlyphId, OutlineBuilder};
 
 use super::raster::{Canvas, Colour};
 
-/// Rows from the top, five bits each, the highest bit at the left.
-#[rustfmt::skip]
-const GLYPHS: &[(char, [u8; 7])] = &[
-    ('a', [0b00000, 0b00000, 0b01110, 0b00001, 0b01111, 0b10001, 0b01111]),
-    ('b', [0b10000, 0b10000, 0b11110, 0b10001, 0b10001, 0b10001, 0b11110]),
-    ('c', [0b00000, 0b00000, 0b01110, 0b10001, 0b10000, 0b10001, 0b01110]),
-    ('d', [0b00001, 0b00001, 0b01111, 0b10001, 0b10001, 0b10001, 0b01111]),
-    ('e', [0b00000, 0b00000, 0b01110, 0b10001, 0b11111, 0b10000, 0b01110]),
-    ('f', [0b00110, 0b01001, 0b01000, 0b11110, 0b01000, 0b01000, 0b01000]),
-    ('g', [0b00000, 0b00000, 0b01111, 0b10001, 0b01111, 0b00001, 0b01110]),
-    ('h', [0b10000, 0b10000, 0b11110, 0b10001, 0b10001, 0b10001, 0b10001]),
-    ('i', [0b00100, 0b00000, 0b01100, 0b00100, 0b00100, 0b00100, 0b01110]),
-    ('j', [0b00010, 0b00000, 0b00110, 0b00010, 0b00010, 0b10010, 0b01100]),
-    ('k', [0b10000, 0b10000, 0b10010, 0b10100, 0b11000, 0b10100, 0b10010]),
-    ('l', [0b01100, 0b00100, 0b00100, 0b00100, 0b00100, 0b00100, 0b01110]),
-    ('m', [0b00000, 0b00000, 0b11010, 0b10101, 0b10101, 0b10101, 0b10101]),
-    ('n', [0b00000, 0b00000, 0b11110, 0b10001, 0b10001, 0b10001, 0b10001]),
-    ('o', [0b00000, 0b00000, 0b01110, 0b10001, 0b10001, 0b10001, 0b01110]),
-    ('p', [0b00000, 0b00000, 0b11110, 0b10001, 0b11110, 0b10000, 0b10000]),
-    ('q', [0b00000, 0b00000, 0b01111, 0b10001, 0b01111, 0b00001, 0b00001]),
-    ('r', [0b00000, 0b00000, 0b10110, 0b11001, 0b10000, 0b10000, 0b10000]),
-    ('s', [0b00000, 0b00000, 0b01111, 0b10000, 0b01110, 0b00001, 0b11110]),
-    ('t', [0b01000, 0b01000, 0b11110, 0b01000, 0b01000, 0b01001, 0b00110]),
-    ('u', [0b00000, 0b00000, 0b10001, 0b10001, 0b10001, 0b10001, 0b01111]),
-    ('v', [0b00000, 0b00000, 0b10001, 0b10001, 0b10001, 0b01010, 0b00100]),
-    ('w', [0b00000, 0b00000, 0b10001, 0b10101, 0b10101, 0b10101, 0b01010]),
-    ('x', [0b00000, 0b00000, 0b10001, 0b01010, 0b00100, 0b01010, 0b10001]),
-    ('y', [0b00000, 0b00000, 0b10001, 0b10001, 0b01111, 0b00001, 0b01110]),
-    ('z', [0b00000, 0b00000, 0b11111, 0b00010, 0b00100, 0b01000, 0b11111]),
-    ('0', [0b01110, 0b10001, 0b10011, 0b10101, 0b11001, 0b10001, 0b01110]),
-    ('1', [0b00100, 0b01100, 0b00100, 0b00100, 0b00100, 0b00100, 0b01110]),
-    ('2', [0b01110, 0b10001, 0b00001, 0b00010, 0b00100, 0b01000, 0b11111]),
-    ('3', [0b11111, 0b00010, 0b00100, 0b00010, 0b00001, 0b10001, 0b01110]),
-    ('4', [0b00010, 0b00110, 0b01010, 0b10010, 0b11111, 0b00010, 0b00010]),
-    ('5', [0b11111, 0b10000, 0b11110, 0b00001, 0b00001, 0b10001, 0b01110]),
-    ('6', [0b00110, 0b01000, 0b10000, 0b11110, 0b10001, 0b10001, 0b01110]),
-    ('7', [0b11111, 0b00001, 0b00010, 0b00100, 0b01000, 0b01000, 0b01000]),
-    ('8', [0b01110, 0b10001, 0b10001, 0b01110, 0b10001, 0b10001, 0b01110]),
-    ('9', [0b01110, 0b10001, 0b10001, 0b01111, 0b00001, 0b00010, 0b01100]),
-    ('.', [0b00000, 0b00000, 0b00000, 0b00000, 0b00000, 0b01100, 0b01100]),
-    (',', [0b00000, 0b00000, 0b00000, 0b00000, 0b01100, 0b00100, 0b01000]),
-    ('-', [0b00000, 0b00000, 0b00000, 0b11111, 0b00000, 0b00000, 0b00000]),
-    ('_', [0b00000, 0b00000, 0b00000, 0b00000, 0b00000, 0b00000, 0b11111]),
-    (':', [0b00000, 0b01100, 0b01100, 0b00000, 0b01100, 0b01100, 0b00000]),
-    ('!', [0b00100, 0b00100, 0b00100, 0b00100, 0b00100, 0b00000, 0b00100]),
-    ('?', [0b01110, 0b10001, 0b00001, 0b00010, 0b00100, 0b00000, 0b00100]),
-    ('\'', [0b00100, 0b00100, 0b01000, 0b00000, 0b00000, 0b00000, 0b00000]),
-    ('"', [0b01010, 0b01010, 0b00000, 0b00000, 0b00000, 0b00000, 0b00000]),
-    ('(', [0b00010, 0b00100, 0b01000, 0b01000, 0b01000, 0b00100, 0b00010]),
-    (')', [0b01000, 0b00100, 0b00010, 0b00010, 0b00010, 0b00100, 0b01000]),
-    ('/', [0b00001, 0b00001, 0b00010, 0b00100, 0b01000, 0b10000, 0b10000]),
-    ('%', [0b11001, 0b11001, 0b00010, 0b00100, 0b01000, 0b10011, 0b10011]),
-    ('=', [0b00000, 0b00000, 0b11111, 0b00000, 0b11111, 0b00000, 0b00000]),
-    ('+', [0b00000, 0b00100, 0b00100, 0b11111, 0b00100, 0b00100, 0b00000]),
-    ('@', [0b01110, 0b10001, 0b10111, 0b10101, 0b10111, 0b10000, 0b01110]),
-];
+/// The font; `trainer/motion/font/README.md` says how it was made.
+static BYTES: &[u8] = include_bytes!("../../font/Inter-Regular.ttf");
+#[expect(clippy::expect_used, reason = "the font is part of the program, and a test draws with it")]
+static FACE: LazyLock<Face<'static>> = LazyLock::new(|| Face::parse(BYTES, 0).expect("a font"));
 
-/// Glyph for a character that the font lacks.
-const UNKNOWN: [u8; 7] = [0b11111, 0b10001, 0b10001, 0b10001, 0b10001, 0b10001, 0b11111];
+/// Outlines of letters at a place, with y down.
+struct Outline {
+    path: PathBuilder,
+    at: [f32; 2],
+    scale: f32,
+}
 
-/// Draws a line of text with its upper left corner at `at`, `size` pixels per dot.
-pub(super) fn draw(canvas: &mut Canvas, text: &str, at: [f64; 2], size: i64, colour: Colour) {
-    for (i, c) in text.chars().flat_map(char::to_lowercase).enumerate() {
-        if c == ' ' {
-            continue;
-        }
-        let rows = GLYPHS.iter().find(|(g, _)| *g == c).map_or(&UNKNOWN, |(_, rows)| rows);
-        for (y, row) in rows.iter().enumerate() {
-            for x in (0..5).filter(|x| row >> (4 - x) & 1 == 1) {
-                let left = at[0] as i64 + size * (6 * i as i64 + x);
-                canvas.dot(left, at[1] as i64 + size * y as i64, size, colour);
-            }
-        }
+impl Outline {
+    fn place(&self, x: f32, y: f32) -> (f32, f32) {
+        (self.at[0] + self.scale * x, self.at[1] - self.scale * y)
     }
 }
 
-/// Breaks a text into lines of at most `width` characters, at spaces if possible.
-pub(super) fn wrap(text: &str, width: usize) -> Vec<String> {
+impl OutlineBuilder for Outline {
+    fn move_to(&mut self, x: f32, y: f32) {
+        let (x, y) = self.place(x, y);
+        self.path.move_to(x, y);
+    }
+
+    fn line_to(&mut self, x: f32, y: f32) {
+        let (x, y) = self.place(x, y);
+        self.path.line_to(x, y);
+    }
+
+    fn quad_to(&mut self, x1: f32, y1: f32, x: f32, y: f32) {
+        let ((x1, y1), (x, y)) = (self.place(x1, y1), self.place(x, y));
+        self.path.quad_to(x1, y1, x, y);
+    }
+
+    fn curve_to(&mut self, x1: f32, y1: f32, x2: f32, y2: f32, x: f32, y: f32) {
+        let ((x1, y1), (x2, y2), (x, y)) = (self.place(x1, y1), self.place(x2, y2), self.place(x, y));
+        self.path.cubic_to(x1, y1, x2, y2, x, y);
+    }
+
+    fn close(&mut self) {
+        self.path.close();
+    }
+}
+
+fn scale(size: f64) -> f64 {
+    size / f64::from(FACE.units_per_em())
+}
+
+/// Glyphs of a text with the advance of each in the font's units.
+fn glyphs(text: &str) -> impl Iterator<Item = (GlyphId, f64)> + '_ {
+    text.chars().map(|c| {
+        let glyph = FACE.glyph_index(c).unwrap_or(GlyphId(0));
+        (glyph, f64::from(FACE.glyph_hor_advance(glyph).unwrap_or(0)))
+    })
+}
+
+/// Width of a text in pixels, at letters of `size` pixels.
+pub(super) fn width(text: &str, size: f64) -> f64 {
+    glyphs(text).map(|(_, advance)| advance).sum::<f64>() * scale(size)
+}
+
+/// Draws a line of text with its upper left corner at `at`, in letters of `size` pixels. Returns its width.
+pub(super) fn draw(canvas: &mut Canvas, text: &str, at: [f64; 2], size: f64, colour: Colour) -> f64 {
+    let baseline = at[1] + f64::from(FACE.ascender()) * scale(size);
+    let place = [at[0] as f32, baseline as f32];
+    let mut outline = Outline { path: PathBuilder::new(), at: place, scale: scale(size) as f32 };
+    for (glyph, advance) in glyphs(text) {
+        FACE.outline_glyph(glyph, &mut outline);
+        outline.at[0] += (advance * scale(size)) as f32;
+    }
+    if let Some(path) = outline.path.finish() {
+        canvas.fill(&path, colour);
+    }
+    f64::from(outline.at[0]) - at[0]
+}
+
+/// Shortens a text to `most` pixels, with `…` at its end if something is missing.
+pub(super) fn fit(text: &str, size: f64, most: f64) -> String {
+    if width(text, size) <= most {
+        return text.to_owned();
+    }
+    let mut shown: String = text.to_owned();
+    while !shown.is_empty() && width(&shown, size) + width("…", size) > most {
+        shown.pop();
+    }
+    format!("{}…", shown.trim_end())
+}
+
+/// Breaks a text at spaces into lines of at most `most` pixels; a longer word has a line of its own.
+pub(super) fn wrap(text: &str, size: f64, most: f64) -> Vec<String> {
     let mut lines: Vec<String> = vec![];
     for word in text.split_whitespace() {
         match lines.last_mut() {
-            Some(line) if line.chars().count() + 1 + word.chars().count() <= width => {
+            Some(line) if width(&format!("{line} {word}"), size) <= most => {
                 line.push(' ');
                 line.push_str(word);
             }
@@ -91,4 +108,29 @@ pub(super) fn wrap(text: &str, width: usize) -> Vec<String> {
         }
     }
     lines
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn letters_have_their_own_widths_and_shapes() {
+        assert!(width("iiii", 16.0) < width("mmmm", 16.0));
+        assert_eq!(wrap("a person walks", 16.0, width("a person", 16.0) + 1.0), ["a person", "walks"]);
+        let short = fit("a person walks in a circle", 16.0, 100.0);
+        assert!(short.ends_with('…') && width(&short, 16.0) <= 100.0, "{short}");
+        assert_eq!(fit("short", 16.0, 100.0), "short");
+        let drawn = |text: &str| {
+            let mut canvas = Canvas::new(40, 40, [255; 3]);
+            draw(&mut canvas, text, [4.0, 4.0], 24.0, [0; 3]);
+            canvas.bytes()
+        };
+        for (one, other) in [("p", "P"), ("q", "9"), ("g", "q"), ("é", "e"), ("\u{4e00}", "a")] {
+            assert_ne!(drawn(one), drawn(other), "{one} {other}");
+        }
+        let grey = drawn("o").iter().filter(|value| (1..255).contains(*value)).count();
+        assert!(grey > 100, "{grey} values between paper and ink: edges are smooth");
+        assert!("ąłżΩж×°–…".chars().all(|c| FACE.glyph_index(c).is_some()), "the font has letters of many languages");
+    }
 }

@@ -1,4 +1,6 @@
-//! Anti-aliased lines and discs on an RGB canvas, and the palette of a GIF.
+//! Anti-aliased lines, discs and outlines on an RGB canvas, and the palette of a GIF.
+
+use tiny_skia::{FillRule, LineCap, LineJoin, Paint, Path, PathBuilder, Pixmap, Stroke, Transform};
 
 /// Red, green and blue, 0 to 255.
 pub(super) type Colour = [u8; 3];
@@ -10,55 +12,68 @@ pub(super) fn blend(under: Colour, over: Colour, share: f64) -> Colour {
 
 pub(super) struct Canvas {
     pub(super) width: usize,
-    height: usize,
-    pixels: Vec<Colour>,
+    pixels: Pixmap,
+}
+
+fn paint(colour: Colour) -> Paint<'static> {
+    let mut paint = Paint { anti_alias: true, ..Paint::default() };
+    paint.set_color_rgba8(colour[0], colour[1], colour[2], 255);
+    paint
 }
 
 impl Canvas {
+    /// Makes a canvas of at least one pixel.
+    ///
+    /// # Panics
+    /// If the canvas exceeds the address space.
+    #[expect(clippy::expect_used, reason = "sizes are those of sheets, far below the limit")]
     pub(super) fn new(width: usize, height: usize, paper: Colour) -> Self {
-        Self { width, height, pixels: vec![paper; width * height] }
+        let mut pixels = Pixmap::new(width.max(1) as u32, height.max(1) as u32).expect("a canvas of this size");
+        pixels.fill(tiny_skia::Color::from_rgba8(paper[0], paper[1], paper[2], 255));
+        Self { width, pixels }
     }
 
-    pub(super) fn bytes(&self) -> &[u8] {
-        self.pixels.as_flattened()
+    fn colours(&self) -> impl Iterator<Item = Colour> + '_ {
+        // Every pixel is opaque, so its colour is not multiplied by anything.
+        self.pixels.pixels().iter().map(|pixel| [pixel.red(), pixel.green(), pixel.blue()])
     }
 
-    /// Draws a line with round ends; the coverage of a pixel depends on the distance of its middle from the edge.
-    pub(super) fn line(&mut self, a: [f64; 2], b: [f64; 2], width: f64, colour: Colour) {
-        let radius = 0.5 * width;
-        let bounds = |k: usize, limit: usize| {
-            let low = (a[k].min(b[k]) - radius - 1.0).floor().clamp(0.0, limit as f64) as usize;
-            let high = (a[k].max(b[k]) + radius + 2.0).ceil().clamp(0.0, limit as f64) as usize;
-            low..high
-        };
-        let along = [b[0] - a[0], b[1] - a[1]];
-        let length = (along[0] * along[0] + along[1] * along[1]).max(1e-9);
-        for y in bounds(1, self.height) {
-            for x in bounds(0, self.width) {
-                let p = [x as f64 + 0.5 - a[0], y as f64 + 0.5 - a[1]];
-                let share = ((p[0] * along[0] + p[1] * along[1]) / length).clamp(0.0, 1.0);
-                let distance = (p[0] - share * along[0]).hypot(p[1] - share * along[1]);
-                let cover = (radius + 0.5 - distance).clamp(0.0, 1.0) * width.min(1.0);
-                if cover > 0.0 {
-                    let pixel = &mut self.pixels[y * self.width + x];
-                    *pixel = blend(*pixel, colour, cover);
-                }
+    /// Red, green and blue of each pixel.
+    pub(super) fn bytes(&self) -> Vec<u8> {
+        self.colours().flatten().collect()
+    }
+
+    /// Draws a line through points, with round ends and corners.
+    pub(super) fn lines(&mut self, points: impl IntoIterator<Item = [f64; 2]>, width: f64, colour: Colour) {
+        let mut path = PathBuilder::new();
+        for [x, y] in points {
+            match path.is_empty() {
+                true => path.move_to(x as f32, y as f32),
+                false => path.line_to(x as f32, y as f32),
             }
         }
+        let stroke =
+            Stroke { width: width as f32, line_cap: LineCap::Round, line_join: LineJoin::Round, ..Stroke::default() };
+        // A path without extent is not drawn.
+        if let Some(path) = path.finish() {
+            self.pixels.stroke_path(&path, &paint(colour), &stroke, Transform::identity(), None);
+        }
+    }
+
+    /// Draws a line with round ends.
+    pub(super) fn line(&mut self, a: [f64; 2], b: [f64; 2], width: f64, colour: Colour) {
+        self.lines([a, b], width, colour);
     }
 
     pub(super) fn disc(&mut self, at: [f64; 2], radius: f64, colour: Colour) {
-        self.line(at, at, 2.0 * radius, colour);
+        if let Some(path) = PathBuilder::from_circle(at[0] as f32, at[1] as f32, radius as f32) {
+            self.fill(&path, colour);
+        }
     }
 
-    /// A filled square of `size` pixels.
-    pub(super) fn dot(&mut self, x: i64, y: i64, size: i64, colour: Colour) {
-        for (dx, dy) in (0..size).flat_map(|dy| (0..size).map(move |dx| (dx, dy))) {
-            let (x, y) = (x + dx, y + dy);
-            if (0..self.width as i64).contains(&x) && (0..self.height as i64).contains(&y) {
-                self.pixels[y as usize * self.width + x as usize] = colour;
-            }
-        }
+    /// Fills the inside of a path.
+    pub(super) fn fill(&mut self, path: &Path, colour: Colour) {
+        self.pixels.fill_path(path, &paint(colour), FillRule::Winding, Transform::identity(), None);
     }
 }
 
@@ -94,7 +109,7 @@ pub(super) fn palette(colours: &[Colour]) -> Palette {
 
 impl Palette {
     pub(super) fn indices(&self, canvas: &Canvas) -> Vec<u8> {
-        let key = |c: &Colour| usize::from(c[0] >> 3) << 10 | usize::from(c[1] >> 3) << 5 | usize::from(c[2] >> 3);
-        canvas.pixels.iter().map(|c| self.nearest[key(c)]).collect()
+        let key = |c: Colour| usize::from(c[0] >> 3) << 10 | usize::from(c[1] >> 3) << 5 | usize::from(c[2] >> 3);
+        canvas.colours().map(|c| self.nearest[key(c)]).collect()
     }
 }

@@ -115,6 +115,7 @@ impl DataFeatures {
 
 impl StageSpec for DataFeatures {
     const KIND: &'static str = "data.features";
+    const VERSION: u32 = 2;
     const SHAPE: Shape = Shape::Map;
     const OUTPUT: Output = Output { name: "dataset", kind: ArtifactKind::Dataset };
 

@@ -10,7 +10,7 @@
 
 use std::collections::BTreeMap;
 
-use mocap::corpus::{self, Division, FromFile, Made, Recipe, Report};
+use mocap::corpus::{self, Division, FromFile, LeftOut, Made, Recipe, Report, Why};
 use mocap::detect::Up;
 use mocap::joint_map::{JointMap, MapError};
 use mocap::listing::{Listing, list};
@@ -37,8 +37,6 @@ const CLIPS_FILE: &str = "clips.json";
 const SHEET_FILE: &str = "contact-sheet.png";
 /// Number of motions and poses on the sheet.
 const SHEET: (usize, usize) = (24, 10);
-/// Length of a caption on the sheet, in letters.
-const TITLE: usize = 60;
 
 /// Meta of a shard.
 #[derive(Debug, Serialize, Deserialize)]
@@ -86,7 +84,7 @@ impl Map for DataFeatures {
             let all = Broken { count: have, broken: &broken };
             return Err(StageError::Input(all.to_string()));
         }
-        report.left_out.extend(broken);
+        report.left_out.extend(broken.into_iter().map(|what| LeftOut::new(Why::Broken, what)));
         report.compare_axes();
         let division = match self.splits {
             Splits::Lists => Division::Lists,
@@ -96,6 +94,9 @@ impl Map for DataFeatures {
         let extras = extras(&dataset)?;
         for note in &report.notes {
             cx.log(&format!("warning: {note}"));
+        }
+        for (why, (count, one)) in report.reasons() {
+            cx.log(&format!("left out: {count} {}; such as {one}", why.words()));
         }
         let skipped = report.left_out.len();
         pack(cx, &dataset, skipped, report.to_string(), extras)
@@ -233,16 +234,17 @@ fn recipe(settings: &DataFeatures, given: &Given) -> Result<Recipe, StageError> 
 fn extras(dataset: &Dataset) -> Result<Vec<Extra>, StageError> {
     let skeleton = dataset.skeleton();
     let fault = |e: std::io::Error| StageError::Fault(e.to_string());
-    let motions: Vec<(String, Vec<f32>)> = corpus::spread(dataset.entries.len(), SHEET.0)
+    let motions: Vec<draw::Row> = corpus::spread(dataset.entries.len(), SHEET.0)
         .into_iter()
         .map(|i| {
             let entry = &dataset.entries[i];
-            let caption: String = dataset.captions[entry.captions[0]].text.chars().take(TITLE).collect();
-            (format!("{}: {caption}", entry.id), recover_joints(dataset.features(entry), skeleton))
+            let title = dataset.captions[entry.captions[0]].text.clone();
+            let joints = recover_joints(dataset.features(entry), skeleton);
+            draw::Row { title, note: entry.id.clone(), joints }
         })
         .collect();
     let mut sheet = Vec::new();
-    draw::strip_png_to(&motions, SHEET.1, skeleton, &mut sheet).map_err(fault)?;
+    draw::sheet_to(&motions, SHEET.1, skeleton, draw::Given::default(), &mut sheet).map_err(fault)?;
     let std = corpus::evaluator_std(skeleton, &dataset.std);
     let array = |values: &[f32]| npy::to_bytes(&[skeleton.features], values).map_err(fault);
     Ok(vec![(SHEET_FILE, sheet), ("evaluator-mean.npy", array(&dataset.mean)?), ("evaluator-std.npy", array(&std)?)])

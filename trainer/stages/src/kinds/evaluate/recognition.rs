@@ -262,15 +262,19 @@ impl Recognition<'_> {
         let skeleton = dataset.skeleton();
         let seen = self.0.activities.iter().enumerate().filter(|(_, activity)| activity.sheet);
         let first = seen.filter_map(|(i, _)| drawn.iter().find(|d| d.asked.activity == i));
-        let motions: Vec<(String, Vec<f32>)> = first
-            .map(|d| (dataset.captions[d.asked.caption].text.clone(), recover_joints(&d.rows, skeleton)))
+        let motions: Vec<draw::Row> = first
+            .map(|d| draw::Row {
+                title: dataset.captions[d.asked.caption].text.clone(),
+                note: self.0.sampler.to_string(),
+                joints: recover_joints(&d.rows, skeleton),
+            })
             .collect();
         if motions.is_empty() {
             return Ok(None);
         }
         let mut png = Vec::new();
         let fault = |e: std::io::Error| StageError::Fault(e.to_string());
-        draw::strip_png_to(&motions, POSES, skeleton, &mut png).map_err(fault)?;
+        draw::sheet_to(&motions, POSES, skeleton, draw::Given::default(), &mut png).map_err(fault)?;
         Ok(Some(png))
     }
 }
