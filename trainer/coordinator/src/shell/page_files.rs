@@ -1,10 +1,11 @@
-//! The files of the page (crate `page`), which need no token: they say nothing but that somebody listens.
+//! The files of the page (crate `page`) and of the book (crate `book`). They need no token: they reveal only that a server is
+//! running, and its version.
 
 use std::sync::Arc;
 
 use axum::Router;
 use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode, header};
-use axum::response::{IntoResponse, Response};
+use axum::response::{IntoResponse, Redirect, Response};
 use axum::routing::get;
 
 use super::actor_handle::ActorHandle;
@@ -20,16 +21,30 @@ const DATA_POLICY: &str = "default-src 'none'; frame-ancestors 'none'; sandbox";
 
 pub(super) fn router() -> Router<Arc<ActorHandle>> {
     let router = page::VIEWS.iter().fold(Router::new(), |router, view| router.route(view, get(document)));
-    router.route("/page/{folder}/{*name}", get(file))
+    router
+        .route("/page/{folder}/{*name}", get(file))
+        .route("/book", get(|| async { Redirect::permanent("/book/") }))
+        .route("/book/", get(|headers| async { chapter(Path(book::FIRST.to_owned()), headers).await }))
+        .route("/book/{*name}", get(chapter))
 }
 
 async fn document(headers: HeaderMap) -> Response {
-    answer(page::index(), &headers, ASK_AGAIN)
+    answer(page::index(), &headers, ASK_AGAIN, page::CONTENT_POLICY)
+}
+
+async fn chapter(Path(name): Path<String>, headers: HeaderMap) -> Response {
+    match book::find(&name) {
+        Some(file) => answer(file, &headers, ASK_AGAIN, book::CONTENT_POLICY),
+        None => {
+            let message = format!("the book has no page `{name}`");
+            Failure::new(StatusCode::NOT_FOUND, "not-found", message).hint("/book/ lists its chapters").into_response()
+        }
+    }
 }
 
 async fn file(Path((folder, name)): Path<(String, String)>, headers: HeaderMap) -> Response {
     match page::find(&folder, &name) {
-        Some(file) => answer(file, &headers, FOR_EVER),
+        Some(file) => answer(file, &headers, FOR_EVER, page::CONTENT_POLICY),
         None => {
             let message = "this build of the server has no such file of the page".to_owned();
             Failure::new(StatusCode::NOT_FOUND, "not-found", message).hint("load the page again").into_response()
@@ -37,14 +52,14 @@ async fn file(Path((folder, name)): Path<(String, String)>, headers: HeaderMap) 
     }
 }
 
-fn answer(file: &'static page::File, headers: &HeaderMap, cache: &'static str) -> Response {
+fn answer(file: &'static page::File, headers: &HeaderMap, cache: &'static str, policy: &'static str) -> Response {
     let text = |name: HeaderName| headers.get(name).and_then(|value| value.to_str().ok()).unwrap_or_default();
     let known = text(header::IF_NONE_MATCH).split(',').any(|tag| tag.trim().trim_start_matches("W/") == file.tag);
     let common = [
         (header::ETAG, file.tag.as_str()),
         (header::CACHE_CONTROL, cache),
         (header::VARY, "accept-encoding"),
-        (header::CONTENT_SECURITY_POLICY, page::CONTENT_POLICY),
+        (header::CONTENT_SECURITY_POLICY, policy),
         (header::REFERRER_POLICY, "no-referrer"),
         (HeaderName::from_static("cross-origin-opener-policy"), "same-origin"),
         (HeaderName::from_static("cross-origin-resource-policy"), "same-origin"),
