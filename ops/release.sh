@@ -2,21 +2,25 @@
 # Builds a release for this machine's platform into a folder: two wheels, a Debian package, a container, checksums, a bill of
 # materials, a provenance statement and the notes of CHANGELOG.md. Then installs the wheel in a bare root and draws a picture.
 #
-#   ops/release.sh [--out DIR] [--binaries DIR] [--glibc VERSION] [--skip container,smoke]
+#   ops/release.sh [--out DIR] [--binaries DIR] [--glibc VERSION] [--bundle STORE] [--model NAME] [--root TAR]
+#                  [--skip container,smoke]
 #
 # --binaries takes ready `trainer` and `registry` from DIR, and `sbom` if it is there, instead of building them.
 # --glibc 2.28 links against that glibc, with cargo-zigbuild and zig; without it, against this machine's.
+# --bundle adds the model of configs/bandai.yaml, or --model, from the store that trained it, with the licence of its data.
+# --root takes the bare root, a Debian with python3-venv, from an archive instead of debootstrap.
 # It needs python3 with venv, PyPI for hatchling and auditwheel, dpkg-deb, and strip and objdump of binutils. The container needs
-# podman or docker. The bare root needs root and debootstrap; without them, the wheel is tried in a fresh venv with an empty HOME.
+# podman or docker; with neither, buildah makes it of the bare root. The bare root needs root and debootstrap; without them, the
+# wheel is tried in a fresh venv with an empty HOME, and the Debian package is not installed.
 # A part that cannot be made is listed as SKIPPED at the end, and is no failure. Nothing is signed; ops/README.md says how.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
-out=target/release-files binaries= glibc= skip=
+out=target/release-files binaries= glibc= bundle= model=bandai@staging root= skip=
 while [ $# -gt 0 ]; do
     case $1 in
-    --out | --binaries | --glibc | --skip) [ $# -gt 1 ] || { echo "$1 needs a value" >&2 && exit 2; } ;;
-    *) echo "unknown: $1; expected --out, --binaries, --glibc or --skip" >&2 && exit 2 ;;
+    --out | --binaries | --glibc | --bundle | --model | --root | --skip) [ $# -gt 1 ] || { echo "$1 needs a value" >&2 && exit 2; } ;;
+    *) echo "unknown: $1; expected --out, --binaries, --glibc, --bundle, --model, --root or --skip" >&2 && exit 2 ;;
     esac
     declare "${1#--}=$2"
     shift 2
@@ -29,8 +33,13 @@ mkdir -p "$out"
 out=$(realpath "$out")
 rm -rf "${out:?}"/*
 work=$(mktemp -d)
-trap 'rm -rf "$work"' EXIT
+trap 'umount "$work/root" 2>/dev/null || true; rm -rf "$work"' EXIT
 say() { printf '\n== %s (%s s)\n' "$1" "$SECONDS"; }
+# Runs a command in the bare root: no network, and nothing of this machine but its kernel.
+in_root() {
+    unshare --net --mount --pid --fork chroot "$work/root" \
+        env -i HOME=/home/new PATH=/usr/sbin:/usr/bin:/sbin:/bin sh -c 'mount -t proc proc /proc; exec "$@"' sh "$@"
+}
 
 say programs
 if [ -n "$binaries" ]; then
@@ -38,7 +47,7 @@ if [ -n "$binaries" ]; then
 elif [ -n "$glibc" ]; then
     target=$machine-unknown-linux-gnu
     cargo zigbuild --release --locked --bin trainer --bin registry --target "$target.$glibc"
-    built="cargo zigbuild --release --locked --target $target.$glibc" binaries=target/$target/release
+    built="cargo zigbuild --release --locked --target $target.$glibc" binaries=${CARGO_TARGET_DIR:-target}/$target/release
 else
     cargo build --release --locked --bin trainer --bin registry
     built="cargo build --release --locked" binaries=${CARGO_TARGET_DIR:-target}/release
@@ -69,16 +78,16 @@ tr -d '\n' <"$work/audit" | grep -q "$platform" || { echo "auditwheel does not c
 
 say "Debian package"
 arch=$(dpkg --print-architecture)
-root=$work/stride_${version}_$arch
-mkdir -p "$root/DEBIAN" "$root"/usr/{bin,share/{stride,man/man1,doc/stride,bash-completion/completions}} "$root/lib/systemd/system"
-cp "$work"/bin/* "$root/usr/bin/"
-cp -r configs "$root/usr/share/stride/"
-cp LICENSE-MIT LICENSE-APACHE README.md CHANGELOG.md "$root/usr/share/doc/stride/"
-for unit in ops/*.service; do sed 's|/usr/local/bin/|/usr/bin/|g' "$unit" >"$root/lib/systemd/system/$(basename "$unit")"; done
-"$work/bin/trainer" man "$root/usr/share/man/man1" 2>/dev/null
-gzip -9n "$root"/usr/share/man/man1/*
-"$work/bin/trainer" completions bash >"$root/usr/share/bash-completion/completions/trainer"
-cat >"$root/DEBIAN/control" <<END
+packed=$work/stride_${version}_$arch
+mkdir -p "$packed/DEBIAN" "$packed"/usr/{bin,share/{stride,man/man1,doc/stride,bash-completion/completions}} "$packed/lib/systemd/system"
+cp "$work"/bin/* "$packed/usr/bin/"
+cp -r configs "$packed/usr/share/stride/"
+cp LICENSE-MIT LICENSE-APACHE README.md CHANGELOG.md "$packed/usr/share/doc/stride/"
+for unit in ops/*.service; do sed 's|/usr/local/bin/|/usr/bin/|g' "$unit" >"$packed/lib/systemd/system/$(basename "$unit")"; done
+"$work/bin/trainer" man "$packed/usr/share/man/man1" 2>/dev/null
+gzip -9n "$packed"/usr/share/man/man1/*
+"$work/bin/trainer" completions bash >"$packed/usr/share/bash-completion/completions/trainer"
+cat >"$packed/DEBIAN/control" <<END
 Package: stride
 Version: $version
 Architecture: $arch
@@ -92,10 +101,83 @@ Description: trains models that turn a sentence into human motion
  One program for training, evaluation and a registry of models, on one machine
  or several. \`trainer demo\` draws motions within seconds.
 END
-find "$root" -type d -exec chmod 755 {} +
-dpkg-deb -Zgzip --root-owner-group --build "$root" "$out" >/dev/null
+find "$packed" -type d -exec chmod 755 {} +
+dpkg-deb -Zgzip --root-owner-group --build "$packed" "$out" >/dev/null
 deb=$(ls "$out"/*.deb)
 dpkg-deb --info "$deb" | sed -n 's/^ \(Package\|Version\|Depends\|Installed-Size\)/\1/p'
+
+say "bare root"
+rooted=
+mkdir "$work/root"
+if [[ ,$skip, == *,smoke,* ]]; then
+    skipped+=("bare root, and the trials on it: as asked")
+elif [ "$(id -u)" != 0 ] || { [ -z "$root" ] && ! command -v debootstrap >/dev/null; }; then
+    skipped+=("bare root: debootstrap is missing, or this is not root")
+else
+    # In memory, because dpkg waits for the disk after each file.
+    mount -t tmpfs -o size=2g tmpfs "$work/root" || echo "no tmpfs could be mounted; this takes longer on a disk"
+    if [ -n "$root" ]; then
+        made=(tar -C "$work/root" -xf "$root")
+    else
+        made=(debootstrap --variant=minbase --include=ca-certificates,python3-venv bookworm "$work/root" http://deb.debian.org/debian)
+    fi
+    if "${made[@]}" >"$work/debootstrap.log" 2>&1; then
+        rooted=yes
+        mkdir -p "$work/root/wheels" "$work/root/home/new"
+        echo "Debian $(cat "$work/root/etc/debian_version"), without Rust"
+    else
+        tail -3 "$work/debootstrap.log" >&2
+        skipped+=("bare root: debootstrap failed: $(tail -1 "$work/debootstrap.log")")
+    fi
+fi
+
+say "the wheel on the bare root"
+# What a newcomer types, timed from `pip install` to the picture.
+cat >"$work/try.sh" <<'END'
+set -eu
+cd "$HOME"
+python3 -m venv bare
+begun=$(date +%s.%N)
+bare/bin/pip install --quiet --no-index --disable-pip-version-check /wheels/stride_motion-*.whl
+installed=$(date +%s.%N)
+PATH="$HOME/bare/bin:$PATH"
+trainer --version
+trainer demo
+test -s stride-demo/demo.png && test -s stride-demo/demo.html
+drawn=$(date +%s.%N)
+registry list --store stride-demo/store
+if command -v cargo; then echo "this root is not bare" >&2 && exit 1; fi
+echo "$begun $installed $drawn" |
+    awk '{printf "pip install took %.1f s, the picture %.1f s more; the limit of both is 60 s\n", $2 - $1, $3 - $2; exit $3 - $1 > 60}'
+END
+if [[ ,$skip, == *,smoke,* ]]; then
+    echo "skipped"
+elif [ -n "$rooted" ]; then
+    cp "$programs" "$work/root/wheels/"
+    cp "$work/try.sh" "$work/root/"
+    in_root sh /try.sh
+    cp "$work/root/home/new/stride-demo/demo.png" "$out/demo.png"
+else
+    echo "NO BARE ROOT: trying the wheel in a fresh venv with an empty HOME on this machine instead" >&2
+    mkdir "$work/home" "$work/wheels"
+    cp "$programs" "$work/wheels/"
+    sed "s|/wheels/|$work/wheels/|; /command -v cargo/d" "$work/try.sh" >"$work/try-here.sh"
+    env -i HOME="$work/home" PATH="$(dirname "$(command -v python3)"):/usr/bin:/bin" sh "$work/try-here.sh"
+    cp "$work/home/stride-demo/demo.png" "$out/demo.png"
+fi
+
+say "the Debian package on the bare root"
+if [ -n "$rooted" ]; then
+    cp "$deb" "$work/root/stride.deb"
+    in_root sh -ec 'dpkg -i /stride.deb && cd && trainer --version && registry --version
+        zcat /usr/share/man/man1/trainer.1.gz | grep -q "^\.TH" && ls /usr/share/man/man1 | grep -c "^trainer" | sed "s/$/ pages of the manual/"
+        bash -c ". /usr/share/bash-completion/completions/trainer && complete -p trainer"
+        trainer plan /usr/share/stride/configs/quickstart.yaml | head -3
+        dpkg -r stride
+        test ! -e /usr/bin/trainer'
+else
+    skipped+=("installation of the Debian package: no bare root")
+fi
 
 say container
 engine=
@@ -104,11 +186,30 @@ for program in podman docker; do
 done
 if [[ ,$skip, == *,container,* ]]; then
     skipped+=("container: as asked")
-elif [ -z "$engine" ]; then
-    skipped+=("container: neither podman nor docker answers here")
-else
+elif [ -n "$engine" ]; then
     "$engine" build -f ops/Containerfile -t "stride:$version" .
     "$engine" save "stride:$version" | gzip -n >"$out/stride-$version-$machine.oci.tar.gz"
+elif [ -n "$rooted" ] && command -v buildah >/dev/null; then
+    bash ops/container-of-root.sh "$work/root" "$work/bin" "$work/containers" "$work/image.tar" "stride:$version"
+    gzip -n <"$work/image.tar" >"$out/stride-$version-$machine.oci.tar.gz"
+    skipped+=("ops/Containerfile: neither podman nor docker answers here; buildah made the container of the bare root instead")
+else
+    skipped+=("container: neither podman nor docker answers here, and buildah or the bare root is missing")
+fi
+
+if [ -n "$bundle" ]; then
+    say "bundle of $model"
+    name=${model%%[@:]*}
+    "$work/bin/registry" export "$model" --store "$bundle" -o "$out/$name.tar.zst"
+    if [ "$name" = bandai ]; then
+        licence="trained on the Bandai-Namco Research Motion Dataset (CC BY-NC 4.0): not for commercial use, and name the set where you show its results"
+    else
+        licence="under the licences of the data that it was trained on; see its lineage: registry show $model"
+    fi
+    printf '%s.tar.zst: %s.\n' "$name" "$licence" | tee "$out/$name.LICENCE.txt"
+    # It is whole, and draws.
+    "$work/bin/registry" import "$out/$name.tar.zst" --model "$name" --store "$work/received"
+    "$work/bin/trainer" generate "a person walks" --model "$name@latest" --store "$work/received" -o "$work/walk.png"
 fi
 
 say "bill, notes, provenance, checksums"
@@ -148,48 +249,10 @@ statement = {
 (out / "provenance.json").write_text(json.dumps(statement, indent=1) + "\n")
 END
 
-say "the wheel on a bare root"
-# What a newcomer types after `pip install`, timed from there.
-cat >"$work/try.sh" <<'END'
-set -eu
-cd "$HOME"
-begun=$(date +%s.%N)
-python3 -m venv bare
-bare/bin/pip install --quiet --no-index --disable-pip-version-check /wheels/stride_motion-*.whl
-installed=$(date +%s.%N)
-PATH="$HOME/bare/bin:$PATH"
-trainer --version
-trainer demo
-test -s stride-demo/demo.png && test -s stride-demo/demo.html
-registry list --store stride-demo/store
-ended=$(date +%s.%N)
-echo "$begun $installed $ended" | awk '{printf "installed in %.1f s, then a picture after %.1f s\n", $2 - $1, $3 - $2; exit $3 - $2 > 60}'
-END
-if [[ ,$skip, == *,smoke,* ]]; then
-    skipped+=("smoke test: as asked")
-elif [ "$(id -u)" = 0 ] && command -v debootstrap >/dev/null &&
-    debootstrap --variant=minbase --include=python3-venv bookworm "$work/root" http://deb.debian.org/debian >"$work/debootstrap.log" 2>&1; then
-    mkdir -p "$work/root/wheels" "$work/root/home/new"
-    cp "$programs" "$work/root/wheels/"
-    cp "$work/try.sh" "$work/root/"
-    # No network, and nothing of this machine but its kernel.
-    unshare --net --mount --pid --fork chroot "$work/root" \
-        env -i HOME=/home/new PATH=/usr/bin:/bin sh -c 'mount -t proc proc /proc; exec sh /try.sh'
-    echo "in a Debian bookworm made by debootstrap, without Rust and without a network"
-    cp "$work/root/home/new/stride-demo/demo.png" "$out/demo.png"
-else
-    mkdir "$work/home" "$work/wheels"
-    cp "$programs" "$work/wheels/"
-    sed "s|/wheels/|$work/wheels/|" "$work/try.sh" >"$work/try-here.sh"
-    env -i HOME="$work/home" PATH=/usr/bin:/bin:/usr/local/bin sh "$work/try-here.sh"
-    echo "in a fresh venv with an empty HOME on this machine; no bare root could be made"
-    skipped+=("bare root: debootstrap is missing, fails, or needs root")
-fi
-
 say done
 ls -l "$out"
 for other in x86_64 aarch64; do
-    [ "$other" = "$machine" ] || skipped+=("Linux $other: run this script there, or cross-compile with --glibc and cargo-zigbuild")
+    [ "$other" = "$machine" ] || skipped+=("Linux $other: run this script there; ops/README.md says what was cross-compiled")
 done
 skipped+=("macOS arm64: workers, gangs and sandboxes use interfaces of Linux; nothing was built or tried")
 printf 'SKIPPED %s\n' "${skipped[@]}"

@@ -33,7 +33,7 @@ pub struct File {
     /// Its MIME type.
     pub kind: &'static str,
     pub bytes: Vec<u8>,
-    /// The same bytes, compressed.
+    /// The same bytes, compressed; empty where that saves nothing.
     pub gzip: Vec<u8>,
     /// Its entity tag, with quotes.
     pub tag: String,
@@ -125,18 +125,26 @@ struct Page {
 static PAGE: LazyLock<Page> = LazyLock::new(|| {
     let all: String = FILES.iter().map(|(name, bytes)| format!("{name} {}\n", Digest::of(bytes))).collect();
     let folder = Digest::of(all.as_bytes()).hex()[..16].to_owned();
-    let mut files: Vec<File> = FILES.iter().map(|(name, bytes)| file(name, bytes.to_vec())).collect();
+    let mut files: Vec<File> = FILES.iter().map(|(name, bytes)| File::new(name, bytes.to_vec())).collect();
     let index = files.remove(0);
-    let index = file(index.name, String::from_utf8_lossy(&index.bytes).replace(FOLDER, &folder).into_bytes());
+    let index = File::new(index.name, String::from_utf8_lossy(&index.bytes).replace(FOLDER, &folder).into_bytes());
     Page { index, folder, files }
 });
 
-fn file(name: &'static str, bytes: Vec<u8>) -> File {
-    let mut encoder = GzEncoder::new(Vec::new(), Compression::best());
-    // Writing to memory cannot fail.
-    let gzip = encoder.write_all(&bytes).and_then(|()| encoder.finish()).unwrap_or_default();
-    let tag = format!("\"{}\"", &Digest::of(&bytes).hex()[..32]);
-    File { name, kind: kind(name), bytes, gzip, tag }
+impl File {
+    /// The file of this name and content, compressed unless it is a PNG, which is compressed already.
+    #[must_use]
+    pub fn new(name: &'static str, bytes: Vec<u8>) -> Self {
+        let kind = kind(name);
+        let mut gzip = Vec::new();
+        if kind != "image/png" {
+            let mut encoder = GzEncoder::new(Vec::new(), Compression::best());
+            // Writing to memory cannot fail.
+            gzip = encoder.write_all(&bytes).and_then(|()| encoder.finish()).unwrap_or_default();
+        }
+        let tag = format!("\"{}\"", &Digest::of(&bytes).hex()[..32]);
+        Self { name, kind, bytes, gzip, tag }
+    }
 }
 
 fn kind(name: &str) -> &'static str {
@@ -145,6 +153,9 @@ fn kind(name: &str) -> &'static str {
         Some("js") => "text/javascript; charset=utf-8",
         Some("css") => "text/css; charset=utf-8",
         Some("svg") => "image/svg+xml",
+        Some("png") => "image/png",
+        Some("md") => "text/markdown; charset=utf-8",
+        Some("txt") => "text/plain; charset=utf-8",
         Some(_) | None => "application/octet-stream",
     }
 }

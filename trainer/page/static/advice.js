@@ -14,6 +14,9 @@ const ADVICE = [
   [/connection|unreachable|timed out|lost/i, "A worker or the network was lost more often than the budget allows. Look at the Workers view, then resume."],
 ];
 
+/** The book's list of causes. */
+export const CAUSES = "/book/troubleshooting.html#causes-of-failed-stages";
+
 /** What holds for every failure. */
 export const OTHERWISE = "Resume tries again from the newest checkpoint, with the same settings. For others change the pipeline and run it again: stages that have finished are not computed anew.";
 

@@ -98,6 +98,7 @@ function draw() {
               <p><b>${who.name}</b>${who.project ? html` of project <b>${who.project}</b>` : nothing}</p>
               <p class="dim">may ${who.scopes.join(", ")}</p>
               <p class="dim">store ${who.store} · version ${who.version}</p>
+              <p><a href="/book/">The book</a> · <a href="/book/troubleshooting.html">Troubleshooting</a></p>
               ${who.until_ms ? html`<button type="button" @click=${leave}>Sign out</button>` : nothing}
             </div>
           </details>
@@ -115,7 +116,7 @@ function content() {
   if (absent) {
     return html`<h1 tabindex="-1">${absent.status === 404 ? "Not here" : "This cannot be shown"}</h1>
       <p>${absent.message}</p>${absent.hint ? html`<p class="dim">${absent.hint}</p>` : nothing}
-      <p><a href="/runs">All runs</a></p>`;
+      <p><a href="/runs">All runs</a> · <a href=${`/book/troubleshooting.html#${encodeURIComponent(absent.code)}`}>What this error means</a></p>`;
   }
   if (!loaded) return html`<div class="skeleton" aria-busy="true"><p class="dim">Loading…</p></div>`;
   return view?.render();

@@ -40,6 +40,8 @@ export function start(whenChanged) {
     const link = event.target instanceof Element ? event.target.closest("a") : null;
     const href = link?.getAttribute("href") ?? "";
     if (!link || !href.startsWith("/") || href.startsWith("//") || link.target || link.hasAttribute("download")) return;
+    // The book has documents of its own.
+    if (href.startsWith("/book/")) return;
     event.preventDefault();
     if (href !== location.pathname + location.search) go(href);
   });

@@ -1,10 +1,11 @@
-//! The files of the page (crate `page`), which need no token, because they contain no data.
+//! The files of the page (crate `page`) and of the book (crate `book`). They need no token: they reveal only that a server is
+//! running, and its version.
 
 use std::sync::Arc;
 
 use axum::Router;
 use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode, header};
-use axum::response::{IntoResponse, Response};
+use axum::response::{IntoResponse, Redirect, Response};
 use axum::routing::get;
 
 use super::actor_handle::ActorHandle;
@@ -26,7 +27,21 @@ pub(super) fn router(stream: Option<&StreamOffer>) -> Router<Arc<ActorHandle>> {
         async move { answer(page::index(), &headers, ASK_AGAIN, &policy) }
     });
     let router = page::VIEWS.iter().fold(Router::new(), |router, view| router.route(view, document.clone()));
-    router.route("/page/{folder}/{*name}", get(file))
+    router
+        .route("/page/{folder}/{*name}", get(file))
+        .route("/book", get(|| async { Redirect::permanent("/book/") }))
+        .route("/book/", get(|headers| async { chapter(Path(book::FIRST.to_owned()), headers).await }))
+        .route("/book/{*name}", get(chapter))
+}
+
+async fn chapter(Path(name): Path<String>, headers: HeaderMap) -> Response {
+    match book::find(&name) {
+        Some(file) => answer(file, &headers, ASK_AGAIN, book::CONTENT_POLICY),
+        None => {
+            let message = format!("the book has no page `{name}`");
+            Failure::new(StatusCode::NOT_FOUND, "not-found", message).hint("/book/ lists its chapters").into_response()
+        }
+    }
 }
 
 async fn file(Path((folder, name)): Path<(String, String)>, headers: HeaderMap) -> Response {

@@ -43,7 +43,7 @@ export function login(place, why, done) {
           ${why ? html`<p class="wrong" role="alert">${why}</p>` : nothing}
           <button class="main" type="submit" ?disabled=${busy}>${busy ? "Signing in…" : "Sign in"}</button>
           <p id="token-help" class="dim">A token is what a line of the server's token file has. On the server's own machine <code>trainer serve</code> and
-            <code>trainer run --ui</code> print a link that signs you in, and the file <code>.stride/token</code> has one while they run.</p>
+            <code>trainer run --ui</code> print a link that signs you in, and the file <code>.stride/token</code> has one while they run. <a href="/book/server.html#who-may-do-what">Tokens and scopes</a></p>
         </form>
       </main>`,
       place,

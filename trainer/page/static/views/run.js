@@ -1,7 +1,7 @@
 //! One run: if it failed why, then its stages, curves, time line, settings, products and log.
 
 import { blob, CallError, get, post, runPath } from "../api.js";
-import { OTHERWISE, whatToDo } from "../advice.js";
+import { CAUSES, OTHERWISE, whatToDo } from "../advice.js";
 import { Chart, curves, inOrder, inWords, mainKey, series } from "../chart.js";
 import { ago, count, date, duration, grouped, number, plain, short, time } from "../format.js";
 import { graph, MOST } from "../graph.js";
@@ -172,7 +172,7 @@ export function run(context, name) {
       <p class="why clamp" dir="auto">${prose(firstLine(message) || "No reason was given.")}</p>
       <p class="actions">${controls(run.owner) ? resume() : nothing}<a class="button" href="#log-title" @click=${toLog}>Log</a></p>
       ${rest ? html`<pre class="rest" tabindex="0">${plain(rest)}</pre>` : nothing}
-      <p>${prose(whatToDo(message) ?? OTHERWISE)}</p>
+      <p>${prose(whatToDo(message) ?? OTHERWISE)} <a href=${CAUSES}>Causes of failed stages</a></p>
       <p class="dim small">${stage.kind}${(last?.attempt ?? stage.attempt) > 0 ? ` · attempt ${last?.attempt ?? stage.attempt}` : ""}${worker ? html` · worker ${worker}` : nothing}${stage.wall_s > 0 ? ` · after ${duration(stage.wall_s)}` : ""}</p>
       ${around.length > 0 ? html`<div class="lines few" tabindex="0" role="group" aria-label="The last lines of its log">${around.map((line) => logLine(line, false, line === marked))}</div>` : nothing}
       ${controls(run.owner) ? nothing : command(`trainer resume ${run.run}`, context)}

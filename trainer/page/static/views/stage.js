@@ -1,7 +1,7 @@
 //! One stage: its curves, numbers and log.
 
 import { get, runPath } from "../api.js";
-import { OTHERWISE, whatToDo } from "../advice.js";
+import { CAUSES, OTHERWISE, whatToDo } from "../advice.js";
 import { Chart, curves, inOrder, inWords, series } from "../chart.js";
 import { count, date, duration, grouped, number, plain, rate, short, time } from "../format.js";
 import { attemptsOf, History } from "../history.js";
@@ -129,7 +129,7 @@ export function stage(context, name, stageName) {
     return html`
       <p class="path"><a href="/runs">Runs</a> / <a href=${address("runs", name)}>${name}</a></p>
       <div class="row head"><h1 tabindex="-1">${it.name}</h1>${badge(it.state)}<span class="dim">${it.kind}</span></div>
-      ${it.state === "failed" ? html`<section class="card cause"><p class="why" dir="auto">${prose(it.message)}</p><p>${prose(whatToDo(it.message) ?? OTHERWISE)}</p><p class="actions"><a class="button" href=${address("runs", name)}>To the run</a></p></section>` : nothing}
+      ${it.state === "failed" ? html`<section class="card cause"><p class="why" dir="auto">${prose(it.message)}</p><p>${prose(whatToDo(it.message) ?? OTHERWISE)} <a href=${CAUSES}>Causes of failed stages</a></p><p class="actions"><a class="button" href=${address("runs", name)}>To the run</a></p></section>` : nothing}
       ${it.wants_workers ? html`<section class="card want warn"><p class="what">${prose(firstLine(it.message))}</p>${command(joinCommand(it.wants_workers, it.message), context)}</section>` : nothing}
       <div class="card summary">
         ${it.state === "running" && it.progress.total > 0 ? bar(share(it.progress), it.name) : nothing}

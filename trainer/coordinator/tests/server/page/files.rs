@@ -78,6 +78,29 @@ async fn a_file_is_loaded_once_and_compressed() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn the_book_is_shown_without_a_token_and_runs_no_script() {
+    let dir = tempfile::tempdir().unwrap();
+    let handle = with_tokens(dir.path()).await;
+    let address = handle.address();
+    for file in book::files() {
+        let answer = call(address, "GET", &format!("/book/{}", file.name), &[]);
+        assert_eq!((answer.status, &answer.body), (200, &file.bytes), "{}", file.name);
+        assert_eq!(answer.header("content-type"), file.kind);
+        assert_eq!(answer.header("content-security-policy"), book::CONTENT_POLICY);
+        assert_eq!(answer.header("x-content-type-options"), "nosniff");
+    }
+    let first = call(address, "GET", "/book/", &[]);
+    assert_eq!((first.status, &first.body), (200, &book::find(book::FIRST).unwrap().bytes));
+    let moved = call(address, "GET", "/book", &[]);
+    assert_eq!((moved.status, moved.header("location")), (308, "/book/"));
+    for other in ["/book/none.html", "/book/SUMMARY.md", "/book/../page/x/main.js"] {
+        let answer = call(address, "GET", other, &[]);
+        assert_eq!((answer.status, answer.json()["code"].as_str()), (404, Some("not-found")), "{other}");
+    }
+    handle.shutdown().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn what_a_call_answers_is_never_shown_as_a_page() {
     let dir = tempfile::tempdir().unwrap();
     let handle = with_tokens(dir.path()).await;
