@@ -28,7 +28,7 @@ use super::bundles::BundleQuery;
 use super::checkpoints::KeptCheckpoint;
 use super::curves::{Curves, CurvesAsked};
 use super::demand::{self, DemandQuery};
-use super::described::{Bytes, Described, EventStream, Nothing, OpenMetrics, Packed, described};
+use super::described::{Bytes, Described, EventStream, Exposition, Nothing, Packed, described};
 use super::draws::{Draw, Drawing};
 use super::events::EventsQuery;
 use super::extract::Query;
@@ -40,7 +40,8 @@ use super::route::Route;
 use super::session_calls::Who;
 use super::settings::RunSettings;
 use super::{
-    bundles, checkpoints, curves, draws, events, page_files, polls, queries, scrape, session_calls, settings, uploads,
+    bundles, checkpoints, curves, draws, events, page_files, polls, queries, scrape, session_calls, settings, spans,
+    uploads,
 };
 use crate::view::WorkerView;
 
@@ -120,7 +121,7 @@ fn table() -> Vec<Entry> {
         entry("POST", "/v1/draws",                 &[Submit],       CALL,                     SHORT, draws::draw,
             described::<Nothing, Json<Draw>, Json<Drawing>>("Draws motions of models for sentences").with(SUBMISSION)),
         entry("GET",  "/metrics",                  &[Read],         CALL,                     SHORT, scrape::metrics,
-            described::<Nothing, Nothing, OpenMetrics>("Shows the server's own numbers to Prometheus")),
+            described::<Nothing, Nothing, Exposition>("Shows the server's own numbers to Prometheus")),
         entry("GET",  "/v1/history",               &[Read],         CALL,                     SHORT, queries::history,
             described::<Query<HistoryCall>, Nothing, Json<Vec<HistoryRow>>>("Lists events, or waits for them")),
         entry("GET",  "/v1/events",                &[Read],         CALL,                     SHORT, events::events,
@@ -191,6 +192,7 @@ pub(crate) fn router(actor_handle: Arc<ActorHandle>, gate: &Arc<Gate>) -> Router
         .layer(middleware::from_fn_with_state(Arc::clone(gate), auth::check_host))
         .layer(middleware::map_response(page_files::keep_from_pages))
         .layer(middleware::from_fn_with_state(Arc::clone(&gate.audit), audit::note))
+        .layer(middleware::from_fn(spans::request))
         .with_state(actor_handle)
 }
 

@@ -41,6 +41,7 @@ mod secrets;
 mod session_calls;
 mod sessions;
 mod settings;
+mod spans;
 mod start_error;
 mod storage;
 mod streams;

@@ -285,7 +285,12 @@ pub(crate) async fn points(
 
 /// Returns true if a client asks for numbers as they are in memory.
 pub(super) fn accepts_packed(headers: &HeaderMap) -> bool {
-    headers.get(header::ACCEPT).and_then(|value| value.to_str().ok()).is_some_and(|accepts| accepts.contains(PACKED))
+    accepts(headers, PACKED)
+}
+
+/// Returns true if a client asks for a media type by its name.
+pub(super) fn accepts(headers: &HeaderMap, kind: &str) -> bool {
+    headers.get(header::ACCEPT).and_then(|value| value.to_str().ok()).is_some_and(|accepts| accepts.contains(kind))
 }
 
 /// Packs values: the length of a head as `u32`, the head as JSON padded with blanks to a multiple of four bytes, then for

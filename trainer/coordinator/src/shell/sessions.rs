@@ -117,7 +117,7 @@ impl Sessions {
         key.secret().to_owned()
     }
 
-    /// Whether `key` is good; it is not any more.
+    /// Takes `key` out of use; returns true if it was good until now.
     pub(crate) fn redeem(&self, key: &str) -> bool {
         let until_ms = self.lists.lock().unwrap_or_else(PoisonError::into_inner).keys.remove(&access::digest_of(key));
         until_ms.is_some_and(|until_ms| wall_clock().0 < until_ms)
