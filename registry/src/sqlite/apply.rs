@@ -129,7 +129,7 @@ pub(super) async fn proven(conn: &mut SqliteConnection, proofs: &Proofs, digest:
     Ok(artifact)
 }
 
-/// What `select` says of those of `tasks` that it finds, by task. `select` gives two columns, the task first, and ends in an open
+/// Values of `tasks` that `select` finds, by task. `select` gives two columns, the task first, and ends in an open
 /// list: `... WHERE task IN (`.
 async fn by_task<T>(conn: &mut SqliteConnection, select: &'static str, tasks: &[&TaskId]) -> Result<BTreeMap<TaskId, T>>
 where

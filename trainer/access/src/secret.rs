@@ -33,7 +33,7 @@ impl Token {
         &self.0
     }
 
-    /// What a server keeps of it: comparing digests says nothing about the token by the time it takes.
+    /// The digest that a server keeps of it: comparing digests says nothing about the token by the time it takes.
     pub fn digest(&self) -> Digest {
         Digest::of(self.0.as_bytes())
     }
