@@ -25,7 +25,7 @@ async fn drawn(store: &Store, window: Window) -> Buckets {
     all.remove("loss").unwrap_or_default()
 }
 
-/// What the buckets should say, added up from the points one by one: each bucket reaches from the one before to its place.
+/// The buckets that are expected, added up from the points one by one: each bucket reaches from the one before to its place.
 async fn check(store: &Store, window: Window) -> Buckets {
     let drawn = drawn(store, window).await;
     assert!(drawn.x.len() <= window.buckets, "{} buckets of {}", drawn.x.len(), window.buckets);

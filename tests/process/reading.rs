@@ -41,6 +41,9 @@ fn read_everything(bench: &Bench, finished: &str, interrupted: &str) {
         (&*format!("status {interrupted} -o json"), 0),
         ("logs", 0),
         (&*format!("logs {interrupted} --stage vae --follow"), 0),
+        ("metrics", 0),
+        ("metrics --stage vae --key loss --csv", 0),
+        ("metrics --key none", 7),
         ("sweep status", 7),
         ("worker list", 0),
         (&*format!("plan {config}"), 0),
@@ -102,6 +105,14 @@ fn reading_a_store_that_nobody_holds_changes_nothing() {
     assert_eq!(state(&bench, &finished), [&*finished, "finished", "ran"]);
     let logs = bench.run(&["logs"]).expect_code(0).stdout;
     assert!(logs.starts_with("dataset w1 "), "{logs}");
+    let values = bench.run(&["metrics", &finished, "--stage", "vae", "--key", "loss", "--csv"]).expect_code(0).stdout;
+    let mut rows = values.lines();
+    assert_eq!(rows.next(), Some("stage,name,step,value"));
+    let is_value = |row: &str| row.starts_with("vae,loss,") && row.rsplit(',').all(|word| !word.is_empty());
+    assert!(rows.clone().count() > 1 && rows.all(is_value), "{values}");
+    bench.run(&["metrics", &finished, "--key", "loss", "--plot", "loss.svg"]).expect_code(0);
+    let picture = fs::read_to_string(bench.path().join("loss.svg")).expect("a picture");
+    assert!(picture.starts_with("<svg ") && picture.contains("<polyline"), "{picture}");
     read_everything(&bench, &finished, &interrupted);
 
     let (resumed, again) = trains(&bench, bench.spawn(&["resume", &interrupted, "--workers", "1"]));

@@ -76,6 +76,7 @@ fn dependencies_point_one_way() {
     never("launcher", &["burn", "stages", "models", "worker", "registry", "coordinator", "sqlx", "axum"]);
     never("page", &["burn", "tokio", "sqlx", "axum", "hyper", "registry", "coordinator", "access"]);
     never("book", &["burn", "tokio", "sqlx", "axum", "hyper", "registry", "coordinator", "pulldown-cmark"]);
+    never("telemetry", &["burn", "axum", "sqlx", "coordinator", "stages", "worker", "opentelemetry"]);
     never("webhooks", &["burn", "axum", "coordinator", "stages", "worker"]);
     never("motion", &["burn", "tokio", "sqlx", "axum", "registry", "checkpoint"]);
     never("mocap", &["burn", "tokio", "sqlx", "axum", "registry", "checkpoint"]);

@@ -111,16 +111,8 @@ impl JoinError {
     }
 }
 
-/// Logs plain lines to standard error, filtered by `RUST_LOG`; standard output stays free. Does nothing if a logger is
-/// already set.
-pub fn init_logging() {
-    let filter = tracing_subscriber::EnvFilter::try_from_default_env()
-        .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("info"));
-    let log = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).with_ansi(false);
-    // A second subscriber is refused, and the first one is as good. A line that cannot be written is dropped without a
-    // panic.
-    let _ = log.log_internal_errors(false).try_init();
-}
+/// Lines that are logged without `RUST_LOG`.
+pub const LOGGED: &str = "info";
 
 /// Works for a coordinator until it asks the worker to leave or the process is asked to end.
 ///

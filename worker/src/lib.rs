@@ -37,5 +37,5 @@ mod telemetry_buffer;
 mod tests;
 
 pub use cli::JoinArgs;
-pub use join::{Files, JoinError, Options, init_logging, join};
+pub use join::{Files, JoinError, LOGGED, Options, join};
 pub use stage_limits::StageLimits;

@@ -16,7 +16,7 @@ fn main() -> ExitCode {
     // First, because the allocator can be tuned only while there is one thread.
     worker::process::tune_allocator();
     let Command::Join(args) = Command::parse();
-    worker::init_logging();
+    let _traces = telemetry::init("stride-worker", worker::LOGGED, false);
     match worker::Options::try_from(args).and_then(worker::join) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {

@@ -15,6 +15,8 @@ use protocol::proof::Vouched;
 use stages::context::{AttemptContext, ContextError, GangContext, Outcome, Part, StageError};
 use stages::external;
 use stages::external::DataAccess;
+use telemetry::SPANS;
+use tracing::Span;
 
 use crate::active_assignment::ActiveAssignment;
 use crate::assignments::Shared;
@@ -63,6 +65,7 @@ pub(crate) fn run(shared: &Shared, bench: &Bench) {
 fn attempt(held: &Arc<ActiveAssignment>, bench: &Bench) {
     let assignment = held.assignment();
     let grant = &assignment.grant;
+    let _entered = span(held).entered();
     tracing::info!(task = %grant.task, attempt = %grant.attempt, fence = %grant.fence, kind = assignment.stage.settings.kind(), "begin");
     let mut context = HttpContext::new(
         held.clone(),
@@ -83,7 +86,9 @@ fn attempt(held: &Arc<ActiveAssignment>, bench: &Bench) {
             found => found.map(Done::Resolved),
         },
     });
-    let caught = stage_limits::within(&bench.limits, held, &bench.client, || panic::catch_unwind(stage));
+    let computing = tracing::trace_span!(target: SPANS, "stage", otel.name = %format_args!("stage {}", assignment.stage.settings.kind()));
+    let work = || computing.in_scope(|| panic::catch_unwind(stage));
+    let caught = stage_limits::within(&bench.limits, held, &bench.client, work);
     let result = caught.unwrap_or_else(|payload| Err(StageError::Fault(panic_message(&*payload))));
     let Some(outcome) = outcome(result, held, &mut context) else { return };
 
@@ -92,7 +97,8 @@ fn attempt(held: &Arc<ActiveAssignment>, bench: &Bench) {
         TaskOutcome::Finished { output, .. } => context.receipts(*output),
         TaskOutcome::Resolved { .. } | TaskOutcome::Yielded { .. } | TaskOutcome::Failed { .. } => BTreeMap::new(),
     };
-    let reported = report(held, bench, &outcome, &receipts);
+    let reporting = tracing::trace_span!(target: SPANS, "report", outcome = %summary(&outcome));
+    let reported = reporting.in_scope(|| report(held, bench, &outcome, &receipts));
     failpoints::hit("outcome::after_report");
     match reported {
         Ok(()) => tracing::info!(task = %grant.task, attempt = %grant.attempt, "end: {}", summary(&outcome)),
@@ -113,6 +119,18 @@ fn attempt(held: &Arc<ActiveAssignment>, bench: &Bench) {
             }
         }
     }
+}
+
+/// The span of an attempt, in the trace of its run.
+fn span(held: &ActiveAssignment) -> Span {
+    let assignment = held.assignment();
+    let (stage, grant) = (&assignment.stage, &assignment.grant);
+    let span = tracing::trace_span!(
+        target: SPANS, "task", stride.run = %stage.run, stride.stage = %stage.name, stride.kind = stage.settings.kind(),
+        stride.task = %grant.task, stride.attempt = grant.attempt.0, stride.worker = %grant.worker
+    );
+    telemetry::join_run(&span, stage.run.as_str());
+    span
 }
 
 fn report(

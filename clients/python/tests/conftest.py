@@ -45,7 +45,7 @@ def server(store: Path) -> Iterator[stride.Server]:
         command = [TRAINER, "serve", "--store", str(store), "--bind", "127.0.0.1:0"]
         processes.append(subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT))
     try:
-        url = _address(log, processes[0])
+        url = address(log, processes[0])
         token = (store / "token").read_text().strip()
         with log.open("a") as out:
             command = [TRAINER, "worker", "join", url, "--token-file", str(store / "token")]
@@ -58,7 +58,8 @@ def server(store: Path) -> Iterator[stride.Server]:
             process.wait(60)
 
 
-def _address(log: Path, process: subprocess.Popen[bytes]) -> str:
+def address(log: Path, process: subprocess.Popen[bytes]) -> str:
+    """The address that a server has printed."""
     until = time.monotonic() + 60
     while time.monotonic() < until and process.poll() is None:
         if found := re.search(r"https?://127\.0\.0\.1:\d+", log.read_text()):

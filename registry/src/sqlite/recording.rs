@@ -1,7 +1,7 @@
 //! Storing values: the rows, when they came, and the roll-ups that they fill.
 //!
-//! What no roll-up holds yet is kept in memory between batches, so that a batch costs no questions. It follows from the tables, and is
-//! forgotten whenever what it came from was not committed.
+//! Values that no roll-up holds yet are kept in memory between batches, so that a batch costs no questions. They follow from the tables, and are
+//! forgotten whenever what they came from was not committed.
 
 use std::collections::{BTreeMap, HashMap};
 

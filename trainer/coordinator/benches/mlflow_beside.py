@@ -1,8 +1,9 @@
 """Stride and MLflow with SQLite side by side, each as a server of its own with one client; run by `mlflow.sh`.
 
 Each measurement is made of both in turns, so that other load of the machine meets both; medians are printed. Runs, batches and keys are
-alike. Stride's values come from a worker by the calls that workers make, MLflow's by `log_batch`. Stride's versions are rows that are put
-into its database before the server starts, since a version is otherwise the result of a training.
+alike. Stride's values come from a worker by the calls that workers make, MLflow's by `log_batch`; those that only make the curve longer
+are put into MLflow's database. Stride's versions are rows that are put into its database before the server starts, since a version is
+otherwise the result of a training.
 """
 
 from __future__ import annotations
@@ -29,13 +30,16 @@ from typing import Any
 import httpx
 
 POINTS = int(os.environ.get("POINTS", "200000"))
-RUNS = int(os.environ.get("RUNS", "500"))
+CURVE = int(os.environ.get("CURVE", "1000000"))
+RUNS = int(os.environ.get("RUNS", "1000"))
 VERSIONS = int(os.environ.get("VERSIONS", "200"))
-ROUNDS = int(os.environ.get("ROUNDS", "7"))
+ROUNDS = int(os.environ.get("ROUNDS", "5"))
 BATCH = 1000
 """Values of one call; MLflow takes no more."""
 BUCKETS = 800
 LISTED = 50
+PAGE = 500
+"""Runs of Stride's largest page."""
 SECRET = "the-secret-of-a-worker-of-the-bench"
 
 PIPELINE = "name: beside\nseed: 1\ndataset: {format: synthetic}\nstages: {vae: {kind: train.vae}}\n"
@@ -48,24 +52,20 @@ def value(step: int) -> float:
 def cpu() -> str:
     lines = Path("/proc/cpuinfo").read_text().splitlines()
     names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    return f"{len(names)} x {names[0]}" if names else platform.processor()
+    return f"{len(os.sched_getaffinity(0))} x {names[0] if names else platform.processor()}"
 
 
 class Stride:
-    """`trainer serve` with one run under way, whose worker is this process."""
+    """The server of `examples/serve.rs` with one run under way, whose worker is this process."""
 
     def __init__(self, folder: Path) -> None:
         self.store = folder / "stride"
-        self.trainer = os.environ["STRIDE_TRAINER"]
-        self.log = folder / "stride.log"
+        self.pipeline = folder / "beside.yaml"
+        self.pipeline.write_text(PIPELINE)
         self.start()
         self.stop()
         self.add_versions()
-        self.start()
-        pipeline = folder / "beside.yaml"
-        pipeline.write_text(PIPELINE)
-        shown = subprocess.run([self.trainer, "config", "show", pipeline, "-o", "json"], check=True, capture_output=True, text=True)
-        self.body = {"pipeline": json.loads(shown.stdout), "source": PIPELINE, "until": None}
+        self.body = {"pipeline": self.start(), "source": PIPELINE, "until": None}
         self.run = self.submit("first")
         join = {"protocol": 0, "worker": "bench", "pid": 1, "backend": "flex", "instruction_set": "any", "peer_address": "a:1"}
         answer = self.call("POST", "/v1/workers", join, SECRET, check=False)
@@ -85,22 +85,21 @@ class Stride:
         while not self.ended.wait(3):
             self.poll()
 
-    def start(self) -> None:
-        self.log.write_text("")
-        command = [self.trainer, "serve", "--store", self.store, "--bind", "127.0.0.1:0", "--max-calls-per-second", "1000000"]
-        with self.log.open("a") as out:
-            self.process = subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT)
-        until = time.monotonic() + 120
-        while not (found := re.search(r"http://127\.0\.0\.1:\d+", self.log.read_text())):
-            if time.monotonic() > until or self.process.poll() is not None:
-                raise SystemExit(self.log.read_text())
-            time.sleep(0.1)
-        token = (self.store / "token").read_text().strip()
-        self.http = httpx.Client(base_url=found.group(), headers={"authorization": f"Bearer {token}"}, timeout=300)
+    def start(self) -> Any:
+        """Starts the server and returns the pipeline as JSON."""
+        command = [os.environ["STRIDE_SERVE"], str(self.store), str(self.pipeline)]
+        self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        assert self.process.stdout is not None
+        pipeline, url, token = (self.process.stdout.readline().strip() for _ in range(3))
+        if not token:
+            raise SystemExit("the server did not start")
+        self.http = httpx.Client(base_url=url, headers={"authorization": f"Bearer {token}"}, timeout=300)
+        return json.loads(pipeline)
 
     def stop(self) -> None:
         self.http.close()
-        self.process.terminate()
+        assert self.process.stdin is not None
+        self.process.stdin.close()
         self.process.wait(60)
 
     def add_versions(self) -> None:
@@ -151,6 +150,15 @@ class Stride:
     def runs(self) -> int:
         return len(self.call("GET", f"/v1/runs?limit={LISTED}").json()["items"])
 
+    def all_runs(self) -> int:
+        """Lists as many runs as were added, in the largest pages."""
+        listed, after = 0, ""
+        while listed < RUNS:
+            page = self.call("GET", f"/v1/runs?limit={min(PAGE, RUNS - listed)}{after}").json()
+            listed += len(page["items"])
+            after = f"&after={page['next']}"
+        return listed
+
     def versions(self) -> int:
         return len(self.call("POST", "/v1/registry", {"command": "show", "reference": "beside"}).json()["data"]["versions"])
 
@@ -168,7 +176,8 @@ class MLflow:
             probe.bind(("127.0.0.1", 0))
             port = probe.getsockname()[1]
         self.metric, self.version, self.url = Metric, mlflow.__version__, f"http://127.0.0.1:{port}"
-        store = f"sqlite:///{folder / 'mlflow.db'}"
+        self.database = folder / "mlflow.db"
+        store = f"sqlite:///{self.database}"
         command = [sys.executable, "-m", "mlflow", "server", "--backend-store-uri", store, "--port", str(port)]
         command += ["--default-artifact-root", str(folder / "artifacts"), "--host", "127.0.0.1"]
         with (folder / "mlflow.log").open("w") as out:
@@ -208,6 +217,12 @@ class MLflow:
             rows = [self.metric("loss", value(step), 1000 + step, step) for step in range(begin, begin + BATCH)]
             self.client.log_batch(self.run, metrics=rows)
 
+    def lengthen(self, first: int, count: int) -> None:
+        """Puts values into the database, for their way through the server takes minutes."""
+        add = "INSERT INTO metrics (key, value, timestamp, run_uuid, step, is_nan) VALUES ('loss', ?, ?, ?, ?, 0)"
+        with sqlite3.connect(self.database, timeout=60) as database:
+            database.executemany(add, ((value(step), 1000 + step, self.run, step) for step in range(first, first + count)))
+
     def whole(self) -> int:
         return len(self.client.get_metric_history(self.run, "loss"))
 
@@ -216,7 +231,13 @@ class MLflow:
         return len(self.http.get("/ajax-api/2.0/mlflow/metrics/get-history-bulk-interval", params=query).raise_for_status().content)
 
     def runs(self) -> int:
-        return len(self.client.search_runs([self.experiment], max_results=LISTED, order_by=["start_time DESC"]))
+        return self.listed(LISTED)
+
+    def all_runs(self) -> int:
+        return self.listed(RUNS)
+
+    def listed(self, count: int) -> int:
+        return len(self.client.search_runs([self.experiment], max_results=count, order_by=["start_time DESC"]))
 
     def versions(self) -> int:
         return len(self.client.search_model_versions("name = 'beside'", max_results=VERSIONS))
@@ -241,34 +262,38 @@ def main() -> None:
 
 
 def measure(ours: Stride, theirs: MLflow) -> None:
-    version = subprocess.run([ours.trainer, "--version"], capture_output=True, text=True, check=True).stdout.strip()
-    print(f"{version} and MLflow {theirs.version} on SQLite, Python {platform.python_version()}")
-    print(f"{cpu()}; {POINTS:,} values, {RUNS:,} runs, {VERSIONS:,} versions; medians of {ROUNDS} in turns")
+    print(f"Stride and MLflow {theirs.version} on SQLite, Python {platform.python_version()}, {cpu()}", flush=True)
+    print(f"{POINTS:,} values written, {RUNS:,} runs, {VERSIONS:,} versions; medians of {ROUNDS} in turns", flush=True)
+    print(f"{'':34}{'Stride':>12}{'MLflow':>12}{'ratio':>8}", flush=True)
     part = POINTS // ROUNDS // BATCH * BATCH
-    writes: list[tuple[float, float]] = []
-    for turn in range(ROUNDS):
-        writes.append((timed(lambda: ours.write(turn * part, part)), timed(lambda: theirs.write(turn * part, part))))
+    total = part * ROUNDS
+    writes = [
+        (timed(lambda: ours.write(turn * part, part)), timed(lambda: theirs.write(turn * part, part))) for turn in range(ROUNDS)
+    ]
+    seconds = [statistics.median(side) for side in zip(*writes)]
+    print(f"{'values stored a second':34}{part / seconds[0]:12,.0f}{part / seconds[1]:12,.0f}{seconds[1] / seconds[0]:8.1f}", flush=True)
+    compare(f"each value of {total:,}, ms", ours.whole, theirs.whole, same=total)
+    if CURVE > total:
+        ours.write(total, CURVE - total)
+        theirs.lengthen(total, CURVE - total)
+    compare(f"curve of {max(CURVE, total):,} in {BUCKETS} parts, ms", ours.curve, theirs.curve)
     for number in range(RUNS):
         ours.add_run(number)
         theirs.add_run(number)
+    compare(f"{LISTED} of {RUNS:,} runs, ms", ours.runs, theirs.runs, same=LISTED)
+    compare(f"all {RUNS:,} runs, ms", ours.all_runs, theirs.all_runs, same=RUNS)
     for number in range(VERSIONS):
         theirs.add_version(number)
-    total = part * ROUNDS
-    assert (ours.whole(), theirs.whole()) == (total, total), "each has all values"
-    assert (ours.runs(), theirs.runs()) == (LISTED, LISTED)
-    assert (ours.versions(), theirs.versions()) == (VERSIONS, VERSIONS)
-    print(f"{'':34}{'Stride':>12}{'MLflow':>12}{'ratio':>8}")
-    seconds = [statistics.median(side) for side in zip(*writes)]
-    print(f"{'values stored a second':34}{part / seconds[0]:12,.0f}{part / seconds[1]:12,.0f}{seconds[1] / seconds[0]:8.1f}")
-    for title, call in [
-        (f"a curve of {total:,} in {BUCKETS} parts, ms", "curve"),
-        (f"every value of {total:,}, ms", "whole"),
-        (f"{LISTED} of {RUNS:,} runs, ms", "runs"),
-        (f"{VERSIONS} versions of a model, ms", "versions"),
-    ]:
-        pairs = [(timed(getattr(ours, call)), timed(getattr(theirs, call))) for _ in range(ROUNDS)]
-        mine, other = (1000 * statistics.median(side) for side in zip(*pairs))
-        print(f"{title:34}{mine:12.1f}{other:12.1f}{other / mine:8.1f}")
+    compare(f"{VERSIONS} versions of a model, ms", ours.versions, theirs.versions, same=VERSIONS)
+
+
+def compare(title: str, mine: Callable[[], int], other: Callable[[], int], same: int | None = None) -> None:
+    """Prints the median times of two calls. Where `same` is given, both return it."""
+    if same is not None:
+        assert (mine(), other()) == (same, same), title
+    pairs = [(timed(mine), timed(other)) for _ in range(ROUNDS)]
+    ours, theirs = (1000 * statistics.median(side) for side in zip(*pairs))
+    print(f"{title:34}{ours:12.1f}{theirs:12.1f}{theirs / ours:8.1f}", flush=True)
 
 
 if __name__ == "__main__":

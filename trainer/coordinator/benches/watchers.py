@@ -1,4 +1,4 @@
-"""Share of a core that browsers cost a server while they watch a training: `STRIDE_TRAINER=target/release/trainer python watchers.py`.
+"""Share of a core that browsers cost a server while they watch a training: `STRIDE_SERVE=target/release/examples/serve python watchers.py`.
 
 Needs httpx. Each client makes the calls that the page's first view makes (`trainer/page/static/views/now.js`) and reads the stream of
 events. One worker trains as far as the server knows: it polls and sends twenty values a second.

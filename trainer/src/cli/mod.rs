@@ -254,7 +254,7 @@ pub(crate) fn main() -> ExitCode {
     }
     if let Verb::Worker(WorkerVerb::Join(args)) = cli.verb {
         // A worker is synchronous, with its own threads and its own logging.
-        worker::init_logging();
+        let _traces = telemetry::init("stride-worker", worker::LOGGED, false);
         return match worker::Options::try_from(args).and_then(worker::join) {
             Ok(()) => ExitCode::SUCCESS,
             Err(error) => {
@@ -263,11 +263,11 @@ pub(crate) fn main() -> ExitCode {
             }
         };
     }
-    match cli.verb {
+    let _traces = match cli.verb {
         // It reports each job that it starts.
-        Verb::Launch(_) => worker::init_logging(),
-        _ => init_logging(),
-    }
+        Verb::Launch(_) => telemetry::init("stride", worker::LOGGED, false),
+        _ => telemetry::init("stride", LOGGED, print::on_terminal()),
+    };
     cli.verb.keep_to_oneself();
     let output = cli.verb.output();
     let runtime = match tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build() {
@@ -302,15 +302,9 @@ fn explained(error: &clap::Error) -> Option<Problem> {
     sentences::without_quotes(error, words())
 }
 
-/// Logs warnings to stderr, and more with `RUST_LOG`. A log line that cannot be written is dropped. Otherwise the
-/// subscriber would report that error, fail again, and panic.
-fn init_logging() {
-    // The database warns of each statement that waits for a slow disk, in lines of SQL.
-    let filter = tracing_subscriber::EnvFilter::try_from_default_env()
-        .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("warn,sqlx=error"));
-    let log = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr);
-    log.with_ansi(print::on_terminal()).log_internal_errors(false).init();
-}
+/// Lines that are logged without `RUST_LOG`. The database warns of each statement that waits for a slow disk, in lines of
+/// SQL.
+const LOGGED: &str = "warn,sqlx=error";
 
 impl Verb {
     /// Returns true if the process coordinates runs, whose workers are other processes.

@@ -28,7 +28,7 @@ use super::bundles::BundleQuery;
 use super::checkpoints::KeptCheckpoint;
 use super::curves::{Curves, CurvesAsked};
 use super::demand::{self, DemandQuery};
-use super::described::{Bytes, Described, EventStream, Nothing, OpenMetrics, Packed, described};
+use super::described::{Bytes, Described, EventStream, Exposition, Nothing, Packed, described};
 use super::draws::{Draw, Drawing};
 use super::events::EventsQuery;
 use super::extract::Query;
@@ -41,7 +41,7 @@ use super::session_calls::Who;
 use super::settings::RunSettings;
 use super::tickets::Ticket;
 use super::{
-    bundles, checkpoints, curves, draws, events, page_files, polls, queries, scrape, session_calls, settings,
+    bundles, checkpoints, curves, draws, events, page_files, polls, queries, scrape, session_calls, settings, spans,
     tickets, uploads,
 };
 use crate::view::WorkerView;
@@ -124,7 +124,7 @@ fn table() -> Vec<Entry> {
         entry("POST", "/v1/tickets",               &[Submit],       CALL,                     SHORT, tickets::ticket,
             described::<Nothing, Nothing, Json<Ticket>>("Makes a ticket by which a browser enters a stream once")),
         entry("GET",  "/metrics",                  &[Read],         CALL,                     SHORT, scrape::metrics,
-            described::<Nothing, Nothing, OpenMetrics>("Shows the server's own numbers to Prometheus")),
+            described::<Nothing, Nothing, Exposition>("Shows the server's own numbers to Prometheus")),
         entry("GET",  "/v1/history",               &[Read],         CALL,                     SHORT, queries::history,
             described::<Query<HistoryCall>, Nothing, Json<Vec<HistoryRow>>>("Lists events, or waits for them")),
         entry("GET",  "/v1/events",                &[Read],         CALL,                     SHORT, events::events,
@@ -197,6 +197,7 @@ pub(crate) fn router(actor_handle: Arc<ActorHandle>, gate: &Arc<Gate>) -> Router
         .layer(middleware::from_fn_with_state(Arc::clone(gate), auth::check_host))
         .layer(middleware::map_response(page_files::keep_from_pages))
         .layer(middleware::from_fn_with_state(Arc::clone(&gate.audit), audit::note))
+        .layer(middleware::from_fn(spans::request))
         .with_state(actor_handle)
 }
 

@@ -16,8 +16,8 @@ pub(super) trait Content {
 pub(super) enum Nothing {}
 /// Bytes of any kind.
 pub(super) enum Bytes {}
-/// The text that Prometheus reads.
-pub(super) enum OpenMetrics {}
+/// The texts that Prometheus reads.
+pub(super) enum Exposition {}
 /// Events as a browser's `EventSource` reads them.
 pub(super) enum EventStream {}
 /// JSON, or the packed form that `Accept: application/octet-stream` asks for.
@@ -41,9 +41,10 @@ impl Content for Bytes {
     }
 }
 
-impl Content for OpenMetrics {
+impl Content for Exposition {
     fn content(_: &mut SchemaGenerator) -> Option<Value> {
-        Some(json!({"application/openmetrics-text": {"schema": {"type": "string"}}}))
+        let text = json!({"schema": {"type": "string"}});
+        Some(json!({"text/plain": text, "application/openmetrics-text": text}))
     }
 }
 

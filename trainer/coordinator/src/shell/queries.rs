@@ -171,7 +171,11 @@ pub(crate) async fn storage(State(actor_handle): State<Arc<ActorHandle>>) -> Res
     let dir = actor_handle.store.dir().to_owned();
     let kinds = actor_handle.store.kind_sizes().await?;
     let away = actor_handle.storage().map(|problem| {
-        Finding::fail("blobs", problem.what, "look whether the disk has space or the bucket answers; training goes on meanwhile")
+        Finding::fail(
+            "blobs",
+            problem.what,
+            "look whether the disk has space or the bucket answers; training goes on meanwhile",
+        )
     });
     let (database_bytes, mut findings) = blocking(move || {
         let size = |name: &str| std::fs::metadata(dir.join(name)).map_or(0, |found| found.len());
@@ -179,7 +183,8 @@ pub(crate) async fn storage(State(actor_handle): State<Arc<ActorHandle>>) -> Res
         (size("stride.db") + size("stride.db-wal"), findings.collect::<Vec<_>>())
     })
     .await;
-    findings.push(away.unwrap_or_else(|| Finding::ok("blobs", "what is to be stored is, and what is stored can be read")));
+    findings
+        .push(away.unwrap_or_else(|| Finding::ok("blobs", "what is to be stored is, and what is stored can be read")));
     Ok(Json(Storage { kinds, database_bytes, findings }))
 }
 
@@ -315,7 +320,12 @@ pub(crate) async fn points(
 
 /// Returns true if a client asks for numbers as they are in memory.
 pub(super) fn accepts_packed(headers: &HeaderMap) -> bool {
-    headers.get(header::ACCEPT).and_then(|value| value.to_str().ok()).is_some_and(|accepts| accepts.contains(PACKED))
+    accepts(headers, PACKED)
+}
+
+/// Returns true if a client asks for a media type by its name.
+pub(super) fn accepts(headers: &HeaderMap, kind: &str) -> bool {
+    headers.get(header::ACCEPT).and_then(|value| value.to_str().ok()).is_some_and(|accepts| accepts.contains(kind))
 }
 
 /// Packs values: the length of a head as `u32`, the head as JSON padded with blanks to a multiple of four bytes, then for

@@ -1,10 +1,12 @@
-//! `GET /metrics`: the server's own numbers as OpenMetrics text, which Prometheus scrapes. No label names a run, a model,
-//! a worker or a token, so that the number of series does not grow with use.
+//! `GET /metrics`: the server's own numbers for Prometheus, as OpenMetrics text if the client asks for it and else as the
+//! text of Prometheus. No label names a run, a model, a worker or a token, so that the number of series does not grow with
+//! use.
 
+use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use axum::extract::State;
-use axum::http::{StatusCode, header};
+use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::IntoResponse;
 use prometheus_client::encoding::text::encode;
 use prometheus_client::metrics::counter::Counter;
@@ -15,10 +17,15 @@ use prometheus_client::registry::{Registry, Unit};
 use super::actor_handle::ActorHandle;
 use super::failure::Failure;
 use super::meters::Labels;
+use super::queries::accepts;
 
 const OPEN_METRICS: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
+const PLAIN: &str = "text/plain; version=0.0.4; charset=utf-8";
 
-pub(crate) async fn metrics(State(actor_handle): State<Arc<ActorHandle>>) -> Result<impl IntoResponse, Failure> {
+pub(crate) async fn metrics(
+    State(actor_handle): State<Arc<ActorHandle>>,
+    headers: HeaderMap,
+) -> Result<impl IntoResponse, Failure> {
     let mut text = String::new();
     encode(&mut text, &registry(&actor_handle)).map_err(|error| {
         Failure::new(
@@ -27,7 +34,22 @@ pub(crate) async fn metrics(State(actor_handle): State<Arc<ActorHandle>>) -> Res
             format!("cannot encode the server's metrics: {error}"),
         )
     })?;
-    Ok(([(header::CONTENT_TYPE, OPEN_METRICS)], text))
+    let open = accepts(&headers, "application/openmetrics-text");
+    let (kind, text) = if open { (OPEN_METRICS, text) } else { (PLAIN, plain(&text)) };
+    Ok(([(header::CONTENT_TYPE, kind), (header::VARY, "accept")], text))
+}
+
+/// The same numbers in Prometheus' own text, which names a counter as its samples and has no units and no end.
+fn plain(open: &str) -> String {
+    let counters: BTreeSet<&str> =
+        open.lines().filter_map(|line| line.strip_prefix("# TYPE ")?.strip_suffix(" counter")).collect();
+    let renamed = |line: &str| {
+        let (word, rest) = line.strip_prefix("# ")?.split_once(' ')?;
+        let (name, rest) = rest.split_once(' ')?;
+        counters.contains(name).then(|| format!("# {word} {name}_total {rest}"))
+    };
+    let kept = open.lines().filter(|line| *line != "# EOF" && !line.starts_with("# UNIT "));
+    kept.map(|line| renamed(line).unwrap_or_else(|| line.to_owned()) + "\n").collect()
 }
 
 fn registry(actor_handle: &ActorHandle) -> Registry {

@@ -66,7 +66,7 @@ impl Secrets {
         text(self.mac(&("session", token, until_ms, nonce)))
     }
 
-    /// Whether `shown` is that proof.
+    /// Returns true if `shown` is that proof.
     pub(crate) fn is_session(&self, token: Option<Digest>, until_ms: u64, nonce: &str, shown: &str) -> bool {
         is(self.mac(&("session", token, until_ms, nonce)), shown)
     }

@@ -20,6 +20,8 @@ use serde::de::DeserializeOwned;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 
+use super::exposition;
+
 type TestResult<T = ()> = Result<T, Box<dyn std::error::Error>>;
 
 /// A minimal HTTP client with one connection per request.
@@ -284,10 +286,17 @@ async fn a_run_goes_through_over_http_and_survives_a_restart() -> TestResult {
     assert_eq!(client.try_call("GET", "/v1/history?run=none", ()).await?.0, StatusCode::NOT_FOUND);
     let (_, text) = client.try_call("GET", "/metrics", ()).await?;
     let text = String::from_utf8(text)?;
-    for line in ["stride_workers{state=\"idle\"} 1", "stride_values_total 0", "stride_storage_trouble 0", "# EOF"] {
+    for line in ["stride_workers{state=\"idle\"} 1", "stride_values_total 0", "stride_storage_trouble 0"] {
         assert!(text.lines().any(|it| it == line), "{line}\n{text}");
     }
     assert!(text.contains("stride_commit_seconds_bucket") && !text.contains(run.as_str()), "{text}");
+    assert!(exposition::check(&text) > 5, "{text}");
+    exposition::check_with_promtool(&text);
+    let request =
+        Request::builder().method("GET").uri("/metrics").header("accept", "application/openmetrics-text;q=0.5");
+    let (_, open) = client.send(request.body(Body::empty())?).await?;
+    let open = String::from_utf8(open.to_vec())?;
+    assert!(open.ends_with("\n# EOF\n") && open.contains("# TYPE stride_values counter\n"), "{open}");
     let lines: Vec<registry::LogRow> = client.call("GET", &format!("/v1/runs/{run}/logs?stage=dataset"), ()).await?;
     assert_eq!(lines.iter().map(|line| line.text.as_str()).collect::<Vec<_>>(), ["hello"]);
     let curves: coordinator::shell::StageMetrics = client.call("GET", &format!("/v1/runs/{run}/metrics"), ()).await?;

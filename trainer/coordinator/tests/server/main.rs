@@ -12,6 +12,7 @@ mod crowd;
 mod demand;
 mod errors;
 mod events;
+mod exposition;
 mod http;
 mod http2;
 mod limits;

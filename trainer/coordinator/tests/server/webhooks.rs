@@ -24,7 +24,7 @@ use super::shell::{SECRET, TestResult, offer, submission};
 
 const KEY: &str = "the-secret-of-a-hook-of-the-tests";
 
-/// What a receiver has got, and how it answers.
+/// Messages that a receiver has got, and its answers.
 #[derive(Default)]
 struct Inbox {
     /// Id, status that it was answered with, and text.
