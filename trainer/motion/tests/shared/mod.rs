@@ -1,6 +1,6 @@
 //! Finds the reference data and prints the distance of a result from it.
 
-#![allow(dead_code, reason = "each test binary uses its own part of this module")]
+#![allow(dead_code, unused_imports, reason = "each test binary uses its own part of this module")]
 
 use motion::DataPath;
 use std::fs;
