@@ -14,6 +14,7 @@ use std::ops::Range;
 use std::path::Path;
 
 use colours::{BODY, FAINT, GRID, INK, LEFT, PAPER, RIGHT, SHADOW, TOLD, TRAIL};
+use font::{NOTE, SMALL, TITLE};
 use raster::{Canvas, Colour};
 
 use crate::skeleton::Skeleton;
@@ -58,11 +59,6 @@ fn colour_of(skeleton: &Skeleton, joint: usize) -> Colour {
         BODY
     }
 }
-
-/// Height of the letters of titles, notes and small labels in pixels.
-const TITLE: f64 = 17.0;
-const NOTE: f64 = 13.0;
-const SMALL: f64 = 11.5;
 
 /// Draws the key of colours from `at` to the right. `kept` adds the pale figures of kept frames, `told` the targets.
 fn key(canvas: &mut Canvas, at: [f64; 2], kept: bool, told: bool) {

@@ -7,6 +7,11 @@ use ttf_parser::{Face, GlyphId, OutlineBuilder};
 
 use super::raster::{Canvas, Colour};
 
+/// Height of the letters of titles, notes and small labels in pixels.
+pub(super) const TITLE: f64 = 17.0;
+pub(super) const NOTE: f64 = 13.0;
+pub(super) const SMALL: f64 = 11.5;
+
 /// The font; `trainer/motion/font/README.md` says how it was made.
 static BYTES: &[u8] = include_bytes!("../../font/Inter-Regular.ttf");
 #[expect(clippy::expect_used, reason = "the font is part of the program, and a test draws with it")]

@@ -1,8 +1,8 @@
 //! Motions from above. z points up the page, so x points left.
 
-use super::colours::{GRID, INK, TOLD, TRAIL};
+use super::colours::{GRID, INK, PAPER, TOLD, TRAIL};
+use super::font::{self, SMALL};
 use super::raster::Canvas;
-use super::{SMALL, font};
 use crate::waypoints::Waypoint;
 
 /// Height of the plan in pixels.
@@ -77,7 +77,7 @@ pub(super) fn trail(canvas: &mut Canvas, path: &[[f64; 2]], fps: f64, at: [f64; 
     }
     if let Some(begin) = way.first() {
         canvas.disc(*begin, 5.0, INK);
-        canvas.disc(*begin, 3.0, super::colours::PAPER);
+        canvas.disc(*begin, 3.0, PAPER);
     }
     arrow(canvas, &way);
     let label = format!("from above, {cell} m a cell");
