@@ -44,8 +44,8 @@ mod write;
 pub use blob::BlobStore;
 pub use blob::place::Place;
 pub use catalog::{
-    CheckpointRow, EndedRow, HistoryQuery, HistoryRow, KindSize, LineageNode, LogRow, Recovery, RunListQuery, RunOrder, RunPage,
-    RunRow, StageResultRow, Usage,
+    CheckpointRow, EndedRow, HistoryQuery, HistoryRow, KindSize, LineageNode, LogRow, Recovery, RunListQuery, RunOrder,
+    RunPage, RunRow, StageResultRow, Usage,
 };
 pub use curve::{Axis, Buckets, Curve, Page, Point, Window};
 pub use error::{QueryError, WriteError};

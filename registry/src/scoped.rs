@@ -13,8 +13,8 @@ use protocol::{Alias, Digest, Group, ModelName, RunId, StageName, TaskId};
 
 use crate::QueryError;
 use crate::catalog::{
-    CheckpointRow, EndedRow, HistoryQuery, HistoryRow, KindSize, LineageNode, LogRow, Needs, Records, Recovery, RunListQuery,
-    RunPage, RunRow, StageResultRow, Usage,
+    CheckpointRow, EndedRow, HistoryQuery, HistoryRow, KindSize, LineageNode, LogRow, Needs, Records, Recovery,
+    RunListQuery, RunPage, RunRow, StageResultRow, Usage,
 };
 use crate::curve::{Buckets, Curve, Page, Window};
 use crate::store_id::Stored;

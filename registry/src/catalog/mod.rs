@@ -31,8 +31,8 @@ use protocol::stage::Keep;
 use protocol::{Alias, Digest, Group, ModelName, RunId, StageName, TaskId};
 
 pub use rows::{
-    CheckpointRow, EndedRow, HistoryQuery, HistoryRow, KindSize, LineageNode, LogRow, Needs, Recovery, Root, RunListQuery,
-    RunOrder, RunPage, RunRow, StageResultRow, Usage,
+    CheckpointRow, EndedRow, HistoryQuery, HistoryRow, KindSize, LineageNode, LogRow, Needs, Recovery, Root,
+    RunListQuery, RunOrder, RunPage, RunRow, StageResultRow, Usage,
 };
 
 use crate::curve::{Buckets, Curve, Page, Window};

@@ -152,7 +152,8 @@ mod tests {
 
     #[test]
     fn a_line_says_state_finding_and_what_to_do() {
-        let (fine, full) = (Finding::ok("disk", "9 GiB are free"), Finding::fail("disk", "0 GiB are free", "remove some"));
+        let (fine, full) =
+            (Finding::ok("disk", "9 GiB are free"), Finding::fail("disk", "0 GiB are free", "remove some"));
         assert_eq!(line(&fine), "ok    disk     9 GiB are free");
         assert_eq!(line(&full), "FAIL  disk     0 GiB are free; remove some");
     }

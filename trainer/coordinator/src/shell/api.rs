@@ -41,8 +41,8 @@ use super::session_calls::Who;
 use super::settings::RunSettings;
 use super::tickets::Ticket;
 use super::{
-    bundles, checkpoints, curves, draws, events, page_files, polls, queries, scrape, session_calls, settings,
-    tickets, uploads,
+    bundles, checkpoints, curves, draws, events, page_files, polls, queries, scrape, session_calls, settings, tickets,
+    uploads,
 };
 use crate::view::WorkerView;
 

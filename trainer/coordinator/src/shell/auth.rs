@@ -90,7 +90,9 @@ impl Gate {
             Some(shown) => (self.shown(shown, route), None),
             None => match self.session(request)? {
                 Some(session) => (self.token_of(session.holder), Some(session)),
-                None => (self.tickets.as_ref().and_then(|tickets| tickets.redeem(headers, &self.tokens.current())), None),
+                None => {
+                    (self.tickets.as_ref().and_then(|tickets| tickets.redeem(headers, &self.tokens.current())), None)
+                }
             },
         };
         let token = token.ok_or_else(|| unauthorized(&Unknown::Nobody))?;

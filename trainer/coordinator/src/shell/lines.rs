@@ -6,8 +6,8 @@
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use protocol::{Incarnation, WorkerId};
 use protocol::proof::Process;
+use protocol::{Incarnation, WorkerId};
 
 use super::actor_handle::ActorHandle;
 use crate::time::Millis;

@@ -219,7 +219,8 @@ impl Coordinator {
         let (stop, stopped) = watch::channel(false);
         let tick = effects::tick(actor_handle.clone(), config.policy.tick_ms, stopped.clone());
         let clock = actor_handle.spawn("the clock", tick);
-        let gate = Gate::new(tokens, &config.hosts, config.allowances.calls).with_sessions(Arc::clone(&sessions), config.stream.clone());
+        let gate = Gate::new(tokens, &config.hosts, config.allowances.calls)
+            .with_sessions(Arc::clone(&sessions), config.stream.clone());
         let gate = Arc::new(gate);
         let audit = actor_handle.spawn("the audit log", audit::write(Arc::clone(&gate.audit), log, stopped.clone()));
         let router = api::router(actor_handle.clone(), &gate);

@@ -163,7 +163,7 @@ pub(crate) struct Storage {
     kinds: Vec<KindSize>,
     /// Bytes of the database, with what it has not written into its file yet.
     database_bytes: u64,
-    /// Checks of the store's folder and of what holds its blobs.
+    /// Checks of the store's folder and of its blob storage.
     findings: Vec<Finding>,
 }
 
@@ -171,7 +171,11 @@ pub(crate) async fn storage(State(actor_handle): State<Arc<ActorHandle>>) -> Res
     let dir = actor_handle.store.dir().to_owned();
     let kinds = actor_handle.store.kind_sizes().await?;
     let away = actor_handle.storage().map(|problem| {
-        Finding::fail("blobs", problem.what, "look whether the disk has space or the bucket answers; training goes on meanwhile")
+        Finding::fail(
+            "blobs",
+            problem.what,
+            "look whether the disk has space or the bucket answers; training goes on meanwhile",
+        )
     });
     let (database_bytes, mut findings) = blocking(move || {
         let size = |name: &str| std::fs::metadata(dir.join(name)).map_or(0, |found| found.len());
@@ -179,7 +183,8 @@ pub(crate) async fn storage(State(actor_handle): State<Arc<ActorHandle>>) -> Res
         (size("stride.db") + size("stride.db-wal"), findings.collect::<Vec<_>>())
     })
     .await;
-    findings.push(away.unwrap_or_else(|| Finding::ok("blobs", "what is to be stored is, and what is stored can be read")));
+    findings
+        .push(away.unwrap_or_else(|| Finding::ok("blobs", "what is to be stored is, and what is stored can be read")));
     Ok(Json(Storage { kinds, database_bytes, findings }))
 }
 

@@ -2,8 +2,8 @@
 //!
 //! A script of a page can send no token with a WebSocket, and may not have one. So the server of the page, which knows a token of the
 //! streaming process, makes a ticket for its signed-in user: `UNTIL.NONCE.PROOF`, bound to the page's origin. The proof's key is the
-//! digest of that token, which both processes have; nothing else passes between them. The ticket stands in the list of subprotocols,
-//! the only header that a script may choose.
+//! digest of that token, which both processes have; nothing else passes between them. A script puts the ticket into
+//! the list of subprotocols, the only header that it may choose.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -42,7 +42,8 @@ impl StreamOffer {
     /// # Errors
     /// The text is no address of a WebSocket, or has a path.
     pub fn new(url: &str, token: Token) -> Result<Self, String> {
-        let wrong = || format!("`{url}` is not the address of a stream; expected `ws://HOST:PORT` or `wss://HOST:PORT`");
+        let wrong =
+            || format!("`{url}` is not the address of a stream; expected `ws://HOST:PORT` or `wss://HOST:PORT`");
         let uri: Uri = url.parse().map_err(|_| wrong())?;
         let (Some(scheme @ ("ws" | "wss")), Some(authority)) = (uri.scheme_str(), uri.authority()) else {
             return Err(wrong());
@@ -60,7 +61,7 @@ impl StreamOffer {
     }
 }
 
-/// What a browser needs to enter a stream once.
+/// A ticket, with all that a browser needs to use it.
 #[derive(Debug, Serialize, JsonSchema)]
 pub(crate) struct Ticket {
     /// The address of the WebSocket.
@@ -84,7 +85,11 @@ pub(crate) async fn ticket(Extension(gate): Extension<Arc<Gate>>, headers: Heade
     let nonce = Token::random().secret()[..32].to_owned();
     let proof = secrets(offer.token.digest()).of_ticket(origin, until_ms, &nonce);
     let ticket = format!("{TICKET}{until_ms}.{nonce}.{proof}");
-    Ok(Json(Ticket { url: format!("{}/v1/stream", offer.origin), protocols: [STREAM_PROTOCOL.to_owned(), ticket], until_ms }))
+    Ok(Json(Ticket {
+        url: format!("{}/v1/stream", offer.origin),
+        protocols: [STREAM_PROTOCOL.to_owned(), ticket],
+        until_ms,
+    }))
 }
 
 fn secrets(token: Digest) -> Secrets {
@@ -111,7 +116,7 @@ impl Tickets {
         self.look(headers, tokens).is_some()
     }
 
-    /// The token that a ticket stands for, once.
+    /// Returns the token of a ticket's maker, once for each ticket.
     pub(crate) fn redeem(&self, headers: &HeaderMap, tokens: &Tokens) -> Option<Digest> {
         let Shown { token, nonce, until_ms } = self.look(headers, tokens)?;
         let mut used = self.used.lock().unwrap_or_else(PoisonError::into_inner);
@@ -127,7 +132,8 @@ impl Tickets {
         let asked = headers.get(header::SEC_WEBSOCKET_PROTOCOL)?.to_str().ok()?;
         let ticket = asked.split(',').find_map(|word| word.trim().strip_prefix(TICKET))?;
         let mut words = ticket.split('.');
-        let (Some(until), Some(nonce), Some(proof), None) = (words.next(), words.next(), words.next(), words.next()) else {
+        let (Some(until), Some(nonce), Some(proof), None) = (words.next(), words.next(), words.next(), words.next())
+        else {
             return None;
         };
         let (until_ms, now_ms) = (until.parse().ok()?, wall_clock().0);
@@ -151,7 +157,16 @@ mod tests {
         for good in ["ws://127.0.0.1:7800", "wss://gpu1.lab:7800/", "ws://[::1]:7800"] {
             assert_eq!(StreamOffer::new(good, token()).unwrap().origin(), good.trim_end_matches('/'));
         }
-        for wrong in ["", "http://gpu1", "ws://a;script-src *", "ws://a b", "ws://me@a", "ws://a/v1/stream", "ws://a'self'", "gpu1:7800"] {
+        for wrong in [
+            "",
+            "http://gpu1",
+            "ws://a;script-src *",
+            "ws://a b",
+            "ws://me@a",
+            "ws://a/v1/stream",
+            "ws://a'self'",
+            "gpu1:7800",
+        ] {
             assert!(StreamOffer::new(wrong, token()).is_err(), "{wrong}");
         }
     }
