@@ -12,7 +12,7 @@ use crate::blob::disk::free_bytes;
 const LITTLE: u64 = 5 << 30;
 const NONE: u64 = 200 << 20;
 
-/// State of what was checked.
+/// Result of a check in a word.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum State {

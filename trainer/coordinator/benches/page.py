@@ -146,18 +146,18 @@ def watched(stride: Stride) -> bool:
 
 def main() -> None:
     print(f"{cpu()}, {time.strftime('%Y-%m-%d')}, load {os.getloadavg()[0]:.1f}")
-    with tempfile.TemporaryDirectory() as name, sync_playwright() as playwright:
+    with tempfile.TemporaryDirectory() as name:
         stride = Stride(Path(name))
-        program = os.environ.get("STRIDE_BROWSER") or shutil.which("chromium")
-        browser = playwright.chromium.launch(executable_path=program, args=["--no-sandbox", "--disable-dev-shm-usage"])
         try:
-            held = measure(browser, stride)
-            browser.close()
+            with sync_playwright() as playwright:
+                program = os.environ.get("STRIDE_BROWSER") or shutil.which("chromium")
+                browser = playwright.chromium.launch(executable_path=program, args=["--no-sandbox", "--disable-dev-shm-usage"])
+                held = measure(browser, stride)
+                browser.close()
+            held = watched(stride) and held
         finally:
             stride.ended.set()
-        stride.ended.clear()
-        held = watched(stride) and held
-        stride.stop()
+            stride.stop()
     raise SystemExit(0 if held else 1)
 
 

@@ -116,6 +116,12 @@ static FILES: [(&str, &[u8]); 43] = files![
     "vendor/uPlot.min.css",
 ];
 
+/// Written by the server in the place of links that load all modules at once, rather than each after the one that names it.
+const PRELOADS: &str = "PRELOADS";
+
+/// Scripts that the document does not need as modules at first.
+const LATER: [&str; 2] = ["character.js", "vendor/uPlot.iife.min.js"];
+
 struct Page {
     index: File,
     folder: String,
@@ -127,7 +133,10 @@ static PAGE: LazyLock<Page> = LazyLock::new(|| {
     let folder = Digest::of(all.as_bytes()).hex()[..16].to_owned();
     let mut files: Vec<File> = FILES.iter().map(|(name, bytes)| File::new(name, bytes.to_vec())).collect();
     let index = files.remove(0);
-    let index = File::new(index.name, String::from_utf8_lossy(&index.bytes).replace(FOLDER, &folder).into_bytes());
+    let modules = files.iter().filter(|file| file.name.ends_with(".js") && !LATER.contains(&file.name));
+    let preloads = modules.map(|file| format!("<link rel=\"modulepreload\" href=\"/page/{FOLDER}/{}\">\n", file.name));
+    let text = String::from_utf8_lossy(&index.bytes).replace(PRELOADS, preloads.collect::<String>().trim_end());
+    let index = File::new(index.name, text.replace(FOLDER, &folder).into_bytes());
     Page { index, folder, files }
 });
 

@@ -268,7 +268,7 @@ def document_from_folder(route: Route) -> None:
     answer = route.fetch()
     folder = re.search(r"/page/([0-9a-f]+)/", answer.text())
     text = (Path(os.environ["STRIDE_PAGE"]) / "index.html").read_text()
-    route.fulfill(response=answer, body=text.replace("FOLDER", folder.group(1) if folder else "FOLDER"))
+    route.fulfill(response=answer, body=text.replace("PRELOADS", "").replace("FOLDER", folder.group(1) if folder else "FOLDER"))
 
 
 def enter(chromium: Browser, world: World, way: Way, token: str | None = None) -> BrowserContext:

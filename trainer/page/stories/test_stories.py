@@ -284,7 +284,7 @@ HOSTILE = "<img src=x onerror=\"window.hostile=1\"></script><script>window.hosti
 
 def test_hostile_words_stay_words(hand: Hand) -> None:
     hand.open("/draw")
-    sentence = hand.page.get_by_label("Sentence")
+    sentence = hand.page.locator("#sentence")
     sentence.fill(HOSTILE)
     hand.press(hand.page.get_by_role("button", name="Draw", exact=True))
     hand.page.wait_for_selector("canvas.figure")

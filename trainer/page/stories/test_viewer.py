@@ -37,7 +37,7 @@ def stopped_at(page: Page, frame: int) -> None:
 def test_a_body_is_capsules_or_bones(drawn: Hand) -> None:
     page = drawn.page
     stopped_at(page, 10)
-    body = page.get_by_label("Body", exact=True)
+    body = page.locator("select.body")
     expect(body).to_have_value("capsules")
     picture = page.locator("canvas.figure").first.screenshot()
     drawn.keep("capsules")
@@ -92,7 +92,7 @@ def test_a_character_of_ones_own_is_drawn_and_stays_here(drawn: Hand) -> None:
     page.on("request", lambda request: asked.append(f"{request.method} {request.url}"))
     file = {"name": "me.glb", "mimeType": "model/gltf-binary", "buffer": characters.glb()}
     page.set_input_files("input.file", files=[file])
-    expect(page.get_by_label("Body", exact=True)).to_have_value("character")
+    expect(page.locator("select.body")).to_have_value("character")
     page.evaluate(DRAWN)
     assert page.evaluate(ORANGE) > before + 0.01
     drawn.keep("character")
@@ -102,8 +102,8 @@ def test_a_character_of_ones_own_is_drawn_and_stays_here(drawn: Hand) -> None:
     for wrong, why in ((b"no such thing", "no GLB file"), (characters.glb()[:5000], "damaged"), (lame, "left_knee")):
         page.set_input_files("input.file", files=[{**file, "name": "<img src=x>.glb", "buffer": wrong}])
         expect(page.locator(".viewer-bar .wrong")).to_contain_text(why)
-    expect(page.get_by_label("Body", exact=True)).to_have_value("character")
-    page.get_by_label("Body", exact=True).select_option("capsules")
+    expect(page.locator("select.body")).to_have_value("character")
+    page.locator("select.body").select_option("capsules")
 
 
 def test_a_sentence_takes_over_in_a_stream(drawn: Hand) -> None:

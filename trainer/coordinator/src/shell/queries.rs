@@ -163,7 +163,7 @@ pub(crate) struct Storage {
     kinds: Vec<KindSize>,
     /// Bytes of the database, with what it has not written into its file yet.
     database_bytes: u64,
-    /// Checks of the store's folder and of what holds its blobs.
+    /// Checks of the store's folder and of its blob storage.
     findings: Vec<Finding>,
 }
 

@@ -2,8 +2,8 @@
 //!
 //! A script of a page can send no token with a WebSocket, and may not have one. So the server of the page, which knows a token of the
 //! streaming process, makes a ticket for its signed-in user: `UNTIL.NONCE.PROOF`, bound to the page's origin. The proof's key is the
-//! digest of that token, which both processes have; nothing else passes between them. The ticket stands in the list of subprotocols,
-//! the only header that a script may choose.
+//! digest of that token, which both processes have; nothing else passes between them. A script puts the ticket into
+//! the list of subprotocols, the only header that it may choose.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -61,7 +61,7 @@ impl StreamOffer {
     }
 }
 
-/// What a browser needs to enter a stream once.
+/// A ticket, with all that a browser needs to use it.
 #[derive(Debug, Serialize, JsonSchema)]
 pub(crate) struct Ticket {
     /// The address of the WebSocket.
@@ -116,7 +116,7 @@ impl Tickets {
         self.look(headers, tokens).is_some()
     }
 
-    /// The token that a ticket stands for, once.
+    /// Returns the token of a ticket's maker, once for each ticket.
     pub(crate) fn redeem(&self, headers: &HeaderMap, tokens: &Tokens) -> Option<Digest> {
         let Shown { token, nonce, until_ms } = self.look(headers, tokens)?;
         let mut used = self.used.lock().unwrap_or_else(PoisonError::into_inner);
