@@ -61,7 +61,7 @@ fn batch(row: &SqliteRow, step: &str, ms: &str) -> Result<Option<(f64, f64)>> {
     Ok(step.zip(ms).map(|(step, ms)| (step as f64, ms as f64)))
 }
 
-/// The value at `x` of the line through two points, of which the second is further.
+/// The value at `x` of the line through two points; the second is further.
 fn between((x0, y0): (f64, f64), (x1, y1): (f64, f64), x: f64) -> f64 {
     if x1 > x0 { y0 + (y1 - y0) * (x - x0) / (x1 - x0) } else { y1 }
 }
