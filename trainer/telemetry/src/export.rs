@@ -14,13 +14,11 @@ use tracing_subscriber::Layer;
 use tracing_subscriber::filter::{LevelFilter, Targets};
 use tracing_subscriber::registry::LookupSpan;
 
-use crate::SPANS;
-
 /// The variables that switch traces on, by the specification of OpenTelemetry.
 const ENDPOINTS: [&str; 2] = ["OTEL_EXPORTER_OTLP_ENDPOINT", "OTEL_EXPORTER_OTLP_TRACES_ENDPOINT"];
 
-/// The layer that reads spans, and what sends them. Both are missing where no variable names a collector.
-pub(crate) fn layer<S>(service: &'static str) -> (Option<impl Layer<S>>, Option<SdkTracerProvider>)
+/// The layer that reads spans of the target `spans`, and their sender. Both are missing where no variable names a collector.
+pub(crate) fn layer<S>(service: &'static str, spans: &'static str) -> (Option<impl Layer<S>>, Option<SdkTracerProvider>)
 where
     S: Subscriber + for<'a> LookupSpan<'a>,
 {
@@ -28,7 +26,7 @@ where
     let layer = provider.as_ref().map(|provider| {
         let layer: OpenTelemetryLayer<S, Tracer> = tracing_opentelemetry::layer().with_tracer(provider.tracer(service));
         // Lines within a span become its events.
-        let wanted = Targets::new().with_default(LevelFilter::INFO).with_target(SPANS, LevelFilter::TRACE);
+        let wanted = Targets::new().with_default(LevelFilter::INFO).with_target(spans, LevelFilter::TRACE);
         layer.with_location(false).with_threads(false).with_tracked_inactivity(false).with_filter(wanted)
     });
     (layer, provider)
@@ -63,6 +61,6 @@ pub(crate) fn join_run(span: &tracing::Span, run: &str) {
     parent.copy_from_slice(&digest[16..24]);
     let (trace, parent) = (TraceId::from_bytes(trace), SpanId::from_bytes(parent));
     let context = SpanContext::new(trace, parent, TraceFlags::SAMPLED, true, TraceState::default());
-    // An error means that nobody reads this span.
+    // An error means that this span is not sent.
     let _ = span.set_parent(Context::new().with_remote_span_context(context));
 }

@@ -2,7 +2,7 @@
 //! collector that the standard variables of OpenTelemetry name.
 //!
 //! Spans have the target [`SPANS`] at the level `TRACE`, so that no line shows them unless `RUST_LOG` asks for it. A
-//! span that nobody reads costs one comparison.
+//! span that is not sent costs one comparison.
 
 #[cfg(feature = "otel")]
 mod export;
@@ -34,7 +34,7 @@ pub fn init(service: &'static str, filter: &str, ansi: bool) -> Result<Traces, T
     let lines = registry().with(lines.with_filter(filter));
     #[cfg(feature = "otel")]
     {
-        let (layer, provider) = export::layer(service);
+        let (layer, provider) = export::layer(service, SPANS);
         lines.with(layer).try_init()?;
         Ok(Traces { provider })
     }
