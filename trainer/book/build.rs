@@ -5,7 +5,7 @@ use std::fmt::Write as _;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use pulldown_cmark::{CowStr, Event, Options, Parser, Tag, TagEnd, html};
+use pulldown_cmark::{Alignment, CowStr, Event, Options, Parser, Tag, TagEnd, html};
 
 #[path = "../../tests/src/book.rs"]
 #[expect(dead_code, unreachable_pub, reason = "the checks of the documents use the rest")]
@@ -97,40 +97,35 @@ impl Rendered {
         let mut headings = source::anchors(text).into_iter();
         let mut taken: BTreeSet<String> = source::anchors(text).into_iter().collect();
         let mut row = Row::None;
-        let events = Parser::new_ext(text, Options::ENABLE_TABLES).filter_map(|event| {
-            let new = match event {
-                Event::Start(Tag::Heading { level, classes, attrs, .. }) => {
-                    let id = headings.next().unwrap_or_else(|| panic!("{}: a heading without a name", path.display()));
-                    Event::Start(Tag::Heading { level, id: Some(id.into()), classes, attrs })
-                }
-                // Alignments would be inline styles. A wide table scrolls by itself.
-                Event::Start(Tag::Table(alignments)) => {
-                    return Some(vec![
-                        Event::Html("<div class=\"table\" tabindex=\"0\">".into()),
-                        Event::Start(Tag::Table(vec![pulldown_cmark::Alignment::None; alignments.len()])),
-                    ]);
-                }
-                Event::End(TagEnd::Table) => return Some(vec![event, Event::Html("</div>\n".into())]),
-                Event::Start(Tag::Link { link_type, dest_url, title, id }) => {
-                    Event::Start(Tag::Link { link_type, dest_url: html_target(&dest_url).into(), title, id })
-                }
-                Event::Start(Tag::Image { ref dest_url, .. }) => {
-                    let beside = path.with_file_name("").join(dest_url.as_ref());
-                    pictures.insert(source::plain(&beside).display().to_string());
-                    event
-                }
-                Event::Html(ref comment) | Event::InlineHtml(ref comment) => {
-                    let is_comment = comment.trim().is_empty() || comment.trim_start().starts_with("<!--");
-                    assert!(is_comment, "{}: markup in a chapter: {comment}", path.display());
-                    return None;
-                }
-                Event::Start(Tag::HtmlBlock) | Event::End(TagEnd::HtmlBlock) => return None,
-                other => row.named(other, &mut taken),
-            };
-            Some(vec![new])
+        let events = Parser::new_ext(text, Options::ENABLE_TABLES).flat_map(|event| match event {
+            Event::Start(Tag::Heading { level, classes, attrs, .. }) => {
+                let id = headings.next().unwrap_or_else(|| panic!("{}: a heading without a name", path.display()));
+                vec![Event::Start(Tag::Heading { level, id: Some(id.into()), classes, attrs })]
+            }
+            // Alignments would be inline styles. A wide table scrolls by itself.
+            Event::Start(Tag::Table(alignments)) => vec![
+                Event::Html("<div class=\"table\" tabindex=\"0\">".into()),
+                Event::Start(Tag::Table(vec![Alignment::None; alignments.len()])),
+            ],
+            Event::End(TagEnd::Table) => vec![event, Event::Html("</div>\n".into())],
+            Event::Start(Tag::Link { link_type, dest_url, title, id }) => {
+                vec![Event::Start(Tag::Link { link_type, dest_url: html_target(&dest_url).into(), title, id })]
+            }
+            Event::Start(Tag::Image { ref dest_url, .. }) => {
+                let beside = path.with_file_name("").join(dest_url.as_ref());
+                pictures.insert(source::plain(&beside).display().to_string());
+                vec![event]
+            }
+            Event::Html(comment) | Event::InlineHtml(comment) => {
+                let is_comment = comment.trim().is_empty() || comment.trim_start().starts_with("<!--");
+                assert!(is_comment, "{}: markup in a chapter: {comment}", path.display());
+                Vec::new()
+            }
+            Event::Start(Tag::HtmlBlock) | Event::End(TagEnd::HtmlBlock) => Vec::new(),
+            other => vec![row.named(other, &mut taken)],
         });
         let mut body = String::with_capacity(2 * text.len());
-        html::push_html(&mut body, events.flatten());
+        html::push_html(&mut body, events);
         assert!(headings.next().is_none(), "{}: a heading was not rendered", path.display());
         Self { body }
     }
@@ -167,19 +162,19 @@ impl Row {
 /// The table of contents with the chapter at `path` marked, from `SUMMARY.md`.
 fn contents(root: &Path, path: &str, up: &str) -> String {
     let text = fs::read_to_string(source::source(root).join("SUMMARY.md")).expect("SUMMARY.md");
-    let mut depth = 0;
-    let events = Parser::new(&text).filter_map(|event| match event {
+    let mut headings = 0;
+    let events = Parser::new(&text).map(|event| match event {
         Event::Start(Tag::Heading { .. }) => {
-            depth += 1;
-            Some(Event::Html(if depth == 1 { "<p class=\"unseen\">" } else { "<p class=\"part\">" }.into()))
+            headings += 1;
+            Event::Html(if headings == 1 { "<p class=\"unseen\">" } else { "<p class=\"part\">" }.into())
         }
-        Event::End(TagEnd::Heading(_)) => Some(Event::Html("</p>\n".into())),
+        Event::End(TagEnd::Heading(_)) => Event::Html("</p>\n".into()),
         Event::Start(Tag::Link { dest_url, .. }) => {
             let mark = if *dest_url == *path { " aria-current=\"page\"" } else { "" };
-            Some(Event::InlineHtml(format!("<a href=\"{up}{}\"{mark}>", html_name(&dest_url)).into()))
+            Event::InlineHtml(format!("<a href=\"{up}{}\"{mark}>", html_name(&dest_url)).into())
         }
-        Event::End(TagEnd::Link) => Some(Event::InlineHtml("</a>".into())),
-        other => Some(other),
+        Event::End(TagEnd::Link) => Event::InlineHtml("</a>".into()),
+        other => other,
     });
     let mut list = String::new();
     html::push_html(&mut list, events);
