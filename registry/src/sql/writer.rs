@@ -154,6 +154,10 @@ impl Drop for Writer {
 async fn serve(mut session: Session, mut orders: mpsc::Receiver<(Order, Answer)>, proofs: &Proofs) {
     let mut recording = Recording::default();
     let mut group = Vec::with_capacity(GROUP);
+    // The connection that opened the catalog needs the caller's runtime, which may end or wait for this thread.
+    while session.leading.is_some() && !session.reconnect().await && !session.is_superseded() {
+        tokio::time::sleep(AGAIN).await;
+    }
     loop {
         let received = match session.wait() {
             None => orders.recv_many(&mut group, GROUP).await,
