@@ -41,7 +41,7 @@ pub struct LeaderTerms {
 
 impl Default for LeaderTerms {
     fn default() -> Self {
-        let [lease, renewed, relied_on, stalled] = [3000, 750, 2500, 2000].map(Duration::from_millis);
+        let [lease, renewed, relied_on, stalled] = [2500, 600, 2000, 1500].map(Duration::from_millis);
         Self { lease, renewed, relied_on, stalled: Some(stalled), terminates: true }
     }
 }
