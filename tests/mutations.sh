@@ -56,8 +56,8 @@ mutation() {
 mutation leniency-times-ten trainer/coordinator/src/observe.rs 's/then\.after\(overslept\)\.min\(at\)/then.after(overslept * 10)/' coordinator
 mutation back-off-times-ten trainer/coordinator/src/policy.rs 's/(self\.backoff_ms)\.saturating_mul/$1.saturating_mul(10).saturating_mul/' coordinator
 mutation heard-is-lost trainer/coordinator/src/batch.rs 's/(Ask::Observation\(\.\.\) =>) [^,]*,/$1 {}/' coordinator
-mutation cancelled-shards-forgotten registry/src/sqlite/retention.rs "s/state = 'finished'/state IN ('finished', 'cancelled')/g" "registry coordinator"
-mutation synchronous-off registry/src/sqlite/open.rs 's/SqliteSynchronous::Full/SqliteSynchronous::Off/' registry
+mutation cancelled-shards-forgotten registry/src/sql/retention.rs "s/state = 'finished'/state IN ('finished', 'cancelled')/g" "registry coordinator"
+mutation synchronous-off registry/src/sql/sqlite.rs 's/SqliteSynchronous::Full/SqliteSynchronous::Off/' registry
 mutation no-sync-of-a-blob registry/src/blob/fs.rs 's/self\.part\.file\.sync\(\)/Ok::<(), io::Error>(())/' "registry coordinator"
 mutation no-sync-of-its-folder registry/src/blob/fs.rs 's/folder\.disk\.sync_dir\(shard\)/Ok::<(), io::Error>(())/' "registry coordinator"
 mutation no-sync-of-the-operating-system registry/src/blob/disk.rs 's/(fn sync\(&mut self\) -> io::Result<\(\)> \{\s+)self\.sync_all\(\)/$1Ok(())/' registry
@@ -71,11 +71,11 @@ mutation gang-in-the-clear worker/src/gang/seal.rs 's/Ok\(stream\.local_addr\(\)
 mutation nonce-that-repeats worker/src/gang/seal.rs 's/bytes\[4\.\.\]\.copy_from_slice\(&number\.to_le_bytes\(\)\);/let _ = number; bytes[4] = 1;/' worker:lib:gang
 mutation every-queued-run-is-visited trainer/coordinator/src/decide/schedule.rs 's/(let prepared = )(prepared_gangs)/cx.state.visits += cx.state.runs.size() as u64;\n    $1$2/' coordinator:decisions:queued
 mutation a-rank-is-not-brought-up-to-date trainer/coordinator/src/state/apply.rs 's/(concerned\.append\(&mut self\.concerned\(fact\)\);)/$1\n        concerned.clear();/' coordinator:decisions
-mutation parts-of-a-given-up-snapshot-count registry/src/sqlite/apply.rs 's/run\(conn, sqlx::query\(given_up\)\.bind\(int\(seq\)\)\.bind\(int\(seq\)\)\)\.await\?;/let _ = given_up;/' registry:catalog_conformance
+mutation parts-of-a-given-up-snapshot-count registry/src/sql/apply.rs 's/run\(conn, query\(given_up\)\.bind\(int\(seq\)\)\.bind\(int\(seq\)\)\)\.await\?;/let _ = given_up;/' registry:catalog_conformance
 mutation readers-take-all-connections trainer/coordinator/src/shell/listener.rs 's/own >= limits\.of_token/own > limits.most/' coordinator:server:limits
 mutation no-limit-of-calls trainer/coordinator/src/shell/rate.rs 's/bucket\.left < 1\.0/bucket.left < -1.0e9/' coordinator:lib:rate
 mutation no-limit-of-live-runs trainer/coordinator/src/decide/runs.rs 's/if live < most \{/if live < most || most > 0 {/' coordinator:server:limits
-mutation no-limit-of-a-runs-lines registry/src/sqlite/usage.rs 's/bind\(int\(log_bytes\)\)/bind(0)/' coordinator:server:limits
+mutation no-limit-of-a-runs-lines registry/src/sql/usage.rs 's/bind\(int\(log_bytes\)\)/bind(0)/' coordinator:server:limits
 mutation a-refused-blob-is-tried-again worker/src/blobs.rs 's/BlobError::Unfit\(message\)/BlobError::Unavailable(message)/' worker:lib:tests
 mutation name-of-another-token trainer/coordinator/src/state/worker.rs 's/if own\.caller != by\.caller/if own.caller.is_empty()/' coordinator:server:workers
 mutation name-of-a-live-process trainer/coordinator/src/state/worker.rs 's/if own\.secret == by\.secret =>/if !own.caller.is_empty() =>/' coordinator:server:workers
@@ -97,7 +97,7 @@ mutation promotion-without-a-second-look trainer/coordinator/src/shell/effects.r
 mutation submission-promotes-unasked trainer/coordinator/src/shell/actor_handle.rs 's/self\.check_registrations\(&pipeline, &owner\)\.await\?;//' coordinator:server:promotion
 mutation runs-of-others-are-shown trainer/coordinator/src/shell/records.rs 's/self\.sees\.as_ref\(\)\.is_none_or\(\|group\| run\.owner\.group\(\) == \*group\)/run.number > 0/' coordinator:server:owners::matrix
 mutation runs-of-others-are-controlled trainer/coordinator/src/shell/queries.rs 's/owner\.is_some\(\) && !caller\.controls\(owner\.as_ref\(\)\)/false/' coordinator:server:owners::matrix
-mutation models-of-others-are-taken registry/src/sqlite/owners.rs 's/if !is_its_own/if false \&\& !is_its_own/' registry:owners
+mutation models-of-others-are-taken registry/src/sql/owners.rs 's/if !is_its_own/if false \&\& !is_its_own/' registry:owners
 mutation revoked-and-served trainer/coordinator/src/shell/token_table.rs 's/self\.changed\.send_modify\(\|version\| \*version \+= 1\);//' coordinator:server:owners::tokens
 mutation expired-and-served trainer/access/src/expiry.rs 's/now_ms >= self\.at_ms/now_ms < self.at_ms \&\& false/' "access:lib coordinator:server:owners::tokens"
 mutation refusals-one-by-one trainer/coordinator/src/shell/audit.rs 's/pending\.count\(kind, now_ms, REFUSED_MS\)/pending.line(kind.line(now_ms, now_ms, 1))/' coordinator:lib:audit

@@ -33,7 +33,8 @@ use crate::identity::Marker;
 use crate::lease::{self, LeaseTerms};
 use crate::lock::CollectionLock;
 use crate::retention::{self, BlobCalls, Rows};
-use crate::{BlobStore, QueryError, ReadStore, StoreId, clock, folder, sqlite};
+use crate::sql::sqlite;
+use crate::{BlobStore, QueryError, ReadStore, StoreId, clock, folder};
 
 const MANIFEST: &str = "backup.json";
 const FORMAT: u32 = 1;

@@ -206,6 +206,8 @@ pub(crate) enum MarkerError {
 #[derive(Debug)]
 pub(crate) struct StoreParts {
     dir: PathBuf,
+    /// Name of a database that is no file of the folder.
+    database: Option<PathBuf>,
     marker: Option<Marker>,
     /// The place of the marker, even if it is missing.
     marker_place: String,
@@ -251,6 +253,7 @@ impl StoreParts {
     pub(crate) fn read(dir: &Path, blobs: &dyn Backend) -> Result<Self, MarkerError> {
         Ok(Self {
             dir: dir.to_owned(),
+            database: None,
             marker: Marker::read(blobs)?,
             marker_place: blobs.marker_place(),
             any_blob: !blobs.is_empty()?,
@@ -258,6 +261,16 @@ impl StoreParts {
             // The log is evidence only if the database is missing.
             log: !folder::has_database(dir) && folder::log_bytes(dir) > 0,
         })
+    }
+
+    /// Gives the database's name in messages, if it is no file of the folder.
+    pub(crate) fn name_database(&mut self, database: PathBuf) {
+        self.database = Some(database);
+    }
+
+    /// Returns the store's folder.
+    pub(crate) fn dir(&self) -> &Path {
+        &self.dir
     }
 
     /// Returns the marker beside the blobs.
@@ -292,7 +305,7 @@ impl StoreParts {
     /// Checks that the parts belong together. `stored` is the identity in the database, or `None` if the database is
     /// absent.
     pub(crate) fn classify(&self, stored: Option<&Stored>) -> Result<Verdict, Mismatch> {
-        let database = folder::database(&self.dir);
+        let database = self.database.clone().unwrap_or_else(|| folder::database(&self.dir));
         let Some(stored) = stored else {
             return match self.evidence() {
                 None => Ok(Verdict::New),
@@ -333,13 +346,10 @@ impl StoreParts {
 /// emptied database as one that needs no blobs.
 pub(crate) async fn check(
     id: &StoreId,
-    dir: &Path,
+    database: &Path,
     blobs: Arc<dyn Backend>,
     records: &dyn Records,
 ) -> Result<(), String> {
-    if !folder::has_database(dir) {
-        return Err(format!("the database `{}` is missing or empty", folder::database(dir).display()));
-    }
     let place = blobs.marker_place();
     // Read before the database, because its epoch is raised first.
     let marker = tokio::task::spawn_blocking(move || Marker::read(&*blobs)).await.map_err(|e| e.to_string())?;
@@ -352,7 +362,7 @@ pub(crate) async fn check(
         Some(stored) if stored.id != *id => Err(format!("the database belongs to store {}, not {id}", stored.id)),
         Some(stored) if marker.epoch > stored.epoch => {
             let (found, known) = (stored.epoch, marker.epoch);
-            Err(Mismatch::Copied { database: folder::database(dir), found, marker: place, known }.to_string())
+            Err(Mismatch::Copied { database: database.to_owned(), found, marker: place, known }.to_string())
         }
         Some(_) => Ok(()),
         None => Err("the database has no store identity".into()),
@@ -462,6 +472,7 @@ mod tests {
     fn parts_are_opened_only_if_they_belong_together() {
         let found = |beside: Option<char>, any_blob, witness: Option<(char, u64)>| StoreParts {
             dir: "/s".into(),
+            database: None,
             marker: beside.map(|store| Marker { store: id(store), epoch: 2, held: None }),
             marker_place: "/s/blobs/IDENTITY".into(),
             any_blob,

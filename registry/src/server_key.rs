@@ -36,9 +36,15 @@ pub(crate) fn read_or_make(dir: &Path) -> io::Result<ServerKey> {
     }
 }
 
-fn make(dir: &Path, path: &Path) -> io::Result<ServerKey> {
+/// Draws a key.
+pub(crate) fn random() -> io::Result<ServerKey> {
     let mut key = ServerKey::default();
     getrandom::fill(&mut key).map_err(io::Error::other)?;
+    Ok(key)
+}
+
+fn make(dir: &Path, path: &Path) -> io::Result<ServerKey> {
+    let key = random()?;
     let fresh = path.with_extension("new");
     // Left by an interrupted start.
     let _ = fs::remove_file(&fresh);

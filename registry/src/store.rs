@@ -1,8 +1,9 @@
-//! The store: a folder with a database, blobs and a lock.
+//! The store: a folder with a database, blobs and a lock. The database may be in PostgreSQL instead.
 //!
 //! ```text
 //! .stride/
 //!   stride.db        SQLite, WAL
+//!   CATALOG          address of the database, if it is in PostgreSQL
 //!   witness          lower bound of the number of transactions in the database
 //!   blobs/IDENTITY   the store that the blobs belong to
 //!   blobs/sha256/    bytes by digest
@@ -12,7 +13,8 @@
 //!   lock             the operating system's lock, with the holder's name
 //! ```
 //!
-//! One process holds a store. A second one gets the holder's name and sends its requests there over HTTP.
+//! One process holds a store. With PostgreSQL several folders may belong to a store, and one process leads
+//! ([`Leadership`]). A second one gets the holder's name and sends its requests there over HTTP.
 
 use std::fs::{self, DirBuilder};
 use std::io;
@@ -25,11 +27,11 @@ use checkpoint::BlobError;
 use protocol::stage::Keep;
 use protocol::{Alias, Digest, Group, ModelName, RunId, TaskId};
 
-use crate::blob::disk::free_bytes;
+use crate::blob::disk::{free_bytes, write_whole};
 use crate::blob::place::{Location, Place};
 use crate::blob::{Backend, BlobStore};
 use crate::calls::Calls;
-use crate::catalog::{Catalog, Done, Order, PromoteOrder, Records, RollbackOrder, Which};
+use crate::catalog::{Catalog, Done, Order, PostgresAddress, PromoteOrder, Records, RollbackOrder, Which};
 use crate::forget::Forgotten;
 use crate::identity::{self, Held, Marker, MarkerError, StoreParts, Verdict, Witness};
 use crate::lease::{self, Lease, LeaseTerms};
@@ -39,10 +41,10 @@ use crate::proofs::Proofs;
 use crate::reserve::{self, OPEN_NEEDS_BYTES};
 use crate::scoped::ScopedRecords;
 use crate::server_key::{self, ServerKey};
-use crate::sqlite::{Opened, Session, SqliteCatalog, SqliteRecords, Writer};
+use crate::sql::{self, LeaderTerms, Leadership, Link, Opened, Session, SqlCatalog, SqlRecords, Writer};
 use crate::store_id::{StoreId, Stored};
 use crate::versions::{Expect, Pick, Promotion};
-use crate::{WriteError, clock, folder, sqlite};
+use crate::{WriteError, clock, folder};
 
 /// Read access to the committed data of a store. A [`Store`] contains one. A read-only process opens its own, even
 /// while another process holds the store; it starts and writes nothing. Clones share it.
@@ -57,6 +59,8 @@ struct Reading {
     blobs: BlobStore,
     calls: Calls,
     records: Arc<dyn Records>,
+    /// Address of the database, unless it is a file of the folder.
+    address: Option<PostgresAddress>,
     /// Blocks writers while a database without a log is read.
     _closed: Option<Arc<SharedLock>>,
 }
@@ -73,6 +77,27 @@ struct Inner {
     _lease: Option<Lease>,
     lock: Arc<StoreLock>,
     proofs: Arc<Proofs>,
+    leading: Option<Leading>,
+}
+
+/// What a process has that leads a catalog in PostgreSQL.
+#[derive(Debug)]
+struct Leading {
+    leadership: Leadership,
+    server_key: ServerKey,
+}
+
+/// A catalog in PostgreSQL, and the terms under which a process leads it.
+#[derive(Debug, Clone)]
+pub struct PostgresCatalog {
+    pub address: PostgresAddress,
+    pub terms: LeaderTerms,
+}
+
+impl From<PostgresAddress> for PostgresCatalog {
+    fn from(address: PostgresAddress) -> Self {
+        Self { address, terms: LeaderTerms::default() }
+    }
 }
 
 impl std::ops::Deref for Store {
@@ -100,15 +125,18 @@ impl ReadStore {
         if let Some(kind) = network_filesystem(&dir).map_err(|e| io(&dir, e))? {
             return Err(OpenError::NetworkFilesystem { dir, kind });
         }
+        if let Some(address) = remembered_catalog(&dir)? {
+            return Self::open_postgres(dir, address).await;
+        }
         // Without a log the database file is complete and does not change while writers are blocked, so it is opened
         // immutably. Reading it in WAL mode would create a log. With a log, SQLite isolates readers from the writer.
         let shared = SharedLock::try_take(&dir.join("lock")).map_err(|e| io(&dir.join("lock"), e))?;
         let closed = shared.filter(|_| folder::log_bytes(&dir) == 0);
         // Read before the database, because the witness and the marker never exceed the committed state.
         let inspection = Inspection::of(&dir, &RequestedPlace::Remembered, false).await?;
-        let id = sqlite::check_to_read(&dir, &inspection.found, closed.is_some()).await?;
+        let id = sql::sqlite::check_to_read(&dir, &inspection.found, closed.is_some()).await?;
         let blobs = BlobStore::over(inspection.blobs);
-        let records = Arc::new(SqliteRecords::new(sqlite::open_readers(&dir, closed.is_some())));
+        let records = Arc::new(SqlRecords::new(sql::sqlite::open_readers(&dir, closed.is_some())));
         let opened_ms = clock::now_ms();
         Ok(Self(Arc::new(Reading {
             dir,
@@ -117,14 +145,32 @@ impl ReadStore {
             blobs,
             calls: Calls::default(),
             records,
+            address: None,
             _closed: closed.map(Arc::new),
+        })))
+    }
+
+    async fn open_postgres(dir: PathBuf, address: PostgresAddress) -> Result<Self, OpenError> {
+        let mut inspection = Inspection::of(&dir, &RequestedPlace::Remembered, false).await?;
+        inspection.found.name_database(sql::postgres::name(&address));
+        let id = sql::postgres::check_to_read(&address, &dir, &inspection.found).await?;
+        let records = Arc::new(SqlRecords::new(sql::postgres::open_readers(&address)?));
+        Ok(Self(Arc::new(Reading {
+            dir,
+            id,
+            opened_ms: clock::now_ms(),
+            blobs: BlobStore::over(inspection.blobs),
+            calls: Calls::default(),
+            records,
+            address: Some(address),
+            _closed: None,
         })))
     }
 
     /// Returns the store as `group` sees it: only its own runs and models.
     #[must_use]
     pub fn seen_by(&self, group: &Group) -> Self {
-        let Reading { dir, id, opened_ms, blobs, calls, records, _closed } = &*self.0;
+        let Reading { dir, id, opened_ms, blobs, calls, records, address, _closed } = &*self.0;
         Self(Arc::new(Reading {
             dir: dir.clone(),
             id: id.clone(),
@@ -132,6 +178,7 @@ impl ReadStore {
             blobs: blobs.clone(),
             calls: calls.clone(),
             records: Arc::new(ScopedRecords::new(Arc::clone(records), group.clone())),
+            address: address.clone(),
             _closed: _closed.clone(),
         }))
     }
@@ -167,7 +214,7 @@ impl ReadStore {
         self.0.calls.run(call).await
     }
 
-    /// Size in bytes of the database and its log.
+    /// Size in bytes of the database and its log in the folder; 0 if the database is in PostgreSQL.
     pub fn database_bytes(&self) -> u64 {
         folder::database_bytes(self.dir()) + folder::log_bytes(self.dir())
     }
@@ -184,7 +231,14 @@ impl ReadStore {
     /// Checks that the database and the blobs were not exchanged since opening, and describes the problem if they were
     /// removed, emptied or replaced.
     pub(crate) async fn check_identity(&self) -> Result<(), String> {
-        identity::check(self.id(), self.dir(), self.blobs().place(), &**self).await
+        let database = match &self.0.address {
+            Some(address) => sql::postgres::name(address),
+            None if folder::has_database(self.dir()) => folder::database(self.dir()),
+            None => {
+                return Err(format!("the database `{}` is missing or empty", folder::database(self.dir()).display()));
+            }
+        };
+        identity::check(self.id(), &database, self.blobs().place(), &**self).await
     }
 }
 
@@ -196,13 +250,13 @@ impl Store {
 
     /// Opens or creates a store with its blobs at `blobs`. An existing store must have them there already.
     pub async fn open_with(dir: &Path, blobs: Option<&Place>, holder: Holder) -> Result<Self, OpenError> {
-        let io = |path: &Path, e: io::Error| OpenError::io(path, &e);
         if !folder::has_database(dir)
+            && remembered_catalog(dir)?.is_none()
             && Inspection::of(dir, &RequestedPlace::Remembered, false).await?.found.evidence().is_none()
         {
             refuse_other_files(dir)?;
         }
-        DirBuilder::new().recursive(true).mode(0o700).create(dir).map_err(|e| io(dir, e))?;
+        make_folder(dir)?;
         Self::take(dir, RequestedPlace::named(blobs), holder, Purpose::Work).await
     }
 
@@ -213,9 +267,45 @@ impl Store {
         holder: Holder,
         terms: LeaseTerms,
     ) -> Result<Self, OpenError> {
-        let io = |path: &Path, e: io::Error| OpenError::io(path, &e);
-        DirBuilder::new().recursive(true).mode(0o700).create(dir).map_err(|e| io(dir, e))?;
-        Self::take_by(dir, RequestedPlace::Given(blobs), holder, Purpose::Work, terms).await
+        make_folder(dir)?;
+        let asked = Asked { place: RequestedPlace::Given(blobs), terms, ..Asked::to(Purpose::Work) };
+        Self::take_by(dir, asked, holder).await
+    }
+
+    /// Opens or creates a store whose catalog is in PostgreSQL, and leads it. `dir` is this process's own folder.
+    pub async fn open_on(
+        catalog: &PostgresCatalog,
+        dir: &Path,
+        blobs: Option<&Place>,
+        holder: Holder,
+    ) -> Result<Self, OpenError> {
+        make_folder(dir)?;
+        let asked =
+            Asked { place: RequestedPlace::named(blobs), catalog: Some(catalog.clone()), ..Asked::to(Purpose::Work) };
+        Self::take_by(dir, asked, holder).await
+    }
+
+    /// Opens or creates a store whose catalog is in PostgreSQL over a given backend. For tests.
+    pub async fn open_on_over(
+        catalog: &PostgresCatalog,
+        dir: &Path,
+        blobs: Arc<dyn Backend>,
+        holder: Holder,
+    ) -> Result<Self, OpenError> {
+        make_folder(dir)?;
+        let asked =
+            Asked { place: RequestedPlace::Given(blobs), catalog: Some(catalog.clone()), ..Asked::to(Purpose::Work) };
+        Self::take_by(dir, asked, holder).await
+    }
+
+    /// Returns once no other process leads the catalog.
+    pub async fn wait_to_lead(catalog: &PostgresCatalog) {
+        sql::postgres::wait_to_lead(&catalog.address).await;
+    }
+
+    /// Returns this process's leadership, if the catalog is in PostgreSQL.
+    pub fn leadership(&self) -> Option<&Leadership> {
+        self.0.leading.as_ref().map(|leading| &leading.leadership)
     }
 
     /// Opens an existing store.
@@ -238,16 +328,10 @@ impl Store {
     }
 
     async fn take(dir: &Path, place: RequestedPlace, holder: Holder, purpose: Purpose) -> Result<Self, OpenError> {
-        Self::take_by(dir, place, holder, purpose, LeaseTerms::default()).await
+        Self::take_by(dir, Asked { place, ..Asked::to(purpose) }, holder).await
     }
 
-    async fn take_by(
-        dir: &Path,
-        place: RequestedPlace,
-        holder: Holder,
-        purpose: Purpose,
-        terms: LeaseTerms,
-    ) -> Result<Self, OpenError> {
+    async fn take_by(dir: &Path, asked: Asked, holder: Holder) -> Result<Self, OpenError> {
         let io = |path: &Path, e: io::Error| OpenError::io(path, &e);
         let dir = dir.canonicalize().map_err(|e| io(dir, e))?;
         close_to_others(&dir).map_err(|e| io(&dir, e))?;
@@ -260,25 +344,30 @@ impl Store {
             Taken::Busy(holder) => return Err(OpenError::Busy { dir, holder }),
         };
         let free = free_bytes(&dir).map_err(|e| io(&dir, e))?;
-        if purpose == Purpose::Collect {
+        if asked.purpose == Purpose::Collect {
             reserve::release_if_full(&dir);
         } else if free < OPEN_NEEDS_BYTES {
             let message = format!("{free} bytes are free, {OPEN_NEEDS_BYTES} are needed");
             return Err(OpenError::Full { path: dir, message });
         }
+        let catalog = choose_catalog(&dir, asked.catalog.clone())?;
         // Read under the lock, so that no other process is creating the store.
-        let adopt = purpose == Purpose::Adopt;
-        let mut inspection = Inspection::of(&dir, &place, adopt).await?;
-        let is_shared = inspection.location.is_shared(&dir);
-        if is_shared && inspection.found.marker().is_some_and(|marker| marker.held.is_some()) {
-            wait_until_free(&dir, &inspection, terms).await?;
-            inspection = Inspection::of(&dir, &place, adopt).await?;
+        let adopt = asked.purpose == Purpose::Adopt;
+        let mut inspection = Inspection::of(&dir, &asked.place, adopt).await?;
+        // The leader of a catalog needs no lease on the blobs: the marker has its epoch.
+        let is_leased = catalog.is_none() && inspection.location.is_shared(&dir);
+        if is_leased && inspection.found.marker().is_some_and(|marker| marker.held.is_some()) {
+            wait_until_free(&dir, &inspection, asked.terms).await?;
+            inspection = Inspection::of(&dir, &asked.place, adopt).await?;
         }
-        if inspection.to_remember && !folder::has_database(&dir) && inspection.found.evidence().is_none() {
+        let is_new = !folder::has_database(&dir) && inspection.found.evidence().is_none();
+        if inspection.to_remember && (is_new || catalog.is_some()) && !adopt {
             // Written before the database exists; an existing database has a known place of blobs.
             inspection.place.remember(&dir).map_err(|e| io(&dir, e))?;
         }
-        let Opened { mut conn, store: id, verdict } = sqlite::open_writer(&dir, &inspection.found, adopt).await?;
+        let begun = Instant::now();
+        let Database { opened: Opened { mut link, store: id, verdict }, led } =
+            Database::open(&dir, &mut inspection, catalog.as_ref(), adopt, &lock.holder()).await?;
         if inspection.to_remember && adopt {
             inspection.place.remember(&dir).map_err(|e| io(&dir, e))?;
         }
@@ -289,32 +378,58 @@ impl Store {
         if let Verdict::New | Verdict::Unfinished(_) = verdict {
             marker = Some(mark(&dir, &blobs, marker, &Stored { id: id.clone(), epoch: 0, commits: 0 }, None).await?);
         }
-        let stored = sqlite::raise_epoch(&dir, &mut conn).await?;
-        let held = is_shared.then(|| lease::held(&dir, &lock.holder())).transpose().map_err(|e| io(&dir, e))?;
-        let begun = Instant::now();
+        let stored = match (&mut link, &catalog, &led) {
+            (Link::Sqlite(conn), _, _) => sql::sqlite::raise_epoch(&dir, conn).await?,
+            (link, Some(catalog), Some((epoch, _))) => {
+                sql::postgres::raise_epoch(&catalog.address, link, *epoch).await?
+            }
+            (Link::Postgres(_), _, _) => return Err(OpenError::NotAStore(dir)),
+        };
+        let held = is_leased.then(|| lease::held(&dir, &lock.holder())).transpose().map_err(|e| io(&dir, e))?;
+        let leased_at = Instant::now();
         let marker = mark(&dir, &blobs, marker, &stored, held).await?;
-        let lease = is_shared.then(|| Lease::begin(blobs.place(), marker, begun, terms));
+        let lease = is_leased.then(|| Lease::begin(blobs.place(), marker, leased_at, asked.terms));
         let lease = lease.transpose().map_err(|e| io(&dir, e))?;
         if let Some(lease) = &lease {
             let check = lease.checked();
             blobs.permit_removals_by(move || check.may_remove());
         }
+        let leading = led.zip(catalog.as_ref()).map(|((_, server_key), catalog)| {
+            let leadership = Leadership::begin(stored.epoch, catalog.terms, begun);
+            let check = leadership.clone();
+            blobs.permit_removals_by(move || check.may_remove());
+            Leading { leadership, server_key }
+        });
         let witness = Witness::begin(&dir, &stored).map_err(|e| io(&dir, e))?;
         reserve::keep(&dir);
         remove_files_of_earlier_builds(&dir).map_err(|e| io(&dir, e))?;
         // By the writer's connection: a reader's would close the database later than the store.
-        for (task, held) in sqlite::held(&mut conn).await.map_err(|e| io(&dir, io::Error::other(e)))? {
+        for (task, held) in sql::held(&mut link).await.map_err(|e| io(&dir, io::Error::other(e)))? {
             held.into_iter().for_each(|digest| blobs.hold(&task, digest));
         }
-        let session = Session { conn, epoch: stored.epoch, witness };
+        let session = Session {
+            link,
+            epoch: stored.epoch,
+            commits: stored.commits,
+            witness,
+            leading: leading
+                .as_ref()
+                .map(|leading| leading.leadership.clone())
+                .zip(catalog.as_ref().map(|c| c.address.clone())),
+        };
         let proofs = Arc::new(Proofs::new(lease.as_ref().map(Lease::checked)));
         let writer = Writer::start(session, Arc::clone(&proofs), Arc::clone(&lock)).map_err(|e| io(&dir, e))?;
-        let records = Arc::new(SqliteRecords::new(sqlite::open_readers(&dir, false)));
-        let catalog = Box::new(SqliteCatalog { writer, records: Arc::clone(&records) });
+        let readers = match &catalog {
+            None => sql::sqlite::open_readers(&dir, false),
+            Some(catalog) => sql::postgres::open_readers(&catalog.address)?,
+        };
+        let records = Arc::new(SqlRecords::new(readers));
+        let catalog_ = Box::new(SqlCatalog { writer, records: Arc::clone(&records) });
         let opened_ms = clock::now_ms();
-        let read =
-            ReadStore(Arc::new(Reading { dir, id, opened_ms, blobs, calls: Calls::default(), records, _closed: None }));
-        Ok(Self(Arc::new(Inner { read, catalog, _lease: lease, lock, proofs })))
+        let address = catalog.map(|catalog| catalog.address);
+        let calls = Calls::default();
+        let read = ReadStore(Arc::new(Reading { dir, id, opened_ms, blobs, calls, records, address, _closed: None }));
+        Ok(Self(Arc::new(Inner { read, catalog: catalog_, _lease: lease, lock, proofs, leading })))
     }
 
     /// Returns the catalog: all data except the blobs.
@@ -324,12 +439,19 @@ impl Store {
 
     /// Returns the key of this store's server, which the first call creates. Reads the disk each time.
     pub fn server_key(&self) -> io::Result<ServerKey> {
-        server_key::read_or_make(self.dir())
+        match &self.0.leading {
+            Some(leading) => Ok(leading.server_key),
+            None => server_key::read_or_make(self.dir()),
+        }
     }
 
     /// Publishes the address of this process's server for other processes.
     pub fn set_address(&self, address: impl Into<String>) -> io::Result<()> {
-        self.0.lock.set_address(address.into())
+        let address = address.into();
+        if let Some(leadership) = self.leadership() {
+            leadership.set_address(&address);
+        }
+        self.0.lock.set_address(address)
     }
 
     /// Returns the description of this process for others.
@@ -492,6 +614,97 @@ fn remove_files_of_earlier_builds(dir: &Path) -> io::Result<()> {
     Ok(())
 }
 
+fn make_folder(dir: &Path) -> Result<(), OpenError> {
+    DirBuilder::new().recursive(true).mode(0o700).create(dir).map_err(|e| OpenError::io(dir, &e))
+}
+
+/// Name of the file with the address of the database.
+const CATALOG: &str = "CATALOG";
+
+/// Returns the address of the database that the folder records; `None` if the database is in the folder.
+fn remembered_catalog(dir: &Path) -> Result<Option<PostgresAddress>, OpenError> {
+    let path = dir.join(CATALOG);
+    let text = match fs::read_to_string(&path) {
+        Ok(text) => text,
+        Err(e) if matches!(e.kind(), io::ErrorKind::NotFound | io::ErrorKind::NotADirectory) => return Ok(None),
+        Err(e) => return Err(OpenError::io(&path, &e)),
+    };
+    text.trim().parse().map(Some).map_err(|message| OpenError::Other { path, message })
+}
+
+/// Returns the catalog in PostgreSQL that the caller asked for or that the folder records, and records it.
+fn choose_catalog(dir: &Path, asked: Option<PostgresCatalog>) -> Result<Option<PostgresCatalog>, OpenError> {
+    let remembered = remembered_catalog(dir)?;
+    let Some(asked) = asked else { return Ok(remembered.map(PostgresCatalog::from)) };
+    let path = dir.join(CATALOG);
+    if folder::has_database(dir) {
+        let message = format!("its database is `{}`; `registry migrate` moves it", folder::DATABASE);
+        return Err(OpenError::Other { path: dir.to_owned(), message });
+    }
+    if let Some(other) = remembered.as_ref().filter(|other| !other.is_same_database(&asked.address)) {
+        let message = format!("its catalog is {other}, not {}; choose another folder with `--store`", asked.address);
+        return Err(OpenError::Other { path, message });
+    }
+    remember_catalog(dir, &asked.address)?;
+    Ok(Some(asked))
+}
+
+/// Records the address of the database.
+pub(crate) fn remember_catalog(dir: &Path, address: &PostgresAddress) -> Result<(), OpenError> {
+    let path = dir.join(CATALOG);
+    let text = format!("{}\n", address.to_remember());
+    write_whole(&path, text.as_bytes()).map_err(|e| OpenError::io(&path, &e))
+}
+
+/// Removes the record; the database is in the folder from then on.
+pub(crate) fn forget_catalog(dir: &Path) -> Result<(), OpenError> {
+    let path = dir.join(CATALOG);
+    match fs::remove_file(&path) {
+        Err(e) if e.kind() != io::ErrorKind::NotFound => Err(OpenError::io(&path, &e)),
+        _ => Ok(()),
+    }
+}
+
+/// An open database; for the leader of a catalog, also its first epoch and the key of its server.
+struct Database {
+    opened: Opened,
+    led: Option<(u64, ServerKey)>,
+}
+
+impl Database {
+    async fn open(
+        dir: &Path,
+        inspection: &mut Inspection,
+        catalog: Option<&PostgresCatalog>,
+        adopt: bool,
+        holder: &Holder,
+    ) -> Result<Self, OpenError> {
+        let Some(PostgresCatalog { address, terms }) = catalog else {
+            let opened = sql::sqlite::open_writer(dir, &inspection.found, adopt).await?;
+            return Ok(Self { opened, led: None });
+        };
+        inspection.found.name_database(sql::postgres::name(address));
+        let opening = sql::postgres::Opening { address, dir, found: &inspection.found, adopt, terms: *terms, holder };
+        let led = sql::postgres::open_writer(&opening).await?;
+        Ok(Self { opened: led.opened, led: Some((led.epoch, led.server_key)) })
+    }
+}
+
+/// A request to open a store.
+struct Asked {
+    place: RequestedPlace,
+    purpose: Purpose,
+    terms: LeaseTerms,
+    /// The catalog in PostgreSQL, if the caller names one.
+    catalog: Option<PostgresCatalog>,
+}
+
+impl Asked {
+    fn to(purpose: Purpose) -> Self {
+        Self { place: RequestedPlace::Remembered, purpose, terms: LeaseTerms::default(), catalog: None }
+    }
+}
+
 /// Purpose of opening a store.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Purpose {
@@ -574,7 +787,7 @@ impl Inspection {
 
 /// Refuses a folder that is not, and never was, a store.
 async fn there(dir: &Path) -> Result<(), OpenError> {
-    if folder::has_database(dir) {
+    if folder::has_database(dir) || remembered_catalog(dir)?.is_some() {
         return Ok(());
     }
     match Inspection::of(dir, &RequestedPlace::Remembered, false).await?.found.evidence() {
@@ -615,7 +828,8 @@ async fn mark(
 }
 
 /// Names that a store's folder may have before its database exists.
-const OF_A_STORE: [&str; 7] = ["lock", "blobs", "staging", "witness", "witness.new", "reserve", server_key::FILE];
+const OF_A_STORE: [&str; 8] =
+    ["lock", CATALOG, "blobs", "staging", "witness", "witness.new", "reserve", server_key::FILE];
 
 /// Refuses to create a store in a folder with other files.
 fn refuse_other_files(dir: &Path) -> Result<(), OpenError> {

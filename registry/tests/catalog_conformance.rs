@@ -5,8 +5,9 @@ mod common;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex};
 
+use cluster_tests::postgres::Postgres as Server;
 use common::{artifact, fence, grant, metrics, result, rows, version};
 use futures::future::join_all;
 use protocol::stage::Keep;
@@ -14,7 +15,10 @@ use protocol::{Alias, ArtifactKind, Digest, FileEntry, Manifest, ModelName, RunI
 use registry::catalog::{Catalog, Done, Order, PromoteOrder, Records, RollbackOrder, Which};
 use registry::testing::slow::SlowBucket;
 use registry::versions::Action;
-use registry::{BlobStore, Expect, Page, Pick, QueryError, RunListQuery, RunOrder, Store, Write, WriteError};
+use registry::{
+    BlobStore, Expect, Holder, LeaderTerms, Page, Pick, PostgresCatalog, QueryError, RunListQuery, RunOrder, Store,
+    Write, WriteError,
+};
 use serde_json::json;
 use tempfile::TempDir;
 
@@ -60,8 +64,49 @@ impl Place for Sqlite {
     }
 }
 
+/// PostgreSQL in a database of its own, with blobs in a bucket. Every opening has a folder of its own, as on another machine.
+struct Postgres {
+    server: &'static Server,
+    database: String,
+    folders: Mutex<Vec<TempDir>>,
+    bucket: SlowBucket,
+}
+
+impl Postgres {
+    /// Returns a new place; `None` where PostgreSQL is not installed.
+    fn new() -> Option<Self> {
+        let server = Server::shared()?;
+        let (folders, bucket) = (Mutex::default(), SlowBucket::default());
+        Some(Self { server, database: server.create(), folders, bucket })
+    }
+}
+
+impl Place for Postgres {
+    async fn open(&self) -> Opened {
+        // The leader's time is over and its session goes on, so that only the epoch protects the store.
+        let over = "DO $$ BEGIN IF to_regclass('leader') IS NOT NULL THEN UPDATE leader SET until = '-infinity'; END IF; END $$";
+        self.server.sql(&self.database, over);
+        let terms = LeaderTerms { terminates: false, ..LeaderTerms::default() };
+        let catalog = PostgresCatalog { address: self.server.address(&self.database).parse().unwrap(), terms };
+        let dir = tempfile::tempdir().unwrap();
+        let blobs = self.bucket.place("p", dir.path());
+        let store = Store::open_on_over(&catalog, dir.path(), blobs, Holder::this_process("test")).await.unwrap();
+        self.folders.lock().unwrap().push(dir);
+        Opened { store, bucket: self.bucket.clone() }
+    }
+}
+
 macro_rules! conformance {
     ($($name:ident),+ $(,)?) => {
+        mod postgres {
+            $(#[tokio::test]
+            async fn $name() {
+                if let Some(place) = super::Postgres::new() {
+                    super::$name(&place).await;
+                }
+            })+
+        }
+
         mod sqlite {
             use super::SlowBucket;
 

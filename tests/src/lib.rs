@@ -11,6 +11,7 @@ pub mod documented;
 pub mod imports;
 pub mod mounted;
 pub mod network;
+pub mod postgres;
 pub mod slurm;
 pub mod supply;
 pub mod tables;

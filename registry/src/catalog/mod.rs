@@ -1,6 +1,6 @@
 //! The catalog of a store: all data except the blobs, behind two traits.
 //!
-//! [`Records`] answers queries from committed data; [`Catalog`] commits. SQLite implements them (`sqlite`). Every
+//! [`Records`] answers queries from committed data; [`Catalog`] commits. `sql` implements them over SQLite and PostgreSQL. Every
 //! implementation passes the suite `registry/tests/catalog_conformance.rs` and guarantees:
 //!
 //! - **One order is all or nothing.** [`Catalog::commit`] returns when the order is durable, or has changed nothing.
@@ -18,6 +18,7 @@
 //! Rules independent of the database are functions beside the types ([`crate::versions`], and `curve`). They cover the
 //! best version, gates, the target of a rollback, and the attempt whose values count.
 
+mod address;
 mod rows;
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -30,6 +31,7 @@ use protocol::message::Times;
 use protocol::stage::Keep;
 use protocol::{Alias, Digest, Group, ModelName, RunId, StageName, TaskId};
 
+pub use address::{CatalogPlace, PostgresAddress};
 pub use rows::{
     CheckpointRow, EndedRow, HistoryQuery, HistoryRow, KindSize, LineageNode, LogRow, Needs, Recovery, Root,
     RunListQuery, RunOrder, RunPage, RunRow, StageResultRow, Usage,

@@ -10,6 +10,7 @@ use checkpoint::published::Layout;
 use super::Command;
 use crate::Place;
 use crate::bundle::SUFFIX;
+use crate::catalog::CatalogPlace;
 
 /// Output format of answers.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, ValueEnum)]
@@ -115,6 +116,18 @@ pub enum Verb {
         #[arg(long, value_name = "PLACE")]
         blobs: Option<Place>,
     },
+    /// Moves a store's catalog between its folder (SQLite) and PostgreSQL, and verifies every row; the blobs stay
+    #[command(
+        after_help = "Example:\n  registry migrate --from .stride --to 'postgres://stride@db/stride?password-file=/run/secrets/stride'"
+    )]
+    Migrate {
+        /// The store's folder, or postgres://USER@HOST/DATABASE?password-file=FILE
+        #[arg(long, value_name = "CATALOG")]
+        from: CatalogPlace,
+        /// An empty database, or the folder that shall have the database
+        #[arg(long, value_name = "CATALOG")]
+        to: CatalogPlace,
+    },
     /// Copies a version's files to a folder, or to one file for `import` on another machine
     #[command(after_help = "Example:\n  registry export quickstart@best -o quickstart.tar.zst")]
     Export {
@@ -153,6 +166,8 @@ pub(super) enum Operation {
     Backup { dir: PathBuf },
     /// Creates a store from a backup on this machine.
     Restore { backup: PathBuf, to: PathBuf, blobs: Option<Place> },
+    /// Needs a store that no process holds, and its folder on this machine.
+    Migrate { from: CatalogPlace, to: CatalogPlace },
     /// Needs a store that no process holds.
     Adopt { blobs: Option<Place> },
 }
@@ -195,6 +210,7 @@ impl Verb {
             Self::Backup { dir } => Operation::Backup { dir },
             Self::Restore { backup, to, blobs } => Operation::Restore { backup, to, blobs },
             Self::Adopt { blobs } => Operation::Adopt { blobs },
+            Self::Migrate { from, to } => Operation::Migrate { from, to },
             Self::Export { model, dir, layout } => {
                 Operation::Export { model, dir: dir.unwrap_or_default(), layout: layout.map(Layout::from) }
             }

@@ -15,6 +15,8 @@ use tokio::io::AsyncReadExt as _;
 use super::args::Operation;
 use super::export::{self, Source};
 use super::{Answer, Command, Data, OutputArg, Verb, bundles, error, print, read, run};
+use crate::catalog::CatalogPlace;
+use crate::migrate::{self, MoveError};
 use crate::{Holder, OpenError, ReadStore, Store};
 
 /// Time to wait for a holder without an address, such as another `registry` command.
@@ -54,6 +56,10 @@ async fn answer(operation: Operation, dir: &Path, options: &ServerOptions) -> An
             Err(refused) => *refused,
         },
         Operation::Adopt { blobs } => adopt(dir, blobs.as_ref(), options).await,
+        Operation::Migrate { from, to } => match local(options, "a catalog is moved on the machine of the store") {
+            Ok(()) => migrate(from, to).await,
+            Err(refused) => *refused,
+        },
         Operation::Restore { backup, to, blobs } => match crate::backup::restore(&backup, &to, blobs.as_ref()).await {
             Ok(summary) => Answer::done(Data::Restored { summary, dir: to }),
             Err(e) => Answer::from(e),
@@ -106,6 +112,26 @@ async fn adopt(dir: &Path, blobs: Option<&crate::Place>, options: &ServerOptions
     match Store::adopt(dir, blobs, Holder::this_process("registry adopt")).await {
         Ok(store) => Answer::done(Data::Adopted { store: store.id().clone() }),
         Err(e) => Answer::from(&e),
+    }
+}
+
+async fn migrate(from: CatalogPlace, to: CatalogPlace) -> Answer {
+    let (names, holder) = ((from.to_string(), to.to_string()), Holder::this_process("registry migrate"));
+    let moved = match (&from, &to) {
+        (CatalogPlace::Folder(dir), CatalogPlace::Postgres(address)) => {
+            migrate::to_postgres(dir, address, holder).await
+        }
+        (CatalogPlace::Postgres(address), CatalogPlace::Folder(dir)) => migrate::to_folder(address, dir, holder).await,
+        _ => {
+            let hint = Some("name the store's folder and an address `postgres://...`");
+            return Answer::refused(error("invalid", "a catalog moves between a folder and PostgreSQL", hint));
+        }
+    };
+    match moved {
+        Ok(rows) => Answer::done(Data::Migrated { from: names.0, to: names.1, rows }),
+        Err(MoveError::Open(e)) => Answer::from(&e),
+        Err(MoveError::Query(e)) => Answer::from(e),
+        Err(e @ MoveError::Refused(_)) => Answer::refused(error("conflict", e, None)),
     }
 }
 

@@ -92,6 +92,13 @@ pub enum Data {
     BackedUp { summary: Summary, dir: std::path::PathBuf },
     /// Result of `restore`.
     Restored { summary: Summary, dir: std::path::PathBuf },
+    /// Result of `migrate`.
+    Migrated {
+        from: String,
+        to: String,
+        /// Number of copied rows.
+        rows: u64,
+    },
     /// Result of `export`.
     Exported {
         version: Version,

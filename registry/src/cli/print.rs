@@ -85,6 +85,9 @@ pub fn render(data: &Data) -> String {
             let (at, bytes, dir) = (format_ms(*at_ms), size(*bytes), dir.display());
             format!("`{dir}` is store {store} as of {at}: {blobs} blobs ({bytes}), all verified\n")
         }
+        Data::Migrated { from, to, rows } => {
+            format!("{rows} rows of `{from}` are in `{to}`, all verified; the store uses it from now on\n")
+        }
         Data::Exported { version, dir, files, left_out } => {
             let without = match left_out.is_empty() {
                 true => String::new(),

@@ -95,7 +95,9 @@ fn the_document_loads_from_the_folder_of_this_build() {
     let folder = page::folder();
     assert!(text.contains(&format!("/page/{folder}/main.js")) && !text.contains("FOLDER"), "{text}");
     assert!(page::find(folder, "main.js").is_some());
-    assert!(text.contains(&format!("modulepreload\" href=\"/page/{folder}/views/run.js")) && !text.contains("PRELOADS"));
+    assert!(
+        text.contains(&format!("modulepreload\" href=\"/page/{folder}/views/run.js")) && !text.contains("PRELOADS")
+    );
     assert!(page::find("0123456789abcdef", "main.js").is_none(), "another build's");
     assert!(page::find(folder, "index.html").is_none() && page::find(folder, "../Cargo.toml").is_none());
 }

@@ -3,16 +3,15 @@
 use std::collections::BTreeMap;
 
 use protocol::{Attempt, Digest, RunId, StageName, TaskId};
-use sqlx::sqlite::SqliteRow;
-use sqlx::{Row, SqliteConnection};
 
 use super::models::numbers;
+use super::statement::{Conn, Row, query};
 use crate::QueryError;
 use crate::catalog::{CheckpointRow, RunRow, StageResultRow};
 
 type Result<T> = std::result::Result<T, QueryError>;
 
-pub(super) fn digest(row: &SqliteRow, column: &str) -> Result<Digest> {
+pub(super) fn digest(row: &Row, column: &str) -> Result<Digest> {
     let text: String = row.try_get(column)?;
     text.parse().map_err(|e| QueryError::Blob(format!("column `{column}`: {e}")))
 }
@@ -21,7 +20,7 @@ pub(super) fn digests(text: &str) -> Result<BTreeMap<String, Digest>> {
     serde_json::from_str(text).map_err(|e| QueryError::Blob(format!("cannot parse a list of artifacts: {e}")))
 }
 
-pub(super) fn stage_result(row: &SqliteRow) -> Result<StageResultRow> {
+pub(super) fn stage_result(row: &Row) -> Result<StageResultRow> {
     Ok(StageResultRow {
         key: digest(row, "key")?,
         run: RunId::new(row.try_get::<String, _>("run")?),
@@ -35,7 +34,7 @@ pub(super) fn stage_result(row: &SqliteRow) -> Result<StageResultRow> {
     })
 }
 
-pub(super) fn run_row(row: &SqliteRow) -> Result<RunRow> {
+pub(super) fn run_row(row: &Row) -> Result<RunRow> {
     let pipeline: &str = row.try_get("pipeline")?;
     Ok(RunRow {
         run: RunId::new(row.try_get::<String, _>("run")?),
@@ -50,9 +49,9 @@ pub(super) fn run_row(row: &SqliteRow) -> Result<RunRow> {
     })
 }
 
-pub(super) async fn checkpoints(conn: &mut SqliteConnection, task: &TaskId) -> Result<Vec<CheckpointRow>> {
-    let find = sqlx::query("SELECT * FROM checkpoints WHERE task = ? ORDER BY step DESC, id DESC").bind(task.as_str());
-    let checkpoint = |row: &SqliteRow| -> Result<CheckpointRow> {
+pub(super) async fn checkpoints(conn: &mut Conn<'_>, task: &TaskId) -> Result<Vec<CheckpointRow>> {
+    let find = query("SELECT * FROM checkpoints WHERE task = ? ORDER BY step DESC, id DESC").bind(task.as_str());
+    let checkpoint = |row: &Row| -> Result<CheckpointRow> {
         Ok(CheckpointRow {
             task: task.clone(),
             attempt: Attempt(row.try_get::<i64, _>("attempt")?.unsigned_abs()),

@@ -7,14 +7,11 @@ use async_trait::async_trait;
 use futures::TryStreamExt as _;
 use protocol::message::Times;
 use protocol::{Alias, Digest, Group, ModelName, RunId, StageName, TaskId};
-use sqlx::pool::PoolConnection;
-use sqlx::sqlite::SqliteRow;
-use sqlx::{Connection, Row, Sqlite, SqliteConnection, SqlitePool};
 
-use super::open::{open_copy, stored};
+use super::pool::Pool;
 use super::rows::{checkpoints, digest, run_row, stage_result};
-use super::statement::json;
-use super::{curves, history, logs, models, owners, retention, run_list, usage};
+use super::statement::{Conn, Row, json, query};
+use super::{curves, history, logs, models, open, owners, postgres, retention, run_list, sqlite, transfer, usage};
 use crate::QueryError;
 use crate::catalog::{
     CheckpointRow, EndedRow, HistoryQuery, HistoryRow, KindSize, LineageNode, LogRow, Needs, Records, Recovery,
@@ -29,43 +26,43 @@ type Result<T> = std::result::Result<T, QueryError>;
 /// A query for rows of runs with their submissions.
 macro_rules! runs {
     ($which:literal) => {
-        concat!("SELECT runs.*, submissions.digest AS submission FROM runs LEFT JOIN submissions USING (run) ", $which)
+        concat!(
+            "SELECT runs.*, submissions.digest AS submission FROM runs LEFT JOIN submissions USING (run) ",
+            "LEFT JOIN run_list USING (run) ",
+            $which
+        )
     };
 }
 
 /// A pool of read-only connections.
 #[derive(Debug)]
-pub(crate) struct SqliteRecords(SqlitePool);
+pub(crate) struct SqlRecords(Pool);
 
-impl SqliteRecords {
-    /// Wraps connections made by [`super::open_readers`].
-    pub(crate) fn new(readers: SqlitePool) -> Self {
+impl SqlRecords {
+    /// Wraps connections for queries.
+    pub(crate) fn new(readers: Pool) -> Self {
         Self(readers)
-    }
-
-    async fn connection(&self) -> Result<PoolConnection<Sqlite>> {
-        Ok(self.0.acquire().await?)
     }
 }
 
 #[async_trait]
-impl Records for SqliteRecords {
+impl Records for SqlRecords {
     async fn stored(&self) -> Result<Option<Stored>> {
-        Ok(stored(&mut *self.connection().await?).await?)
+        Ok(open::stored(&mut self.0.reader().await?.conn()).await?)
     }
 
     async fn recovery(&self) -> Result<Recovery> {
-        let mut conn = self.connection().await?;
         // One transaction sees one moment; two could see a snapshot without the facts after it.
-        let mut moment = conn.begin().await?;
+        let mut moment = self.0.moment().await?;
         let mut recovery = Recovery::default();
         let newest = "SELECT seq, state FROM snapshots ORDER BY seq DESC LIMIT 1";
-        if let Some(row) = sqlx::query(newest).fetch_optional(&mut *moment).await? {
+        if let Some(row) = query(newest).fetch_optional(&mut moment.conn()).await? {
             let seq: i64 = row.try_get(0)?;
             recovery.snapshot = Some((seq.unsigned_abs(), row.try_get(1)?));
-            // SQLite takes the other columns of a group from the row with the maximum.
-            let parts = "SELECT part, state, max(seq) FROM snapshot_parts WHERE seq <= ? GROUP BY part";
-            let mut rows = sqlx::query(parts).bind(seq).fetch(&mut *moment);
+            let parts = "SELECT part, state FROM snapshot_parts AS newest WHERE seq = \
+                         (SELECT max(seq) FROM snapshot_parts WHERE part = newest.part AND seq <= ?)";
+            let mut conn = moment.conn();
+            let mut rows = query(parts).bind(seq).fetch(&mut conn);
             while let Some(row) = rows.try_next().await? {
                 if let Some(state) = row.try_get(1)? {
                     recovery.parts.insert(row.try_get(0)?, state);
@@ -73,51 +70,51 @@ impl Records for SqliteRecords {
             }
         }
         let facts = "SELECT seq, facts FROM facts ORDER BY seq";
-        for row in sqlx::query(facts).fetch_all(&mut *moment).await? {
+        for row in query(facts).fetch_all(&mut moment.conn()).await? {
             recovery.facts.push((row.try_get::<i64, _>(0)?.unsigned_abs(), row.try_get(1)?));
         }
-        moment.rollback().await?;
+        moment.end().await?;
         Ok(recovery)
     }
 
     async fn ended(&self, run: &RunId) -> Result<Option<EndedRow>> {
-        let mut conn = self.connection().await?;
-        let find = sqlx::query("SELECT view, archive FROM runs WHERE run = ? AND view IS NOT NULL");
-        let row = find.bind(run.as_str()).fetch_optional(&mut *conn).await?;
-        let ended = |row: SqliteRow| Ok(EndedRow { view: row.try_get(0)?, archive: row.try_get(1)? });
+        let mut reader = self.0.reader().await?;
+        let mut conn = reader.conn();
+        let find = query("SELECT view, archive FROM runs WHERE run = ? AND view IS NOT NULL");
+        let row = find.bind(run.as_str()).fetch_optional(&mut conn).await?;
+        let ended = |row: Row| Ok(EndedRow { view: row.try_get(0)?, archive: row.try_get(1)? });
         row.map(ended).transpose()
     }
 
     async fn run_list(&self, asked: &RunListQuery) -> Result<RunPage> {
-        let mut conn = self.connection().await?;
-        let mut moment = conn.begin().await?;
-        let page = run_list::page(&mut moment, asked, None).await?;
-        moment.rollback().await?;
+        let mut moment = self.0.moment().await?;
+        let page = run_list::page(&mut moment.conn(), asked, None).await?;
+        moment.end().await?;
         Ok(page)
     }
 
     async fn run_list_of(&self, group: &Group, asked: &RunListQuery) -> Result<RunPage> {
-        let mut conn = self.connection().await?;
-        let mut moment = conn.begin().await?;
-        let page = run_list::page(&mut moment, asked, Some(group)).await?;
-        moment.rollback().await?;
+        let mut moment = self.0.moment().await?;
+        let page = run_list::page(&mut moment.conn(), asked, Some(group)).await?;
+        moment.end().await?;
         Ok(page)
     }
 
     async fn run_owners(&self, runs: &[RunId]) -> Result<BTreeMap<RunId, Group>> {
-        Ok(owners::of_runs(&mut *self.connection().await?, runs).await?)
+        Ok(owners::of_runs(&mut self.0.reader().await?.conn(), runs).await?)
     }
 
     async fn model_owners(&self, model: Option<&ModelName>) -> Result<BTreeMap<ModelName, Group>> {
-        Ok(owners::of_models(&mut *self.connection().await?, model).await?)
+        Ok(owners::of_models(&mut self.0.reader().await?.conn(), model).await?)
     }
 
     async fn sources(&self, keys: &[Digest]) -> Result<BTreeMap<Digest, (RunId, StageName)>> {
-        let mut conn = self.connection().await?;
-        let find = "SELECT key, run, stage FROM executions WHERE key IN (SELECT value FROM json_each(?1)) \
-                    UNION ALL SELECT key, run, stage FROM stage_results WHERE key IN (SELECT value FROM json_each(?1))";
-        let rows = sqlx::query(find).bind(json(&keys)).fetch_all(&mut *conn).await?;
-        let source = |row: &SqliteRow| -> Result<_> {
+        let mut reader = self.0.reader().await?;
+        let mut conn = reader.conn();
+        let find = "SELECT key, run, stage FROM executions WHERE key IN {texts ?1} \
+                    UNION ALL SELECT key, run, stage FROM stage_results WHERE key IN {texts ?1}";
+        let rows = query(find).bind(json(&keys)).fetch_all(&mut conn).await?;
+        let source = |row: &Row| -> Result<_> {
             let (run, stage): (String, String) = (row.try_get("run")?, row.try_get("stage")?);
             Ok((digest(row, "key")?, (RunId::new(run), StageName::new(stage))))
         };
@@ -126,60 +123,65 @@ impl Records for SqliteRecords {
     }
 
     async fn archived_execution(&self, key: Digest) -> Result<Option<String>> {
-        let mut conn = self.connection().await?;
-        let find = sqlx::query("SELECT execution FROM executions WHERE key = ?").bind(key.to_string());
-        Ok(find.fetch_optional(&mut *conn).await?.map(|row| row.try_get(0)).transpose()?)
+        let mut reader = self.0.reader().await?;
+        let mut conn = reader.conn();
+        let find = query("SELECT execution FROM executions WHERE key = ?").bind(key.to_string());
+        Ok(find.fetch_optional(&mut conn).await?.map(|row| row.try_get(0)).transpose()?)
     }
 
     async fn stage_results(&self, keys: &[Digest]) -> Result<BTreeMap<Digest, StageResultRow>> {
-        let mut conn = self.connection().await?;
-        let find = "SELECT * FROM stage_results WHERE key IN (SELECT value FROM json_each(?))";
-        let rows = sqlx::query(find).bind(json(&keys)).fetch_all(&mut *conn).await?;
+        let mut reader = self.0.reader().await?;
+        let mut conn = reader.conn();
+        let find = "SELECT * FROM stage_results WHERE key IN {texts ?}";
+        let rows = query(find).bind(json(&keys)).fetch_all(&mut conn).await?;
         rows.iter().map(|row| stage_result(row).map(|result| (result.key, result))).collect()
     }
 
     async fn runs(&self) -> Result<Vec<RunRow>> {
-        let mut conn = self.connection().await?;
-        let rows = sqlx::query(runs!("ORDER BY created_ms DESC, runs.rowid DESC")).fetch_all(&mut *conn).await?;
+        let mut reader = self.0.reader().await?;
+        let mut conn = reader.conn();
+        let rows = query(runs!("ORDER BY runs.created_ms DESC, run_list.number DESC")).fetch_all(&mut conn).await?;
         rows.iter().map(run_row).collect()
     }
 
     async fn run(&self, run: &RunId) -> Result<Option<RunRow>> {
-        let mut conn = self.connection().await?;
-        let find = sqlx::query(runs!("WHERE run = ?")).bind(run.as_str());
-        find.fetch_optional(&mut *conn).await?.as_ref().map(run_row).transpose()
+        let mut reader = self.0.reader().await?;
+        let mut conn = reader.conn();
+        let find = query(runs!("WHERE runs.run = ?")).bind(run.as_str());
+        find.fetch_optional(&mut conn).await?.as_ref().map(run_row).transpose()
     }
 
     async fn run_by_key(&self, key: &str) -> Result<Option<RunRow>> {
-        let mut conn = self.connection().await?;
-        let find = sqlx::query(runs!("WHERE idempotency_key = ?")).bind(key);
-        find.fetch_optional(&mut *conn).await?.as_ref().map(run_row).transpose()
+        let mut reader = self.0.reader().await?;
+        let mut conn = reader.conn();
+        let find = query(runs!("WHERE idempotency_key = ?")).bind(key);
+        find.fetch_optional(&mut conn).await?.as_ref().map(run_row).transpose()
     }
 
     async fn checkpoints(&self, task: &TaskId) -> Result<Vec<CheckpointRow>> {
-        let mut conn = self.connection().await?;
+        let mut reader = self.0.reader().await?;
+        let mut conn = reader.conn();
         checkpoints(&mut conn, task).await
     }
 
     async fn shards(&self, run: &RunId) -> Result<BTreeMap<TaskId, Digest>> {
-        let mut conn = self.connection().await?;
-        let rows = sqlx::query("SELECT task, output FROM shards WHERE run = ?")
-            .bind(run.as_str())
-            .fetch_all(&mut *conn)
-            .await?;
+        let mut reader = self.0.reader().await?;
+        let mut conn = reader.conn();
+        let rows =
+            query("SELECT task, output FROM shards WHERE run = ?").bind(run.as_str()).fetch_all(&mut conn).await?;
         rows.iter().map(|row| Ok((TaskId::new(row.try_get::<String, _>(0)?), digest(row, "output")?))).collect()
     }
 
     async fn logs(&self, run: &RunId, stage: Option<&StageName>, after: i64, limit: u32) -> Result<Vec<LogRow>> {
-        logs::read(&mut *self.connection().await?, run, stage, after, limit).await
+        logs::read(&mut self.0.reader().await?.conn(), run, stage, after, limit).await
     }
 
     async fn last_logs(&self, run: &RunId, stage: Option<&StageName>, limit: u32) -> Result<Vec<LogRow>> {
-        logs::last(&mut *self.connection().await?, run, stage, limit).await
+        logs::last(&mut self.0.reader().await?.conn(), run, stage, limit).await
     }
 
     async fn usage(&self, run: &RunId) -> Result<Usage> {
-        usage::read(&mut *self.connection().await?, run).await
+        usage::read(&mut self.0.reader().await?.conn(), run).await
     }
 
     async fn kind_sizes(&self) -> Result<Vec<KindSize>> {
@@ -187,59 +189,65 @@ impl Records for SqliteRecords {
     }
 
     async fn timeline(&self, asked: &HistoryQuery) -> Result<Vec<HistoryRow>> {
-        history::read(&mut *self.connection().await?, asked, None).await
+        history::read(&mut self.0.reader().await?.conn(), asked, None).await
     }
 
     async fn timeline_of(&self, group: &Group, asked: &HistoryQuery) -> Result<Vec<HistoryRow>> {
-        history::read(&mut *self.connection().await?, asked, Some(group)).await
+        history::read(&mut self.0.reader().await?.conn(), asked, Some(group)).await
     }
 
     async fn history_span(&self) -> Result<(Option<i64>, i64)> {
-        history::span(&mut *self.connection().await?).await
+        history::span(&mut self.0.reader().await?.conn()).await
     }
 
     async fn delivered(&self, hook: &str) -> Result<Option<i64>> {
-        history::delivered(&mut *self.connection().await?, hook).await
+        history::delivered(&mut self.0.reader().await?.conn(), hook).await
     }
 
     async fn run_times(&self, runs: &[RunId]) -> Result<BTreeMap<RunId, Times>> {
-        history::run_times(&mut *self.connection().await?, runs).await
+        history::run_times(&mut self.0.reader().await?.conn(), runs).await
     }
 
     async fn stage_times(&self, run: &RunId) -> Result<BTreeMap<StageName, Times>> {
-        history::stage_times(&mut *self.connection().await?, run).await
+        history::stage_times(&mut self.0.reader().await?.conn(), run).await
     }
 
     async fn models(&self) -> Result<Vec<Model>> {
-        let mut conn = self.connection().await?;
+        let mut reader = self.0.reader().await?;
+        let mut conn = reader.conn();
         Ok(models::models(&mut conn).await?)
     }
 
     async fn model(&self, model: &ModelName) -> Result<Option<Model>> {
-        let mut conn = self.connection().await?;
+        let mut reader = self.0.reader().await?;
+        let mut conn = reader.conn();
         Ok(models::model(&mut conn, model).await?)
     }
 
     async fn versions(&self, model: &ModelName) -> Result<Vec<Version>> {
-        let mut conn = self.connection().await?;
+        let mut reader = self.0.reader().await?;
+        let mut conn = reader.conn();
         Ok(models::versions(&mut conn, model).await?)
     }
 
     async fn history(&self, model: &ModelName, alias: Option<&Alias>) -> Result<Vec<Promotion>> {
-        let mut conn = self.connection().await?;
+        let mut reader = self.0.reader().await?;
+        let mut conn = reader.conn();
         Ok(models::history(&mut conn, model, alias).await?)
     }
 
     async fn lineage(&self, digest: Digest) -> Result<Vec<LineageNode>> {
-        let mut conn = self.connection().await?;
+        let mut reader = self.0.reader().await?;
+        let mut conn = reader.conn();
         lineage(&mut conn, digest).await
     }
 
     async fn ended_before(&self, before_ms: i64) -> Result<Vec<RunId>> {
-        let mut conn = self.connection().await?;
+        let mut reader = self.0.reader().await?;
+        let mut conn = reader.conn();
         let find = "SELECT run FROM runs WHERE state IN ('finished', 'failed', 'cancelled') AND view IS NOT NULL \
                     AND updated_ms < ? ORDER BY updated_ms, run";
-        let rows = sqlx::query(find).bind(before_ms).fetch_all(&mut *conn).await?;
+        let rows = query(find).bind(before_ms).fetch_all(&mut conn).await?;
         rows.iter().map(|row| Ok(RunId::new(row.try_get::<String, _>(0)?))).collect()
     }
 
@@ -250,10 +258,9 @@ impl Records for SqliteRecords {
         keys: Option<&[String]>,
         page: Page,
     ) -> Result<BTreeMap<String, Curve>> {
-        let mut conn = self.connection().await?;
-        let mut moment = conn.begin().await?;
-        let curves = curves::points(&mut moment, run, stage, keys, page).await?;
-        moment.rollback().await?;
+        let mut moment = self.0.moment().await?;
+        let curves = curves::points(&mut moment.conn(), run, stage, keys, page).await?;
+        moment.end().await?;
         Ok(curves)
     }
 
@@ -264,61 +271,53 @@ impl Records for SqliteRecords {
         keys: Option<&[String]>,
         window: &Window,
     ) -> Result<BTreeMap<String, Buckets>> {
-        let mut conn = self.connection().await?;
-        let mut moment = conn.begin().await?;
-        let curves = curves::buckets(&mut moment, run, stage, keys, window).await?;
-        moment.rollback().await?;
+        let mut moment = self.0.moment().await?;
+        let curves = curves::buckets(&mut moment.conn(), run, stage, keys, window).await?;
+        moment.end().await?;
         Ok(curves)
     }
 
     async fn present(&self, blobs: &[Digest]) -> Result<BTreeMap<Digest, u64>> {
-        let mut conn = self.connection().await?;
-        let find = "SELECT digest, bytes FROM blobs WHERE digest IN (SELECT value FROM json_each(?))";
-        let rows = sqlx::query(find).bind(json(&blobs)).fetch_all(&mut *conn).await?;
+        let mut reader = self.0.reader().await?;
+        let mut conn = reader.conn();
+        let find = "SELECT digest, bytes FROM blobs WHERE digest IN {texts ?}";
+        let rows = query(find).bind(json(&blobs)).fetch_all(&mut conn).await?;
         rows.iter().map(|row| Ok((digest(row, "digest")?, row.try_get::<i64, _>("bytes")?.unsigned_abs()))).collect()
     }
 
     async fn held(&self) -> Result<BTreeMap<TaskId, BTreeSet<Digest>>> {
-        let mut conn = self.connection().await?;
+        let mut reader = self.0.reader().await?;
+        let mut conn = reader.conn();
         retention::held(&mut conn).await
     }
 
     async fn needs(&self) -> Result<Needs> {
-        let mut conn = self.connection().await?;
         // A reading transaction sees one moment of the database.
-        let mut moment = conn.begin().await?;
-        let needs = retention::needs(&mut moment).await?;
-        moment.rollback().await?;
+        let mut moment = self.0.moment().await?;
+        let needs = retention::needs(&mut moment.conn()).await?;
+        moment.end().await?;
         Ok(needs)
     }
 
     async fn problems(&self) -> Result<Vec<String>> {
-        let mut conn = self.connection().await?;
-        let mut problems = Vec::new();
-        for row in sqlx::query("PRAGMA integrity_check").fetch_all(&mut *conn).await? {
-            let line: String = row.try_get(0)?;
-            if line != "ok" {
-                problems.push(format!("database: {line}"));
-            }
+        let mut reader = self.0.reader().await?;
+        match &mut reader.conn() {
+            Conn::Sqlite(conn) => sqlite::problems(conn).await,
+            Conn::Postgres(conn) => postgres::problems(conn).await,
         }
-        for row in sqlx::query("PRAGMA foreign_key_check").fetch_all(&mut *conn).await? {
-            problems.push(format!("database: a row of `{}` has a dangling reference", row.try_get::<String, _>(0)?));
-        }
-        Ok(problems)
     }
 
     async fn copy_to(&self, path: &Path) -> Result<Needs> {
-        let mut conn = self.connection().await?;
-        sqlx::query("VACUUM INTO ?").bind(path.to_string_lossy().into_owned()).execute(&mut *conn).await?;
-        drop(conn);
-        let mut copy = open_copy(path).await?;
-        let needs = retention::needs(&mut copy).await;
-        let checked: String = sqlx::query("PRAGMA integrity_check").fetch_one(&mut copy).await?.try_get(0)?;
-        copy.close().await?;
-        match checked.as_str() {
-            "ok" => needs,
-            problem => Err(QueryError::Blob(format!("the database is damaged: {problem}"))),
+        match &self.0 {
+            Pool::Sqlite(pool) => sqlite::copy(&mut *pool.acquire().await?, path).await?,
+            Pool::Postgres(_) => {
+                transfer::to_file(&self.0, path).await?;
+            }
         }
+        let mut copy = sqlite::open_copy(path).await?;
+        let needs = retention::needs(&mut Conn::Sqlite(&mut copy)).await;
+        sqlite::check_copy(copy).await?;
+        needs
     }
 
     async fn close(&self) {
@@ -326,7 +325,7 @@ impl Records for SqliteRecords {
     }
 }
 
-pub(super) async fn lineage(conn: &mut SqliteConnection, root: Digest) -> Result<Vec<LineageNode>> {
+pub(super) async fn lineage(conn: &mut Conn<'_>, root: Digest) -> Result<Vec<LineageNode>> {
     let mut nodes: Vec<LineageNode> = Vec::new();
     let mut next = vec![root];
     let mut depth = 0;
@@ -337,11 +336,10 @@ pub(super) async fn lineage(conn: &mut SqliteConnection, root: Digest) -> Result
                 continue;
             }
             let name = digest_.to_string();
-            let row =
-                sqlx::query("SELECT * FROM artifacts WHERE digest = ?").bind(&name).fetch_optional(&mut *conn).await?;
-            let edges = sqlx::query("SELECT parent, role FROM edges WHERE child = ? ORDER BY role").bind(&name);
+            let row = query("SELECT * FROM artifacts WHERE digest = ?").bind(&name).fetch_optional(conn).await?;
+            let edges = query("SELECT parent, role FROM edges WHERE child = ? ORDER BY role").bind(&name);
             let mut inputs = BTreeMap::new();
-            for edge in edges.fetch_all(&mut *conn).await? {
+            for edge in edges.fetch_all(conn).await? {
                 inputs.insert(edge.try_get::<String, _>("role")?, digest(&edge, "parent")?);
             }
             after.extend(inputs.values().copied());

@@ -4,12 +4,11 @@ use std::collections::{BTreeMap, BTreeSet, HashMap};
 
 use protocol::stage::Keep;
 use protocol::{Digest, TaskId};
-use sqlx::{Row, SqliteConnection};
 
 use super::apply::proven;
 use super::error::write_error;
 use super::rows::{checkpoints, digest, digests};
-use super::statement::{int, json, run};
+use super::statement::{Conn, int, json, query, run};
 use crate::catalog::{Needs, Root};
 use crate::proofs::Proofs;
 use crate::{QueryError, WriteError, clock};
@@ -17,7 +16,7 @@ use crate::{QueryError, WriteError, clock};
 /// Deletes a task's checkpoints that `keep` does not select, under way or `at_end`. Refuses a metric that none of them has
 /// and deletes nothing.
 pub(super) async fn prune(
-    conn: &mut SqliteConnection,
+    conn: &mut Conn<'_>,
     task: &TaskId,
     keep: &Keep,
     at_end: bool,
@@ -32,7 +31,7 @@ pub(super) async fn prune(
     let kept = if at_end { keep.kept_at_end(&metrics) } else { keep.kept(&metrics) };
     let mut forgotten = Vec::new();
     for (row, _) in rows.iter().zip(kept).filter(|(_, kept)| !kept) {
-        let forget = sqlx::query("DELETE FROM checkpoints WHERE task = ? AND step = ? AND manifest = ?");
+        let forget = query("DELETE FROM checkpoints WHERE task = ? AND step = ? AND manifest = ?");
         run(conn, forget.bind(task.as_str()).bind(int(row.step)).bind(row.manifest.to_string())).await?;
         forgotten.push(row.manifest);
     }
@@ -41,100 +40,95 @@ pub(super) async fn prune(
 
 /// Sets or removes a pin.
 pub(super) async fn pin(
-    conn: &mut SqliteConnection,
+    conn: &mut Conn<'_>,
     proofs: &Proofs,
     digest: Digest,
     reason: Option<&str>,
 ) -> Result<(), WriteError> {
     let name = digest.to_string();
     let Some(reason) = reason else {
-        return run(conn, sqlx::query("DELETE FROM pins WHERE digest = ?").bind(name)).await.map(|_| ());
+        return run(conn, query("DELETE FROM pins WHERE digest = ?").bind(name)).await.map(|_| ());
     };
     proven(conn, proofs, digest).await?;
-    let set =
-        "INSERT INTO pins (digest, reason, at_ms) VALUES (?, ?, ?) ON CONFLICT DO UPDATE SET reason = excluded.reason";
-    run(conn, sqlx::query(set).bind(name).bind(reason).bind(clock::now_ms())).await.map(|_| ())
+    let set = "INSERT INTO pins (digest, reason, at_ms) VALUES (?, ?, ?) ON CONFLICT (digest) DO UPDATE SET reason = excluded.reason";
+    run(conn, query(set).bind(name).bind(reason).bind(clock::now_ms())).await.map(|_| ())
 }
 
 /// Reads the blobs of held tasks.
-pub(crate) async fn held(conn: &mut SqliteConnection) -> Result<BTreeMap<TaskId, BTreeSet<Digest>>, QueryError> {
+pub(crate) async fn held(conn: &mut Conn<'_>) -> Result<BTreeMap<TaskId, BTreeSet<Digest>>, QueryError> {
     let mut held: BTreeMap<TaskId, BTreeSet<Digest>> = BTreeMap::new();
-    for row in sqlx::query("SELECT task, digest FROM held_blobs").fetch_all(&mut *conn).await? {
+    for row in query("SELECT task, digest FROM held_blobs").fetch_all(&mut *conn).await? {
         held.entry(TaskId::new(row.try_get::<String, _>(0)?)).or_default().insert(digest(&row, "digest")?);
     }
     Ok(held)
 }
 
 /// Records that a held task stores a blob.
-pub(super) async fn hold(conn: &mut SqliteConnection, task: &TaskId, digest: Digest) -> Result<(), WriteError> {
-    let hold = "INSERT OR IGNORE INTO held_blobs (task, digest) VALUES (?, ?)";
-    run(conn, sqlx::query(hold).bind(task.as_str()).bind(digest.to_string())).await.map(|_| ())
+pub(super) async fn hold(conn: &mut Conn<'_>, task: &TaskId, digest: Digest) -> Result<(), WriteError> {
+    let hold = "INSERT INTO held_blobs (task, digest) VALUES (?, ?) ON CONFLICT DO NOTHING";
+    run(conn, query(hold).bind(task.as_str()).bind(digest.to_string())).await.map(|_| ())
 }
 
 /// Deletes the records of tasks that are no longer held.
-pub(super) async fn let_go(conn: &mut SqliteConnection, tasks: &[TaskId]) -> Result<(), WriteError> {
-    let let_go = "DELETE FROM held_blobs WHERE task IN (SELECT value FROM json_each(?))";
-    run(conn, sqlx::query(let_go).bind(json(&tasks))).await.map(|_| ())
+pub(super) async fn let_go(conn: &mut Conn<'_>, tasks: &[TaskId]) -> Result<(), WriteError> {
+    let let_go = "DELETE FROM held_blobs WHERE task IN {texts ?}";
+    run(conn, query(let_go).bind(json(&tasks))).await.map(|_| ())
 }
 
 /// Deletes the records of blobs that no row has named since the collection began, and returns these blobs.
-pub(super) async fn condemn(
-    conn: &mut SqliteConnection,
-    proofs: &Proofs,
-    blobs: &[Digest],
-) -> Result<Vec<Digest>, WriteError> {
+pub(super) async fn condemn(conn: &mut Conn<'_>, proofs: &Proofs, blobs: &[Digest]) -> Result<Vec<Digest>, WriteError> {
     let taken = proofs.condemn(blobs);
-    let forget = "DELETE FROM blobs WHERE digest IN (SELECT value FROM json_each(?))";
-    run(conn, sqlx::query(forget).bind(json(&taken))).await?;
+    let forget = "DELETE FROM blobs WHERE digest IN {texts ?}";
+    run(conn, query(forget).bind(json(&taken))).await?;
     Ok(taken)
 }
 
 /// Deletes the shards of finished runs, which the stage's artifact replaces. Returns their tasks.
-pub(super) async fn forget_shards(conn: &mut SqliteConnection) -> Result<Vec<TaskId>, WriteError> {
+pub(super) async fn forget_shards(conn: &mut Conn<'_>) -> Result<Vec<TaskId>, WriteError> {
     let forget = "DELETE FROM shards WHERE run IN (SELECT run FROM runs WHERE state = 'finished') RETURNING task";
-    let rows = sqlx::query(forget).fetch_all(conn).await.map_err(write_error)?;
+    let rows = query(forget).fetch_all(conn).await.map_err(write_error)?;
     let mut tasks: Vec<_> = rows.iter().map(|row| TaskId::new(row.get::<String, _>(0))).collect();
     tasks.sort();
     Ok(tasks)
 }
 
 /// Returns the blobs that rows need.
-pub(super) async fn needs(conn: &mut SqliteConnection) -> Result<Needs, QueryError> {
+pub(super) async fn needs(conn: &mut Conn<'_>) -> Result<Needs, QueryError> {
     let done = "SELECT task FROM shards WHERE run IN (SELECT run FROM runs WHERE state = 'finished') ORDER BY task";
-    let done = sqlx::query(done).fetch_all(&mut *conn).await?;
+    let done = query(done).fetch_all(&mut *conn).await?;
     let done_shards = done.iter().map(|row| row.try_get::<String, _>(0).map(TaskId::new)).collect::<Result<_, _>>()?;
     let mut parents: HashMap<Digest, Vec<Digest>> = HashMap::new();
-    for row in sqlx::query("SELECT parent, child FROM edges").fetch_all(&mut *conn).await? {
+    for row in query("SELECT parent, child FROM edges").fetch_all(&mut *conn).await? {
         parents.entry(digest(&row, "child")?).or_default().push(digest(&row, "parent")?);
     }
     let live = "SELECT EXISTS (SELECT 1 FROM runs WHERE state IN ('running', 'paused'))";
-    let live = sqlx::query(live).fetch_one(&mut *conn).await?.try_get(0)?;
+    let live = query(live).fetch_one(&mut *conn).await?.try_get(0)?;
     Ok(Needs { roots: roots(conn).await?, parents, done_shards, live })
 }
 
 /// Lists every digest that a row names and that must be whole, with a description of the row.
-async fn roots(conn: &mut SqliteConnection) -> Result<Vec<Root>, QueryError> {
+async fn roots(conn: &mut Conn<'_>) -> Result<Vec<Root>, QueryError> {
     let mut roots = Vec::new();
     let mut add = |digest: Digest, what: String, shard: Option<TaskId>| roots.push(Root { digest, what, shard });
-    for row in sqlx::query("SELECT model, version, artifact FROM versions").fetch_all(&mut *conn).await? {
+    for row in query("SELECT model, version, artifact FROM versions").fetch_all(&mut *conn).await? {
         let (model, version): (String, i64) = (row.try_get(0)?, row.try_get(1)?);
         add(digest(&row, "artifact")?, format!("version {model}:{version}"), None);
     }
-    for row in sqlx::query("SELECT key, run, stage, outputs FROM stage_results").fetch_all(&mut *conn).await? {
+    for row in query("SELECT key, run, stage, outputs FROM stage_results").fetch_all(&mut *conn).await? {
         let (run, stage): (String, String) = (row.try_get("run")?, row.try_get("stage")?);
         for (name, digest) in digests(row.try_get("outputs")?)? {
             add(digest, format!("output `{name}` of `{run}/{stage}`"), None);
         }
     }
-    for row in sqlx::query("SELECT task, step, manifest FROM checkpoints").fetch_all(&mut *conn).await? {
+    for row in query("SELECT task, step, manifest FROM checkpoints").fetch_all(&mut *conn).await? {
         let (task, step): (String, i64) = (row.try_get(0)?, row.try_get(1)?);
         add(digest(&row, "manifest")?, format!("checkpoint of `{task}` at step {step}"), None);
     }
-    for row in sqlx::query("SELECT task, output FROM shards").fetch_all(&mut *conn).await? {
+    for row in query("SELECT task, output FROM shards").fetch_all(&mut *conn).await? {
         let task: String = row.try_get(0)?;
         add(digest(&row, "output")?, format!("shard `{task}`"), Some(TaskId::new(task)));
     }
-    for row in sqlx::query("SELECT digest, reason FROM pins").fetch_all(&mut *conn).await? {
+    for row in query("SELECT digest, reason FROM pins").fetch_all(&mut *conn).await? {
         let reason: String = row.try_get(1)?;
         add(digest(&row, "digest")?, format!("pin ({reason})"), None);
     }

@@ -1,22 +1,23 @@
-//! Opening of a database: for writing after migrating and checking it, or for reading.
+//! SQLite: opening the file in a store's folder, for writing after migrating and checking it, or for reading.
 
 use std::cmp::Ordering;
 use std::path::Path;
 use std::time::Duration;
 
-use sqlx::migrate::{MigrateError, Migrator};
+use sqlx::migrate::MigrateError;
 use sqlx::sqlite::{SqliteConnectOptions, SqliteJournalMode, SqlitePoolOptions, SqliteSynchronous};
-use sqlx::{Connection, Row, SqliteConnection, SqlitePool};
+use sqlx::{Connection, Row, SqliteConnection};
 
 use super::error::open_error;
-use super::statement::int;
-use crate::clock;
+use super::migrations::{self, OF_SQLITE};
+use super::open::{self, Link, Opened};
+use super::pool::Pool;
+use super::statement::{Conn, int};
+use crate::QueryError;
 use crate::folder::{self, DATABASE};
 use crate::identity::{StoreParts, Verdict};
 use crate::open_error::OpenError;
 use crate::store_id::{StoreId, Stored};
-
-pub(crate) static MIGRATOR: Migrator = sqlx::migrate!("../migrations");
 
 fn options(dir: &Path) -> SqliteConnectOptions {
     SqliteConnectOptions::new()
@@ -26,15 +27,6 @@ fn options(dir: &Path) -> SqliteConnectOptions {
         .foreign_keys(true)
         .busy_timeout(Duration::from_secs(10))
         .statement_cache_capacity(200)
-}
-
-/// A database opened for writing.
-#[derive(Debug)]
-pub(crate) struct Opened {
-    pub(crate) conn: SqliteConnection,
-    pub(crate) store: StoreId,
-    /// Result of the identity check.
-    pub(crate) verdict: Verdict,
 }
 
 /// Opens the writing connection and migrates the schema, after checking that the database belongs to the parts `found`
@@ -49,7 +41,7 @@ pub(crate) async fn open_writer(dir: &Path, found: &StoreParts, adopt: bool) -> 
     let mut conn = SqliteConnection::connect_with(&options(dir).create_if_missing(!existed))
         .await
         .map_err(|e| open_error(&path, &e))?;
-    let verdict = match belongs(dir, found, adopt, existed, &mut conn).await {
+    let verdict = match open::belongs(&path, found, adopt, existed, &mut Conn::Sqlite(&mut conn)).await {
         Ok(verdict) => verdict,
         Err(refused) => {
             // Removes the empty log that opening has created. The refusal matters more than an error of closing.
@@ -61,7 +53,7 @@ pub(crate) async fn open_writer(dir: &Path, found: &StoreParts, adopt: bool) -> 
         back_up_before_migrating(dir, &mut conn).await?;
     }
     // Not `run`: its future is not `Send`.
-    MIGRATOR.run_direct(None, &mut conn, false).await.map_err(|e| match e {
+    OF_SQLITE.run_direct(None, &mut conn, false).await.map_err(|e| match e {
         MigrateError::VersionMissing(found) => OpenError::NewerSchema { path: path.clone(), found, known: newest() },
         MigrateError::Execute(e) | MigrateError::ExecuteMigration(e, _) => open_error(&path, &e),
         e => OpenError::Damaged { path: path.clone(), message: e.to_string() },
@@ -74,61 +66,9 @@ pub(crate) async fn open_writer(dir: &Path, found: &StoreParts, adopt: bool) -> 
             forget.map_err(|e| open_error(&path, &e))?;
             store.clone()
         }
-        Verdict::New => name(&path, &mut conn).await?,
+        Verdict::New => open::name(&path, &mut Conn::Sqlite(&mut conn)).await?,
     };
-    Ok(Opened { conn, store, verdict })
-}
-
-/// Checks that an open database belongs to the parts `found` beside it.
-async fn belongs(
-    dir: &Path,
-    found: &StoreParts,
-    adopt: bool,
-    existed: bool,
-    conn: &mut SqliteConnection,
-) -> Result<Verdict, OpenError> {
-    if !existed {
-        return Ok(Verdict::New);
-    }
-    let failed = |e: &sqlx::Error| open_error(&folder::database(dir), e);
-    let stored = stored(conn).await.map_err(|e| failed(&e))?;
-    match (found.classify(stored.as_ref()), stored) {
-        (Ok(verdict), _) => Ok(verdict),
-        (Err(why), Some(stored)) if adopt && why.may_be_adopted() => {
-            let reach = sqlx::query("UPDATE store SET commits = max(commits, ?), epoch = max(epoch, ?)");
-            let reach = reach.bind(int(found.witnessed())).bind(int(found.marked_epoch()));
-            reach.execute(conn).await.map_err(|e| failed(&e))?;
-            Ok(Verdict::Unfinished(stored.id))
-        }
-        (Err(mismatch), _) => Err(OpenError::Mismatch { dir: dir.to_owned(), mismatch }),
-    }
-}
-
-/// Reads the identity row of a database; `None` if it belongs to no store.
-pub(super) async fn stored(conn: &mut SqliteConnection) -> Result<Option<Stored>, sqlx::Error> {
-    let has_table = sqlx::query("SELECT count(*) FROM sqlite_master WHERE type = 'table' AND name = 'store'");
-    let has_table: i64 = has_table.fetch_one(&mut *conn).await?.try_get(0)?;
-    if has_table == 0 {
-        return Ok(None);
-    }
-    let row = sqlx::query("SELECT id, epoch, commits FROM store").fetch_optional(&mut *conn).await?;
-    row.map(|row| {
-        let id: String = row.try_get(0)?;
-        let id = id.parse().map_err(|e: String| sqlx::Error::ColumnDecode { index: "id".into(), source: e.into() })?;
-        let (epoch, commits): (i64, i64) = (row.try_get(1)?, row.try_get(2)?);
-        Ok(Stored { id, epoch: epoch.unsigned_abs(), commits: commits.unsigned_abs() })
-    })
-    .transpose()
-}
-
-/// Names a new database as a new store.
-async fn name(path: &Path, conn: &mut SqliteConnection) -> Result<StoreId, OpenError> {
-    let io = |e: std::io::Error| OpenError::Other { path: path.to_owned(), message: e.to_string() };
-    let id = StoreId::random().map_err(io)?;
-    let row = sqlx::query("INSERT INTO store (one, id, epoch, commits, at_ms) VALUES (1, ?, 0, 0, ?)");
-    let row = row.bind(id.as_str()).bind(clock::now_ms());
-    row.execute(conn).await.map_err(|e| open_error(path, &e))?;
-    Ok(id)
+    Ok(Opened { link: Link::Sqlite(conn), store, verdict })
 }
 
 /// Raises the database's epoch. From then on a process that opened it earlier cannot write to it.
@@ -136,7 +76,7 @@ pub(crate) async fn raise_epoch(dir: &Path, conn: &mut SqliteConnection) -> Resu
     let failed = |e: &sqlx::Error| open_error(&folder::database(dir), e);
     let raise = "UPDATE store SET epoch = epoch + 1, commits = commits + 1";
     sqlx::query(raise).execute(&mut *conn).await.map_err(|e| failed(&e))?;
-    let stored = stored(conn).await.map_err(|e| failed(&e))?;
+    let stored = open::stored(&mut Conn::Sqlite(conn)).await.map_err(|e| failed(&e))?;
     stored
         .ok_or_else(|| OpenError::Damaged { path: folder::database(dir), message: "the store's row is missing".into() })
 }
@@ -154,8 +94,8 @@ pub(crate) async fn reach_epoch(dir: &Path, epoch: u64) -> Result<(), sqlx::Erro
 
 /// Makes a pool of read-only connections that connect on first use. With `closed` the database has no writer and no log
 /// while they are open.
-pub(crate) fn open_readers(dir: &Path, closed: bool) -> SqlitePool {
-    SqlitePoolOptions::new().max_connections(4).connect_lazy_with(reading(dir, closed))
+pub(crate) fn open_readers(dir: &Path, closed: bool) -> Pool {
+    Pool::Sqlite(SqlitePoolOptions::new().max_connections(4).connect_lazy_with(reading(dir, closed)))
 }
 
 /// Opens a copy of a database that has no writer.
@@ -183,7 +123,7 @@ pub(crate) async fn check_to_read(dir: &Path, found: &StoreParts, closed: bool) 
         return Err(OpenError::NotAStore(dir.to_owned()));
     }
     let mut conn = SqliteConnection::connect_with(&reading(dir, closed)).await.map_err(|e| failed(&e))?;
-    let Some(stored) = stored(&mut conn).await.map_err(|e| failed(&e))? else {
+    let Some(stored) = open::stored(&mut Conn::Sqlite(&mut conn)).await.map_err(|e| failed(&e))? else {
         found.classify(None).map_err(mismatch)?;
         return Err(OpenError::NotAStore(dir.to_owned()));
     };
@@ -198,8 +138,52 @@ pub(crate) async fn check_to_read(dir: &Path, found: &StoreParts, closed: bool) 
     }
 }
 
+/// Describes the inconsistencies that SQLite finds in the file. Reads all of it.
+pub(super) async fn problems(conn: &mut SqliteConnection) -> Result<Vec<String>, QueryError> {
+    let mut problems = Vec::new();
+    for row in sqlx::query("PRAGMA integrity_check").fetch_all(&mut *conn).await? {
+        let line: String = row.try_get(0)?;
+        if line != "ok" {
+            problems.push(format!("database: {line}"));
+        }
+    }
+    for row in sqlx::query("PRAGMA foreign_key_check").fetch_all(&mut *conn).await? {
+        problems.push(format!("database: a row of `{}` has a dangling reference", row.try_get::<String, _>(0)?));
+    }
+    Ok(problems)
+}
+
+/// Copies the database to a new file as of one moment.
+pub(super) async fn copy(conn: &mut SqliteConnection, path: &Path) -> Result<(), QueryError> {
+    sqlx::query("VACUUM INTO ?").bind(path.to_string_lossy().into_owned()).execute(conn).await?;
+    Ok(())
+}
+
+/// Checks a copy as a whole and closes it.
+pub(super) async fn check_copy(mut copy: SqliteConnection) -> Result<(), QueryError> {
+    let checked: String = sqlx::query("PRAGMA integrity_check").fetch_one(&mut copy).await?.try_get(0)?;
+    copy.close().await?;
+    match checked.as_str() {
+        "ok" => Ok(()),
+        problem => Err(QueryError::Blob(format!("the database is damaged: {problem}"))),
+    }
+}
+
+/// Makes an empty database of the newest schema in a new file, for a copy.
+pub(super) async fn make_copy(path: &Path) -> Result<SqliteConnection, QueryError> {
+    if path.exists() {
+        return Err(QueryError::Storage(format!("`{}` exists already", path.display())));
+    }
+    let options = SqliteConnectOptions::new().filename(path).create_if_missing(true).foreign_keys(false);
+    let options = options.journal_mode(SqliteJournalMode::Delete).synchronous(SqliteSynchronous::Full);
+    let mut conn = SqliteConnection::connect_with(&options).await?;
+    let migrated = OF_SQLITE.run_direct(None, &mut conn, false).await;
+    migrated.map_err(|e| QueryError::Database(e.to_string()))?;
+    Ok(conn)
+}
+
 fn newest() -> i64 {
-    MIGRATOR.iter().map(|m| m.version).max().unwrap_or(0)
+    migrations::newest(&OF_SQLITE)
 }
 
 /// Copies the database to a file beside it before a migration.
@@ -229,11 +213,20 @@ async fn back_up_before_migrating(dir: &Path, conn: &mut SqliteConnection) -> Re
 #[cfg(test)]
 #[allow(clippy::unwrap_used, reason = "a test may panic")]
 mod tests {
+    use sqlx::migrate::Migrator;
+
     use super::*;
+
+    fn sqlite_of(link: Link) -> SqliteConnection {
+        match link {
+            Link::Sqlite(conn) => conn,
+            Link::Postgres(_) => panic!("a file"),
+        }
+    }
 
     async fn opened(dir: &Path) -> SqliteConnection {
         let found = StoreParts::read(dir, &crate::blob::fs::Folder::to_read(dir)).unwrap();
-        open_writer(dir, &found, false).await.unwrap().conn
+        sqlite_of(open_writer(dir, &found, false).await.unwrap().link)
     }
 
     /// A commit that SQLite does not sync is lost in a power loss although it was acknowledged.
@@ -256,7 +249,7 @@ mod tests {
     async fn every_old_schema_becomes_the_newest_with_a_copy_kept_before() {
         let fresh = tempfile::tempdir().unwrap();
         let newest_schema = schema(&mut opened(fresh.path()).await).await;
-        let all: Vec<_> = MIGRATOR.iter().cloned().collect();
+        let all: Vec<_> = OF_SQLITE.iter().cloned().collect();
         for count in 1..all.len() {
             let dir = tempfile::tempdir().unwrap();
             let mut conn = SqliteConnection::connect_with(&options(dir.path()).create_if_missing(true)).await.unwrap();
@@ -273,7 +266,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let mut conn = opened(dir.path()).await;
         let before = schema(&mut conn).await;
-        for migration in MIGRATOR.iter() {
+        for migration in OF_SQLITE.iter() {
             sqlx::raw_sql(migration.sql.clone()).execute(&mut conn).await.unwrap();
         }
         assert_eq!(schema(&mut conn).await, before);

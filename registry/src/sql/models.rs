@@ -4,9 +4,8 @@ use std::collections::BTreeMap;
 
 use protocol::stage::Mode;
 use protocol::{Alias, Digest, ModelName};
-use sqlx::sqlite::SqliteRow;
-use sqlx::{Row, SqliteConnection};
 
+use super::statement::{Conn, Row, query};
 use crate::versions::{self, Action, Model, Promotion, Version};
 
 /// Parses stored metrics; null becomes NaN.
@@ -15,16 +14,16 @@ pub(super) fn numbers(text: &str) -> BTreeMap<String, f64> {
     stored.into_iter().map(|(key, value)| (key, value.unwrap_or(f64::NAN))).collect()
 }
 
-pub(super) fn digest(row: &SqliteRow, column: &str) -> Result<Digest, sqlx::Error> {
+pub(super) fn digest(row: &Row, column: &str) -> Result<Digest, sqlx::Error> {
     let text: String = row.try_get(column)?;
     text.parse().map_err(|e| sqlx::Error::ColumnDecode { index: column.to_owned(), source: Box::new(e) })
 }
 
-fn number(row: &SqliteRow, column: &str) -> Result<u64, sqlx::Error> {
+fn number(row: &Row, column: &str) -> Result<u64, sqlx::Error> {
     Ok(row.try_get::<i64, _>(column)?.unsigned_abs())
 }
 
-fn version(row: &SqliteRow) -> Result<Version, sqlx::Error> {
+fn version(row: &Row) -> Result<Version, sqlx::Error> {
     let aliases: Option<String> = row.try_get("aliases")?;
     Ok(Version {
         model: ModelName::new(row.try_get::<String, _>("model")?),
@@ -37,21 +36,21 @@ fn version(row: &SqliteRow) -> Result<Version, sqlx::Error> {
     })
 }
 
-const VERSIONS: &str = "SELECT v.*, (SELECT group_concat(alias, ',') FROM (SELECT alias FROM aliases a \
-    WHERE a.model = v.model AND a.version = v.version ORDER BY alias)) AS aliases \
+const VERSIONS: &str = "SELECT v.*, (SELECT string_agg(alias, ',') FROM (SELECT alias FROM aliases a \
+    WHERE a.model = v.model AND a.version = v.version ORDER BY alias) AS named) AS aliases \
     FROM versions v WHERE v.model = ? ORDER BY v.version";
 
 /// Returns all versions of a model, oldest first.
-pub(super) async fn versions(conn: &mut SqliteConnection, model: &ModelName) -> Result<Vec<Version>, sqlx::Error> {
-    let rows = sqlx::query(VERSIONS).bind(model.as_str()).fetch_all(&mut *conn).await?;
+pub(super) async fn versions(conn: &mut Conn<'_>, model: &ModelName) -> Result<Vec<Version>, sqlx::Error> {
+    let rows = query(VERSIONS).bind(model.as_str()).fetch_all(&mut *conn).await?;
     rows.iter().map(version).collect()
 }
 
 async fn declared(
-    conn: &mut SqliteConnection,
+    conn: &mut Conn<'_>,
     model: &ModelName,
 ) -> Result<Option<(Option<String>, Option<Mode>)>, sqlx::Error> {
-    let row = sqlx::query("SELECT metric, mode FROM models WHERE model = ?")
+    let row = query("SELECT metric, mode FROM models WHERE model = ?")
         .bind(model.as_str())
         .fetch_optional(&mut *conn)
         .await?;
@@ -61,15 +60,15 @@ async fn declared(
 }
 
 /// Returns one model.
-pub(super) async fn model(conn: &mut SqliteConnection, name: &ModelName) -> Result<Option<Model>, sqlx::Error> {
+pub(super) async fn model(conn: &mut Conn<'_>, name: &ModelName) -> Result<Option<Model>, sqlx::Error> {
     let Some((metric, mode)) = declared(conn, name).await? else { return Ok(None) };
     let versions = versions(conn, name).await?;
     Ok(Some(versions::summary(name.clone(), metric, mode, &versions)))
 }
 
 /// Returns all models by name.
-pub(super) async fn models(conn: &mut SqliteConnection) -> Result<Vec<Model>, sqlx::Error> {
-    let rows = sqlx::query("SELECT model FROM models ORDER BY model").fetch_all(&mut *conn).await?;
+pub(super) async fn models(conn: &mut Conn<'_>) -> Result<Vec<Model>, sqlx::Error> {
+    let rows = query("SELECT model FROM models ORDER BY model").fetch_all(&mut *conn).await?;
     let mut models = Vec::with_capacity(rows.len());
     for row in rows {
         models.extend(model(conn, &ModelName::new(row.try_get::<String, _>(0)?)).await?);
@@ -79,13 +78,13 @@ pub(super) async fn models(conn: &mut SqliteConnection) -> Result<Vec<Model>, sq
 
 /// Returns the moves of a model's aliases, or of one alias, oldest first.
 pub(super) async fn history(
-    conn: &mut SqliteConnection,
+    conn: &mut Conn<'_>,
     model: &ModelName,
     alias: Option<&Alias>,
 ) -> Result<Vec<Promotion>, sqlx::Error> {
-    let find = sqlx::query("SELECT * FROM promotions WHERE model = ?1 AND (?2 IS NULL OR alias = ?2) ORDER BY id");
+    let find = query("SELECT * FROM promotions WHERE model = ?1 AND (?2 IS NULL OR alias = ?2) ORDER BY id");
     let rows = find.bind(model.as_str()).bind(alias.map(Alias::as_str)).fetch_all(&mut *conn).await?;
-    let entry = |row: &SqliteRow| -> Result<Promotion, sqlx::Error> {
+    let entry = |row: &Row| -> Result<Promotion, sqlx::Error> {
         Ok(Promotion {
             id: row.try_get("id")?,
             at_ms: row.try_get("at_ms")?,

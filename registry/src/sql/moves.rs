@@ -4,10 +4,9 @@ use std::collections::BTreeMap;
 
 use protocol::{Alias, ArtifactKind, Digest, ModelName};
 use serde_json::Value;
-use sqlx::{Row, SqliteConnection};
 
 use super::error::write_error;
-use super::statement::{int, json, one, run};
+use super::statement::{Conn, int, json, one, query, run};
 use super::{history, models};
 use crate::catalog::{PromoteOrder, RollbackOrder, Which};
 use crate::history::{HistoryEntry, HistoryKind};
@@ -16,7 +15,7 @@ use crate::{QueryError, WriteError, clock};
 
 /// Registers an artifact, or adds metrics to its existing version. Returns the version's number.
 pub(super) async fn register(
-    conn: &mut SqliteConnection,
+    conn: &mut Conn<'_>,
     model: &ModelName,
     artifact: Digest,
     kind: ArtifactKind,
@@ -30,7 +29,7 @@ pub(super) async fn register(
         )));
     }
     let now = clock::now_ms();
-    let add = sqlx::query("INSERT INTO models (model, at_ms) VALUES (?, ?) ON CONFLICT DO NOTHING");
+    let add = query("INSERT INTO models (model, at_ms) VALUES (?, ?) ON CONFLICT DO NOTHING");
     run(conn, add.bind(model.as_str()).bind(now)).await?;
     declare(conn, model, source).await?;
 
@@ -38,12 +37,12 @@ pub(super) async fn register(
     if let Some(version) = versions.into_iter().find(|version| version.artifact == artifact) {
         let mut all = version.metrics;
         all.extend(metrics.clone());
-        let set = sqlx::query("UPDATE versions SET metrics = ? WHERE model = ? AND version = ?");
+        let set = query("UPDATE versions SET metrics = ? WHERE model = ? AND version = ?");
         run(conn, set.bind(json(&all)).bind(model.as_str()).bind(int(version.version))).await?;
         return Ok(version.version);
     }
     // The single writer makes the next number safe; the primary key refuses a duplicate as well.
-    let add = sqlx::query(
+    let add = query(
         "INSERT INTO versions (model, version, artifact, metrics, source, at_ms) \
          SELECT ?1, coalesce(max(version), 0) + 1, ?2, ?3, ?4, ?5 FROM versions WHERE model = ?1 RETURNING version",
     );
@@ -54,7 +53,7 @@ pub(super) async fn register(
 }
 
 /// Stores the metric that ranks `@best`, from `source.metric` and `source.mode` of the newest registration.
-async fn declare(conn: &mut SqliteConnection, model: &ModelName, source: &Value) -> Result<(), WriteError> {
+async fn declare(conn: &mut Conn<'_>, model: &ModelName, source: &Value) -> Result<(), WriteError> {
     let (Some(metric), mode) = (source["metric"].as_str(), source["mode"].as_str().unwrap_or("min")) else {
         return Ok(());
     };
@@ -63,12 +62,12 @@ async fn declare(conn: &mut SqliteConnection, model: &ModelName, source: &Value)
             "the direction of metric `{metric}` is `{mode}`; expected `min` or `max`"
         )));
     }
-    let set = sqlx::query("UPDATE models SET metric = ?, mode = ? WHERE model = ?");
+    let set = query("UPDATE models SET metric = ?, mode = ? WHERE model = ?");
     run(conn, set.bind(metric).bind(mode).bind(model.as_str())).await.map(|_| ())
 }
 
 /// Returns the version that a reference names.
-async fn resolve(conn: &mut SqliteConnection, model: &ModelName, pick: Pick) -> Result<Version, QueryError> {
+async fn resolve(conn: &mut Conn<'_>, model: &ModelName, pick: Pick) -> Result<Version, QueryError> {
     let reference = ModelRef { model: model.clone(), pick: Some(pick) };
     match models::model(conn, model).await? {
         None => Err(versions::unknown(model, &models::models(conn).await?)),
@@ -77,7 +76,7 @@ async fn resolve(conn: &mut SqliteConnection, model: &ModelName, pick: Pick) -> 
 }
 
 /// Moves an alias forward: compares, checks the gates, moves, logs. Changes nothing if the alias already points there.
-pub(super) async fn promote(conn: &mut SqliteConnection, order: &PromoteOrder) -> Result<Promotion, WriteError> {
+pub(super) async fn promote(conn: &mut Conn<'_>, order: &PromoteOrder) -> Result<Promotion, WriteError> {
     let PromoteOrder { model, alias, .. } = order;
     versions::refuse_reserved(alias)?;
     let candidate = match &order.to {
@@ -108,7 +107,7 @@ pub(super) async fn promote(conn: &mut SqliteConnection, order: &PromoteOrder) -
 
 /// Returns the metrics of the versions that gates compare with, by alias.
 async fn compared_with(
-    conn: &mut SqliteConnection,
+    conn: &mut Conn<'_>,
     order: &PromoteOrder,
     gates: &[Gate],
 ) -> Result<BTreeMap<Alias, BTreeMap<String, f64>>, WriteError> {
@@ -125,7 +124,7 @@ async fn compared_with(
 }
 
 /// Moves an alias back, to `to` or to its version before the last promotion.
-pub(super) async fn rollback(conn: &mut SqliteConnection, order: &RollbackOrder) -> Result<Promotion, WriteError> {
+pub(super) async fn rollback(conn: &mut Conn<'_>, order: &RollbackOrder) -> Result<Promotion, WriteError> {
     let RollbackOrder { model, alias, .. } = order;
     versions::refuse_reserved(alias)?;
     let Some(current) = pointed(conn, model, alias).await? else {
@@ -152,8 +151,8 @@ pub(super) async fn rollback(conn: &mut SqliteConnection, order: &RollbackOrder)
     set_alias(conn, moved, Vec::new(), &order.reason, &order.actor).await
 }
 
-async fn pointed(conn: &mut SqliteConnection, model: &ModelName, alias: &Alias) -> Result<Option<u64>, WriteError> {
-    let find = sqlx::query("SELECT version FROM aliases WHERE model = ? AND alias = ?");
+async fn pointed(conn: &mut Conn<'_>, model: &ModelName, alias: &Alias) -> Result<Option<u64>, WriteError> {
+    let find = query("SELECT version FROM aliases WHERE model = ? AND alias = ?");
     let row = one(conn, find.bind(model.as_str()).bind(alias.as_str())).await?;
     Ok(row.map(|row| row.get::<i64, _>(0).unsigned_abs()))
 }
@@ -168,7 +167,7 @@ struct Move<'a> {
 }
 
 async fn set_alias(
-    conn: &mut SqliteConnection,
+    conn: &mut Conn<'_>,
     moved: Move<'_>,
     gates: Vec<GateResult>,
     reason: &str,
@@ -176,7 +175,7 @@ async fn set_alias(
 ) -> Result<Promotion, WriteError> {
     let Move { model, alias, action, from, to } = moved;
     let at_ms = clock::now_ms();
-    let set = sqlx::query(
+    let set = query(
         "INSERT INTO aliases (model, alias, version, at_ms) VALUES (?, ?, ?, ?) \
          ON CONFLICT (model, alias) DO UPDATE SET version = excluded.version, at_ms = excluded.at_ms",
     );
@@ -185,7 +184,7 @@ async fn set_alias(
         Action::Promote => "promote",
         Action::Rollback => "rollback",
     };
-    let log = sqlx::query(
+    let log = query(
         "INSERT INTO promotions (at_ms, model, alias, action, from_version, to_version, actor, reason, gates) \
          VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?) RETURNING id",
     );

@@ -9,12 +9,10 @@ use std::sync::Arc;
 
 use protocol::message::Grant;
 use protocol::{Digest, Fence, TaskId};
-use sqlx::query_builder::Separated;
-use sqlx::{QueryBuilder, Row, Sqlite, SqliteConnection};
 
 use super::error::write_error;
 use super::recording::Recording;
-use super::statement::{ROWS, insert, int, json, one, run, run_and_stage};
+use super::statement::{Builder, Column, Conn, ROWS, Values, insert, int, json, one, query, run, run_and_stage};
 use super::{history, logs, moves, owners};
 use crate::catalog::{PromoteOrder, Which};
 use crate::proofs::{Artifact, Proofs};
@@ -25,7 +23,7 @@ type Result<T> = std::result::Result<T, WriteError>;
 
 /// Does all of `writes`, or says why one of them is refused; then the caller rolls back.
 pub(super) async fn apply(
-    conn: &mut SqliteConnection,
+    conn: &mut Conn<'_>,
     proofs: &Proofs,
     recording: &mut Recording,
     writes: &[Write],
@@ -47,17 +45,17 @@ pub(super) async fn apply(
                 set_run(conn, run.as_str(), &pipeline.to_string(), source, state, idempotency_key.as_deref()).await?;
             }
             Write::Submission { run: of, digest } => {
-                let set = sqlx::query("INSERT OR IGNORE INTO submissions (run, digest) VALUES (?, ?)");
+                let set = query("INSERT INTO submissions (run, digest) VALUES (?, ?) ON CONFLICT DO NOTHING");
                 run(conn, set.bind(of.as_str()).bind(digest.to_string())).await?;
             }
             Write::RunOwner { run, owner } => owners::own_run(conn, run, owner).await?,
             Write::ModelOwner { model, owner } => owners::claim(conn, model, owner).await?,
             Write::RunState { run: of, state } => {
-                let set = sqlx::query("UPDATE runs SET state = ?, updated_ms = ? WHERE run = ?");
+                let set = query("UPDATE runs SET state = ?, updated_ms = ? WHERE run = ?");
                 run(conn, set.bind(state).bind(now).bind(of.as_str())).await?;
             }
             Write::RunEnded { run: of, state, view, archive } => {
-                let set = sqlx::query("UPDATE runs SET state = ?, updated_ms = ?, view = ?, archive = ? WHERE run = ?");
+                let set = query("UPDATE runs SET state = ?, updated_ms = ?, view = ?, archive = ? WHERE run = ?");
                 let set = set.bind(state).bind(now).bind(view).bind(archive);
                 run(conn, set.bind(of.as_str())).await?;
             }
@@ -70,7 +68,7 @@ pub(super) async fn apply(
             Write::Checkpoint { grant, step, manifest, metrics } => {
                 proven(conn, proofs, *manifest).await?;
                 one_checkpoint_a_step(conn, &grant.task, *step, *manifest).await?;
-                let insert = sqlx::query(
+                let insert = query(
                     "INSERT INTO checkpoints (task, attempt, step, manifest, metrics, at_ms) VALUES (?, ?, ?, ?, ?, ?) \
                      ON CONFLICT DO NOTHING",
                 );
@@ -118,11 +116,11 @@ pub(super) async fn apply(
 }
 
 /// Checks that an artifact which a row is about to name is proven, and records its blobs as stored.
-pub(super) async fn proven(conn: &mut SqliteConnection, proofs: &Proofs, digest: Digest) -> Result<Arc<Artifact>> {
+pub(super) async fn proven(conn: &mut Conn<'_>, proofs: &Proofs, digest: Digest) -> Result<Arc<Artifact>> {
     let artifact = proofs.name(digest)?;
     let now = clock::now_ms();
     let rows: Vec<(&Digest, &u64)> = artifact.blobs.iter().collect();
-    let values = |row: &mut Separated<'_, Sqlite, &'static str>, (digest, bytes): &(&Digest, &u64)| {
+    let values = |row: &mut Values<'_, '_>, (digest, bytes): &(&Digest, &u64)| {
         row.push_bind(digest.to_string()).push_bind(int(**bytes)).push_bind(now);
     };
     insert(conn, "INSERT INTO blobs (digest, bytes, verified_ms) ", &rows, values, " ON CONFLICT DO NOTHING").await?;
@@ -131,18 +129,18 @@ pub(super) async fn proven(conn: &mut SqliteConnection, proofs: &Proofs, digest:
 
 /// Runs `select` for `tasks` and returns the values by task. `select` has two columns, the task first, and ends in an
 /// open list: `... WHERE task IN (`.
-async fn by_task<T>(conn: &mut SqliteConnection, select: &'static str, tasks: &[&TaskId]) -> Result<BTreeMap<TaskId, T>>
+async fn by_task<T>(conn: &mut Conn<'_>, select: &'static str, tasks: &[&TaskId]) -> Result<BTreeMap<TaskId, T>>
 where
-    T: for<'r> sqlx::Decode<'r, Sqlite> + sqlx::Type<Sqlite>,
+    T: for<'r> Column<'r>,
 {
     let mut found = BTreeMap::new();
     for tasks in tasks.chunks(ROWS) {
-        let mut query = QueryBuilder::<Sqlite>::new(select);
-        let mut list = query.separated(", ");
-        tasks.iter().for_each(|task| {
-            list.push_bind(task.as_str().to_owned());
-        });
-        let rows = query.push(")").build().persistent(false).fetch_all(&mut *conn).await.map_err(write_error)?;
+        let mut find = Builder::new(select);
+        for (place, task) in tasks.iter().enumerate() {
+            find.push(if place == 0 { "" } else { ", " }).push_bind(task.as_str());
+        }
+        find.push(")");
+        let rows = find.build().fetch_all(&mut *conn).await.map_err(write_error)?;
         found.extend(rows.iter().map(|row| (TaskId::from(row.get::<&str, _>(0)), row.get::<T, _>(1))));
     }
     Ok(found)
@@ -155,7 +153,7 @@ struct Fences {
 }
 
 impl Fences {
-    async fn read(conn: &mut SqliteConnection, writes: &[Write]) -> Result<Self> {
+    async fn read(conn: &mut Conn<'_>, writes: &[Write]) -> Result<Self> {
         let of = |write: &Write| match write {
             Write::Fence { task, .. } => Some(task.clone()),
             other => other.grant().map(|grant| grant.task.clone()),
@@ -190,71 +188,64 @@ impl Fences {
         Ok(())
     }
 
-    async fn write(self, conn: &mut SqliteConnection) -> Result<()> {
+    async fn write(self, conn: &mut Conn<'_>) -> Result<()> {
         let rows: Vec<(&TaskId, Fence)> = self.raised.iter().map(|task| (task, self.known[task])).collect();
         let begin = "INSERT INTO fences (task, fence) ";
         let end = " ON CONFLICT (task) DO UPDATE SET fence = excluded.fence";
-        let values = |row: &mut Separated<'_, Sqlite, &'static str>, (task, fence): &(&TaskId, Fence)| {
+        let values = |row: &mut Values<'_, '_>, (task, fence): &(&TaskId, Fence)| {
             row.push_bind(task.as_str().to_owned()).push_bind(int(fence.0));
         };
         insert(conn, begin, &rows, values, end).await
     }
 }
 
-async fn add_facts(conn: &mut SqliteConnection, decisions: &[(u64, &str)]) -> Result<()> {
+async fn add_facts(conn: &mut Conn<'_>, decisions: &[(u64, &str)]) -> Result<()> {
     let now = clock::now_ms();
     if let Some((first, _)) = decisions.first() {
-        let find =
-            "SELECT max(coalesce((SELECT max(seq) FROM facts), 0), coalesce((SELECT max(seq) FROM snapshots), 0))";
-        let newest: i64 = one(conn, sqlx::query(find)).await?.map_or(0, |row| row.get(0));
+        let find = "SELECT {greatest}(coalesce((SELECT max(seq) FROM facts), 0), coalesce((SELECT max(seq) FROM snapshots), 0))";
+        let newest: i64 = one(conn, query(find)).await?.map_or(0, |row| row.get(0));
         if newest >= int(*first) {
             return Err(WriteError::Internal(format!(
                 "decision {first} is already stored (the newest is {newest}); check if another coordinator uses the store"
             )));
         }
     }
-    let values = |row: &mut Separated<'_, Sqlite, &'static str>, (seq, facts): &(u64, &str)| {
+    let values = |row: &mut Values<'_, '_>, (seq, facts): &(u64, &str)| {
         row.push_bind(int(*seq)).push_bind(now).push_bind((*facts).to_owned());
     };
     insert(conn, "INSERT INTO facts (seq, at_ms, facts) ", decisions, values, "").await
 }
 
-async fn set_parts(conn: &mut SqliteConnection, seq: u64, parts: &[(String, Option<String>)]) -> Result<()> {
-    let values = |row: &mut Separated<'_, Sqlite, &'static str>, (part, state): &(String, Option<String>)| {
+async fn set_parts(conn: &mut Conn<'_>, seq: u64, parts: &[(String, Option<String>)]) -> Result<()> {
+    let values = |row: &mut Values<'_, '_>, (part, state): &(String, Option<String>)| {
         row.push_bind(part.clone()).push_bind(int(seq)).push_bind(state.clone());
     };
     let begin = "INSERT INTO snapshot_parts (part, seq, state) ";
-    insert(conn, begin, parts, values, " ON CONFLICT DO UPDATE SET state = excluded.state").await
+    insert(conn, begin, parts, values, " ON CONFLICT (part, seq) DO UPDATE SET state = excluded.state").await
 }
 
 /// Stores a snapshot. Deletes the facts it covers, the previous snapshot, and replaced parts.
-async fn set_snapshot(conn: &mut SqliteConnection, seq: u64, state: &str) -> Result<()> {
+async fn set_snapshot(conn: &mut Conn<'_>, seq: u64, state: &str) -> Result<()> {
     // Parts of a snapshot that was never completed.
     let given_up = "DELETE FROM snapshot_parts WHERE seq < ? AND seq > (SELECT coalesce(max(seq), 0) FROM snapshots WHERE seq < ?)";
-    run(conn, sqlx::query(given_up).bind(int(seq)).bind(int(seq))).await?;
+    run(conn, query(given_up).bind(int(seq)).bind(int(seq))).await?;
     let superseded = "DELETE FROM snapshot_parts WHERE (part, seq) IN (SELECT old.part, old.seq FROM snapshot_parts new \
                       JOIN snapshot_parts old ON old.part = new.part AND old.seq < new.seq WHERE new.seq = ?)";
-    run(conn, sqlx::query(superseded).bind(int(seq))).await?;
-    run(conn, sqlx::query("DELETE FROM snapshot_parts WHERE seq = ? AND state IS NULL").bind(int(seq))).await?;
-    let set = sqlx::query(
+    run(conn, query(superseded).bind(int(seq))).await?;
+    run(conn, query("DELETE FROM snapshot_parts WHERE seq = ? AND state IS NULL").bind(int(seq))).await?;
+    let set = query(
         "INSERT INTO snapshots (seq, at_ms, state) VALUES (?, ?, ?) ON CONFLICT (seq) DO UPDATE SET state = excluded.state",
     );
     run(conn, set.bind(int(seq)).bind(clock::now_ms()).bind(state)).await?;
-    run(conn, sqlx::query("DELETE FROM snapshots WHERE seq < ?").bind(int(seq))).await?;
-    run(conn, sqlx::query("DELETE FROM facts WHERE seq <= ?").bind(int(seq))).await.map(|_| ())
+    run(conn, query("DELETE FROM snapshots WHERE seq < ?").bind(int(seq))).await?;
+    run(conn, query("DELETE FROM facts WHERE seq <= ?").bind(int(seq))).await.map(|_| ())
 }
 
-async fn set_archive(
-    conn: &mut SqliteConnection,
-    key: Digest,
-    of: &str,
-    stage: &str,
-    execution: Option<&str>,
-) -> Result<()> {
+async fn set_archive(conn: &mut Conn<'_>, key: Digest, of: &str, stage: &str, execution: Option<&str>) -> Result<()> {
     let Some(execution) = execution else {
-        return run(conn, sqlx::query("DELETE FROM executions WHERE key = ?").bind(key.to_string())).await.map(|_| ());
+        return run(conn, query("DELETE FROM executions WHERE key = ?").bind(key.to_string())).await.map(|_| ());
     };
-    let set = sqlx::query(
+    let set = query(
         "INSERT INTO executions (key, run, stage, execution, at_ms) VALUES (?, ?, ?, ?, ?) ON CONFLICT (key) DO UPDATE \
          SET run = excluded.run, stage = excluded.stage, execution = excluded.execution, at_ms = excluded.at_ms",
     );
@@ -262,9 +253,9 @@ async fn set_archive(
 }
 
 /// Refuses a second state of one step. Two states break a guarantee, and continuing from either would hide that.
-async fn one_checkpoint_a_step(conn: &mut SqliteConnection, task: &TaskId, step: u64, manifest: Digest) -> Result<()> {
+async fn one_checkpoint_a_step(conn: &mut Conn<'_>, task: &TaskId, step: u64, manifest: Digest) -> Result<()> {
     let find = "SELECT manifest FROM checkpoints WHERE task = ? AND step = ? AND manifest <> ?";
-    let find = sqlx::query(find).bind(task.as_str()).bind(int(step)).bind(manifest.to_string());
+    let find = query(find).bind(task.as_str()).bind(int(step)).bind(manifest.to_string());
     match one(conn, find).await?.map(|row| row.get::<String, _>(0)) {
         Some(stored) => Err(WriteError::Conflict(two_states(task, step, &stored, &manifest.to_string()))),
         None => Ok(()),
@@ -272,7 +263,7 @@ async fn one_checkpoint_a_step(conn: &mut SqliteConnection, task: &TaskId, step:
 }
 
 async fn set_run(
-    conn: &mut SqliteConnection,
+    conn: &mut Conn<'_>,
     run_id: &str,
     pipeline: &str,
     source: &str,
@@ -280,17 +271,17 @@ async fn set_run(
     key: Option<&str>,
 ) -> Result<()> {
     if let Some(key) = key {
-        let holder = one(conn, sqlx::query("SELECT run FROM runs WHERE idempotency_key = ?").bind(key)).await?;
+        let holder = one(conn, query("SELECT run FROM runs WHERE idempotency_key = ?").bind(key)).await?;
         let holder: Option<String> = holder.map(|row| row.get(0));
         if let Some(holder) = holder.filter(|holder| holder != run_id) {
             return Err(WriteError::Conflict(format!("idempotency key `{key}` already belongs to run `{holder}`")));
         }
     }
     let now = clock::now_ms();
-    let set = sqlx::query(
+    let set = query(
         "INSERT INTO runs (run, pipeline, source, state, idempotency_key, created_ms, updated_ms) VALUES (?, ?, ?, ?, ?, ?, ?) \
          ON CONFLICT (run) DO UPDATE SET pipeline = excluded.pipeline, source = excluded.source, state = excluded.state, \
-         idempotency_key = coalesce(excluded.idempotency_key, idempotency_key), updated_ms = excluded.updated_ms",
+         idempotency_key = coalesce(excluded.idempotency_key, runs.idempotency_key), updated_ms = excluded.updated_ms",
     );
     run(conn, set.bind(run_id).bind(pipeline).bind(source).bind(state).bind(key).bind(now).bind(now)).await.map(|_| ())
 }
@@ -307,7 +298,7 @@ fn two_shards(task: &TaskId, stored: &str, output: Digest) -> WriteError {
     WriteError::Conflict(format!("shard `{task}` is already stored as {stored}, but this attempt made {output}"))
 }
 
-async fn add_shards(conn: &mut SqliteConnection, shards: &BTreeMap<&TaskId, Digest>) -> Result<()> {
+async fn add_shards(conn: &mut Conn<'_>, shards: &BTreeMap<&TaskId, Digest>) -> Result<()> {
     let tasks: Vec<&TaskId> = shards.keys().copied().collect();
     let stored = by_task::<String>(conn, "SELECT task, output FROM shards WHERE task IN (", &tasks).await?;
     for (task, stored) in &stored {
@@ -318,7 +309,7 @@ async fn add_shards(conn: &mut SqliteConnection, shards: &BTreeMap<&TaskId, Dige
     }
     let now = clock::now_ms();
     let rows: Vec<_> = shards.iter().filter(|(task, _)| !stored.contains_key(**task)).collect();
-    let values = |row: &mut Separated<'_, Sqlite, &'static str>, (task, output): &(&&TaskId, &Digest)| {
+    let values = |row: &mut Values<'_, '_>, (task, output): &(&&TaskId, &Digest)| {
         row.push_bind(task.as_str().to_owned()).push_bind(run_and_stage(task).0.to_owned());
         row.push_bind(output.to_string()).push_bind(now);
     };
@@ -336,9 +327,9 @@ struct Made<'a> {
     wall_s: f64,
 }
 
-async fn set_result(conn: &mut SqliteConnection, proofs: &Proofs, made: &Made<'_>) -> Result<()> {
+async fn set_result(conn: &mut Conn<'_>, proofs: &Proofs, made: &Made<'_>) -> Result<()> {
     let (key, outputs) = (made.key.to_string(), json(made.outputs));
-    let stored = one(conn, sqlx::query("SELECT outputs FROM stage_results WHERE key = ?").bind(&key)).await?;
+    let stored = one(conn, query("SELECT outputs FROM stage_results WHERE key = ?").bind(&key)).await?;
     match stored.map(|row| row.get::<String, _>(0)) {
         Some(stored) if stored == outputs => return Ok(()),
         Some(stored) => {
@@ -351,7 +342,7 @@ async fn set_result(conn: &mut SqliteConnection, proofs: &Proofs, made: &Made<'_
     }
     proofs.note(made.inputs.values().copied());
     let now = clock::now_ms();
-    let add = sqlx::query(
+    let add = query(
         "INSERT INTO stage_results (key, run, stage, kind, outputs, metrics, inputs, wall_s, at_ms) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
     );
     let add = add.bind(&key).bind(made.run).bind(made.stage).bind(made.kind).bind(outputs).bind(json(made.metrics));
@@ -360,13 +351,13 @@ async fn set_result(conn: &mut SqliteConnection, proofs: &Proofs, made: &Made<'_
         let artifact = proven(conn, proofs, *output).await?;
         let kind =
             serde_json::to_value(artifact.kind).ok().and_then(|k| k.as_str().map(str::to_owned)).unwrap_or_default();
-        let add = sqlx::query(
+        let add = query(
             "INSERT INTO artifacts (digest, kind, bytes, run, stage, key, at_ms) VALUES (?, ?, ?, ?, ?, ?, ?) ON CONFLICT DO NOTHING",
         );
         let add = add.bind(output.to_string()).bind(kind).bind(int(artifact.bytes)).bind(made.run).bind(made.stage);
         run(conn, add.bind(&key).bind(now)).await?;
         for (role, input) in made.inputs {
-            let add = sqlx::query("INSERT INTO edges (parent, child, role) VALUES (?, ?, ?) ON CONFLICT DO NOTHING");
+            let add = query("INSERT INTO edges (parent, child, role) VALUES (?, ?, ?) ON CONFLICT DO NOTHING");
             run(conn, add.bind(input.to_string()).bind(output.to_string()).bind(role)).await?;
         }
     }

@@ -7,11 +7,9 @@ use std::collections::{BTreeMap, HashMap};
 
 use protocol::message::{Grant, MetricRow};
 use protocol::{Attempt, TaskId};
-use sqlx::query_builder::Separated;
-use sqlx::{QueryBuilder, Row, Sqlite, SqliteConnection};
 
 use super::error::write_error;
-use super::statement::{ROWS, insert, int, one, run, run_and_stage};
+use super::statement::{Builder, Conn, ROWS, Row, Values, insert, int, one, query, run, run_and_stage};
 use super::usage;
 use crate::rollup::{Bucket, LEVELS, Open};
 use crate::{WriteError, clock};
@@ -53,7 +51,7 @@ impl Recording {
     }
 
     /// Adds values; those that are stored already are left as they are.
-    pub(super) async fn add(&mut self, conn: &mut SqliteConnection, grant: &Grant, rows: &[MetricRow]) -> Result<()> {
+    pub(super) async fn add(&mut self, conn: &mut Conn<'_>, grant: &Grant, rows: &[MetricRow]) -> Result<()> {
         let Some(last) = rows.iter().map(|row| int(row.step)).max() else { return Ok(()) };
         if self.recorders.values().map(|recorder| recorder.series.len()).sum::<usize>() > SERIES {
             self.forget();
@@ -78,7 +76,7 @@ impl Recording {
                 fresh.push((series.id, *step, *value));
             }
         }
-        let values = |row: &mut Separated<'_, Sqlite, &'static str>, (id, step, value): &(i64, i64, Option<f64>)| {
+        let values = |row: &mut Values<'_, '_>, (id, step, value): &(i64, i64, Option<f64>)| {
             row.push_bind(*id).push_bind(*step).push_bind(*value);
         };
         insert(conn, "INSERT INTO metrics (series, step, value) ", &fresh, values, "").await?;
@@ -87,7 +85,7 @@ impl Recording {
         usage::add(conn, run_and_stage(&grant.task).0, 0, rows.len() as u64).await
     }
 
-    async fn recorder(&mut self, conn: &mut SqliteConnection, grant: &Grant) -> Result<&mut Recorder> {
+    async fn recorder(&mut self, conn: &mut Conn<'_>, grant: &Grant) -> Result<&mut Recorder> {
         let known = (grant.task.clone(), grant.attempt);
         if !self.recorders.contains_key(&known) {
             let recorder = find_recorder(conn, grant).await?;
@@ -98,28 +96,28 @@ impl Recording {
     }
 }
 
-async fn find_recorder(conn: &mut SqliteConnection, grant: &Grant) -> Result<Recorder> {
+async fn find_recorder(conn: &mut Conn<'_>, grant: &Grant) -> Result<Recorder> {
     let (task, attempt) = (grant.task.as_str(), int(grant.attempt.0));
-    let find = sqlx::query("SELECT id FROM recorders WHERE task = ? AND attempt = ?").bind(task).bind(attempt);
+    let find = query("SELECT id FROM recorders WHERE task = ? AND attempt = ?").bind(task).bind(attempt);
     let Some(row) = one(conn, find).await? else {
         // Fences keep earlier tries from saving anything now, so the newest of theirs is what this one continued from.
         let (of_run, stage) = run_and_stage(&grant.task);
         let add = "INSERT INTO recorders (run, stage, task, attempt, resumed) SELECT ?1, ?2, ?3, ?4, \
                    (SELECT max(step) FROM checkpoints WHERE task = ?3 AND attempt < ?4) RETURNING id";
-        let add = sqlx::query(add).bind(of_run).bind(stage).bind(task).bind(attempt);
+        let add = query(add).bind(of_run).bind(stage).bind(task).bind(attempt);
         let id = add.fetch_one(&mut *conn).await.map_err(write_error)?.get(0);
         return Ok(Recorder { id, newest: None, series: HashMap::new() });
     };
     let id: i64 = row.get(0);
     let newest = "SELECT step, at_ms FROM recorded WHERE recorder = ? ORDER BY step DESC LIMIT 1";
-    let newest = one(conn, sqlx::query(newest).bind(id)).await?.map(|row| (row.get(0), row.get(1)));
+    let newest = one(conn, query(newest).bind(id)).await?.map(|row| (row.get(0), row.get(1)));
     Ok(Recorder { id, newest, series: HashMap::new() })
 }
 
 impl Recorder {
     async fn series(
         &mut self,
-        conn: &mut SqliteConnection,
+        conn: &mut Conn<'_>,
         grant: &Grant,
         key: &str,
         full: &mut Vec<Full>,
@@ -132,13 +130,13 @@ impl Recorder {
     }
 
     /// Notes when a batch came whose last step is `last`.
-    async fn came(&mut self, conn: &mut SqliteConnection, last: i64) -> Result<()> {
+    async fn came(&mut self, conn: &mut Conn<'_>, last: i64) -> Result<()> {
         if self.newest.is_some_and(|(step, _)| step >= last) {
             return Ok(());
         }
         // A clock that was set back does not turn time around.
         let now = clock::now_ms().max(self.newest.map_or(0, |(_, at)| at));
-        let add = sqlx::query("INSERT INTO recorded (recorder, step, at_ms) VALUES (?, ?, ?)");
+        let add = query("INSERT INTO recorded (recorder, step, at_ms) VALUES (?, ?, ?)");
         run(conn, add.bind(self.id).bind(last).bind(now)).await?;
         self.newest = Some((last, now));
         Ok(())
@@ -154,42 +152,42 @@ impl Series {
     }
 }
 
-async fn find_series(conn: &mut SqliteConnection, grant: &Grant, key: &str, full: &mut Vec<Full>) -> Result<Series> {
+async fn find_series(conn: &mut Conn<'_>, grant: &Grant, key: &str, full: &mut Vec<Full>) -> Result<Series> {
     let (task, attempt) = (grant.task.as_str(), int(grant.attempt.0));
     let find = "SELECT id FROM series WHERE task = ? AND attempt = ? AND key = ?";
-    if let Some(row) = one(conn, sqlx::query(find).bind(task).bind(attempt).bind(key)).await? {
+    if let Some(row) = one(conn, query(find).bind(task).bind(attempt).bind(key)).await? {
         return load(conn, row.get(0), full).await;
     }
     let (of_run, stage) = run_and_stage(&grant.task);
     let add = "INSERT INTO series (run, stage, task, attempt, key) VALUES (?, ?, ?, ?, ?) RETURNING id";
-    let add = sqlx::query(add).bind(of_run).bind(stage).bind(task).bind(attempt).bind(key);
+    let add = query(add).bind(of_run).bind(stage).bind(task).bind(attempt).bind(key);
     let id = add.fetch_one(&mut *conn).await.map_err(write_error)?.get(0);
     Ok(Series { id, last_step: None, open: Open::default() })
 }
 
 /// Takes up what is stored of a series after its newest roll-ups.
-async fn load(conn: &mut SqliteConnection, id: i64, full: &mut Vec<Full>) -> Result<Series> {
+async fn load(conn: &mut Conn<'_>, id: i64, full: &mut Vec<Full>) -> Result<Series> {
     let mut series = Series { id, last_step: None, open: Open::default() };
     for level in (1..LEVELS).rev() {
         let rows = "SELECT * FROM rollups WHERE series = ?1 AND level = ?2 AND last_step > coalesce(\
                     (SELECT max(last_step) FROM rollups WHERE series = ?1 AND level = ?2 + 1), -1) ORDER BY last_step";
-        let rows = sqlx::query(rows).bind(id).bind(level as i64).fetch_all(&mut *conn).await.map_err(write_error)?;
+        let rows = query(rows).bind(id).bind(level as i64).fetch_all(&mut *conn).await.map_err(write_error)?;
         for row in &rows {
             series.add(level, bucket(row).map_err(write_error)?, full);
         }
     }
     let rows = "SELECT step, value FROM metrics WHERE series = ?1 AND step > coalesce(\
                 (SELECT max(last_step) FROM rollups WHERE series = ?1 AND level = 1), -1) ORDER BY step";
-    for row in sqlx::query(rows).bind(id).fetch_all(&mut *conn).await.map_err(write_error)? {
+    for row in query(rows).bind(id).fetch_all(&mut *conn).await.map_err(write_error)? {
         series.add(0, Bucket::of(row.get(0), row.get(1)), full);
     }
-    let last = sqlx::query("SELECT max(step) FROM metrics WHERE series = ?").bind(id);
+    let last = query("SELECT max(step) FROM metrics WHERE series = ?").bind(id);
     series.last_step = one(conn, last).await?.and_then(|row| row.get(0));
     Ok(series)
 }
 
 /// Reads a row of the table, or a sum of such rows.
-pub(super) fn bucket(row: &sqlx::sqlite::SqliteRow) -> std::result::Result<Bucket, sqlx::Error> {
+pub(super) fn bucket(row: &Row) -> std::result::Result<Bucket, sqlx::Error> {
     Ok(Bucket {
         first_step: row.try_get("first_step")?,
         last_step: row.try_get("last_step")?,
@@ -202,8 +200,8 @@ pub(super) fn bucket(row: &sqlx::sqlite::SqliteRow) -> std::result::Result<Bucke
     })
 }
 
-async fn add_rollups(conn: &mut SqliteConnection, full: &[Full]) -> Result<()> {
-    let values = |row: &mut Separated<'_, Sqlite, &'static str>, (series, level, bucket): &Full| {
+async fn add_rollups(conn: &mut Conn<'_>, full: &[Full]) -> Result<()> {
+    let values = |row: &mut Values<'_, '_>, (series, level, bucket): &Full| {
         row.push_bind(*series).push_bind(*level as i64).push_bind(bucket.last_step).push_bind(bucket.first_step);
         row.push_bind(int(bucket.count)).push_bind(int(bucket.odd));
         row.push_bind(bucket.low.is_finite().then_some(bucket.low));
@@ -216,24 +214,24 @@ async fn add_rollups(conn: &mut SqliteConnection, full: &[Full]) -> Result<()> {
 }
 
 /// Adds values that come after later ones, each to the roll-ups that hold its step. Returns true if any was not stored yet.
-async fn add_late(conn: &mut SqliteConnection, series: i64, values: &[(i64, Option<f64>)]) -> Result<bool> {
+async fn add_late(conn: &mut Conn<'_>, series: i64, values: &[(i64, Option<f64>)]) -> Result<bool> {
     let mut any = false;
     for values in values.chunks(ROWS) {
-        let mut add = QueryBuilder::<Sqlite>::new("INSERT INTO metrics (series, step, value) ");
-        add.push_values(values, |mut row, (step, value)| {
+        let mut add = Builder::new("INSERT INTO metrics (series, step, value) ");
+        add.push_rows(values, |row, (step, value)| {
             row.push_bind(series).push_bind(*step).push_bind(*value);
         });
-        let add = add.push(" ON CONFLICT DO NOTHING RETURNING step, value").build().persistent(false);
-        for row in add.fetch_all(&mut *conn).await.map_err(write_error)? {
+        add.push(" ON CONFLICT DO NOTHING RETURNING step, value");
+        for row in add.build().fetch_all(&mut *conn).await.map_err(write_error)? {
             any = true;
             let bucket = Bucket::of(row.get(0), row.get(1));
-            let to = "UPDATE rollups SET first_step = min(first_step, ?3), count = count + 1, odd = odd + (?4 IS NULL), \
-                      low = min(coalesce(low, ?4), coalesce(?4, low)), high = max(coalesce(high, ?4), coalesce(?4, high)), \
+            let to = "UPDATE rollups SET first_step = {least}(first_step, ?3), count = count + 1, \
+                      odd = odd + CASE WHEN ?4 IS NULL THEN 1 ELSE 0 END, \
+                      low = {least}(coalesce(low, ?4), coalesce(?4, low)), high = {greatest}(coalesce(high, ?4), coalesce(?4, high)), \
                       sum = sum + coalesce(?4, 0.0) WHERE series = ?1 AND level = ?2 AND last_step = (SELECT last_step \
                       FROM rollups WHERE series = ?1 AND level = ?2 AND last_step >= ?3 ORDER BY last_step LIMIT 1)";
             for level in 1..=LEVELS {
-                run(conn, sqlx::query(to).bind(series).bind(level as i64).bind(bucket.first_step).bind(bucket.last))
-                    .await?;
+                run(conn, query(to).bind(series).bind(level as i64).bind(bucket.first_step).bind(bucket.last)).await?;
             }
         }
     }

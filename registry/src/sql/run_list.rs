@@ -4,10 +4,8 @@ use std::collections::BTreeSet;
 
 use protocol::message::{RunState, RunSummary};
 use protocol::{Group, RunId};
-use sqlx::sqlite::SqliteRow;
-use sqlx::{QueryBuilder, Row, Sqlite, SqliteConnection};
 
-use super::statement::json;
+use super::statement::{Builder, Conn, Row, json};
 use crate::QueryError;
 use crate::catalog::{RunListQuery, RunOrder, RunPage};
 
@@ -41,7 +39,7 @@ impl Place {
 }
 
 /// Returns a part of the list. Runs of others than `group` are left out, if there is one.
-pub(super) async fn page(conn: &mut SqliteConnection, asked: &RunListQuery, group: Option<&Group>) -> Result<RunPage> {
+pub(super) async fn page(conn: &mut Conn<'_>, asked: &RunListQuery, group: Option<&Group>) -> Result<RunPage> {
     let owner = match (group, &asked.owner) {
         (Some(group), Some(owner)) if group != owner => return Ok(RunPage::default()),
         (Some(group), _) => Some(group),
@@ -56,9 +54,11 @@ pub(super) async fn page(conn: &mut SqliteConnection, asked: &RunListQuery, grou
     }
     let found = match words.as_slice() {
         [] => None,
+        // PostgreSQL has no index of words; it compares every row.
+        _ if !conn.is_sqlite() => None,
         words => Some(candidates(conn, words, asked.order, after).await?),
     };
-    let mut find = QueryBuilder::<Sqlite>::new("SELECT * FROM (");
+    let mut find = Builder::new("SELECT * FROM (");
     let all = [RunState::Running, RunState::Paused, RunState::Finished, RunState::Failed, RunState::Cancelled];
     let states: Vec<RunState> = match asked.states.is_empty() {
         // The indexes begin with these columns; without them, the list is read in its own order.
@@ -67,7 +67,8 @@ pub(super) async fn page(conn: &mut SqliteConnection, asked: &RunListQuery, grou
         false => all.into_iter().filter(|state| asked.states.contains(state)).collect(),
     };
     let limit = i64::from(asked.limit) + 1;
-    let part = |find: &mut QueryBuilder<Sqlite>, state: Option<RunState>| {
+    let is_indexed = conn.is_sqlite();
+    let part = |find: &mut Builder<'_>, state: Option<RunState>| {
         find.push("SELECT * FROM (SELECT * FROM run_list WHERE true");
         if let Some(state) = state {
             find.push(" AND state = ").push_bind(state.name());
@@ -79,7 +80,7 @@ pub(super) async fn page(conn: &mut SqliteConnection, asked: &RunListQuery, grou
             find.push(" AND owner = ").push_bind(owner.as_str().to_owned());
         }
         if let Some(found) = &found {
-            find.push(" AND number IN (SELECT value FROM json_each(").push_bind(json(found)).push("))");
+            find.push(" AND number IN {numbers ?}").bind(json(found));
         }
         match (asked.order, after) {
             (_, None) => {}
@@ -91,11 +92,11 @@ pub(super) async fn page(conn: &mut SqliteConnection, asked: &RunListQuery, grou
             }
         }
         // A word that folds in other ways than SQLite's is left to the index.
-        for word in words.iter().filter(|word| word.is_ascii() || word.chars().count() < INDEXED) {
-            let text = " AND instr(lower(run || ' ' || pipeline || ' ' || owner || ' ' || token || ' ' || note), ";
+        for word in words.iter().filter(|word| !is_indexed || word.is_ascii() || word.chars().count() < INDEXED) {
+            let text = " AND {find}({lower}(run || ' ' || pipeline || ' ' || owner || ' ' || token || ' ' || note), ";
             find.push(text).push_bind(word.clone()).push(") > 0");
         }
-        find.push(order(asked.order)).push(" LIMIT ").push_bind(limit).push(")");
+        find.push(order(asked.order)).push(" LIMIT ").push_bind(limit).push(") AS part");
     };
     match states.split_first() {
         None => part(&mut find, None),
@@ -107,8 +108,8 @@ pub(super) async fn page(conn: &mut SqliteConnection, asked: &RunListQuery, grou
             }
         }
     }
-    find.push(")").push(order(asked.order)).push(" LIMIT ").push_bind(limit);
-    let rows = find.build().persistent(false).fetch_all(conn).await?;
+    find.push(") AS parts").push(order(asked.order)).push(" LIMIT ").push_bind(limit);
+    let rows = find.build().fetch_all(conn).await?;
     let shown = rows.len().min(asked.limit as usize);
     let more = rows.len() > shown;
     let last = rows[..shown].last().map(place).transpose()?;
@@ -132,15 +133,10 @@ fn order(order: RunOrder) -> &'static str {
 }
 
 /// The numbers of the next runs that may have all of the words, in the list's order.
-async fn candidates(
-    conn: &mut SqliteConnection,
-    words: &[String],
-    order: RunOrder,
-    after: Option<Place>,
-) -> Result<Vec<i64>> {
+async fn candidates(conn: &mut Conn<'_>, words: &[String], order: RunOrder, after: Option<Place>) -> Result<Vec<i64>> {
     let parts: BTreeSet<String> = words.iter().flat_map(|word| parts(word)).collect();
     let (table, number) = if parts.is_empty() { ("run_list", "number") } else { ("run_words", "rowid") };
-    let mut find = QueryBuilder::<Sqlite>::new("SELECT ");
+    let mut find = Builder::new("SELECT ");
     find.push(number).push(" FROM ").push(table).push(" WHERE ").push(number);
     let oldest = order == RunOrder::Oldest;
     find.push(if oldest { " > " } else { " < " });
@@ -151,7 +147,7 @@ async fn candidates(
     }
     find.push(" ORDER BY ").push(number).push(if oldest { "" } else { " DESC" });
     find.push(" LIMIT ").push_bind(CANDIDATES);
-    let rows = find.build().persistent(false).fetch_all(conn).await?;
+    let rows = find.build().fetch_all(conn).await?;
     rows.iter().map(|row| Ok(row.try_get(0)?)).collect()
 }
 
@@ -162,13 +158,16 @@ fn parts(word: &str) -> impl Iterator<Item = String> + use<> {
     parts.into_iter()
 }
 
-fn place(row: &SqliteRow) -> Result<Place> {
+fn place(row: &Row) -> Result<Place> {
     Ok(Place { changed_ms: row.try_get("changed_ms")?, number: row.try_get("number")? })
 }
 
-fn summary(row: &SqliteRow) -> Result<RunSummary> {
+fn summary(row: &Row) -> Result<RunSummary> {
     let text = |column: &str| row.try_get::<String, _>(column);
-    let count = |column: &str| row.try_get::<u32, _>(column);
+    let count = |column: &str| -> Result<u32> {
+        let count: i64 = row.try_get(column)?;
+        u32::try_from(count).map_err(|_| QueryError::Database(format!("`{column}` of a run is {count}")))
+    };
     let (state, owner, token) = (text("state")?, text("owner")?, text("token")?);
     let known = RunState::named(&state);
     let state = known.ok_or_else(|| QueryError::Database(format!("`{state}` is no state of a run")))?;

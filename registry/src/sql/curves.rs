@@ -4,10 +4,9 @@ use std::collections::BTreeMap;
 use std::collections::btree_map::Entry;
 
 use protocol::{RunId, StageName};
-use sqlx::{Row, SqliteConnection};
 
 use super::recording::bucket;
-use super::statement::{int, json};
+use super::statement::{Conn, int, json, query};
 use super::times;
 use crate::QueryError;
 use crate::curve::{Axis, Buckets, Curve, Page, Point, Window};
@@ -32,22 +31,22 @@ struct Recorder {
 
 /// The segments of a stage's curves by key.
 async fn segments(
-    conn: &mut SqliteConnection,
+    conn: &mut Conn<'_>,
     run: &RunId,
     stage: &StageName,
     keys: Option<&[String]>,
 ) -> Result<BTreeMap<String, Vec<Segment>>> {
-    let find = sqlx::query("SELECT id, task, attempt, resumed FROM recorders WHERE run = ? AND stage = ?");
+    let find = query("SELECT id, task, attempt, resumed FROM recorders WHERE run = ? AND stage = ?");
     let mut recorders: BTreeMap<(String, i64), Recorder> = BTreeMap::new();
     for row in find.bind(run.as_str()).bind(stage.as_str()).fetch_all(&mut *conn).await? {
         let recorder = Recorder { id: row.try_get("id")?, resumed: row.try_get("resumed")? };
         recorders.insert((row.try_get("task")?, row.try_get("attempt")?), recorder);
     }
     let find = "SELECT id, key, task, attempt, (SELECT min(step) FROM metrics WHERE series = id) AS first FROM series \
-                WHERE run = ?1 AND stage = ?2 AND (?3 IS NULL OR key IN (SELECT value FROM json_each(?3))) \
+                WHERE run = ?1 AND stage = ?2 AND (?3 IS NULL OR key IN {texts ?3}) \
                 ORDER BY key, task, attempt DESC";
     let keys = keys.map(|keys| json(&keys));
-    let rows = sqlx::query(find).bind(run.as_str()).bind(stage.as_str()).bind(keys).fetch_all(&mut *conn).await?;
+    let rows = query(find).bind(run.as_str()).bind(stage.as_str()).bind(keys).fetch_all(&mut *conn).await?;
     let mut all: BTreeMap<String, Vec<Segment>> = BTreeMap::new();
     // The key and the task of the series before, and the first step of its newer tries.
     let mut newer: Option<(String, String, i64)> = None;
@@ -71,7 +70,7 @@ async fn segments(
 
 /// The points of a stage's curves by key.
 pub(super) async fn points(
-    conn: &mut SqliteConnection,
+    conn: &mut Conn<'_>,
     run: &RunId,
     stage: &StageName,
     keys: Option<&[String]>,
@@ -84,7 +83,7 @@ pub(super) async fn points(
         for segment in segments {
             let find =
                 "SELECT step, value FROM metrics WHERE series = ? AND step > ? AND step <= ? ORDER BY step LIMIT ?";
-            let find = sqlx::query(find).bind(segment.series).bind(after.max(segment.low - 1)).bind(segment.high);
+            let find = query(find).bind(segment.series).bind(after.max(segment.low - 1)).bind(segment.high);
             for row in find.bind(limit).fetch_all(&mut *conn).await? {
                 let value = row.try_get::<Option<f64>, _>(1)?.unwrap_or(f64::NAN);
                 points.push(Point { step: row.try_get::<i64, _>(0)?.unsigned_abs(), value });
@@ -99,7 +98,7 @@ pub(super) async fn points(
 
 /// The buckets of a stage's curves by key. A key without a value in the window has no bucket.
 pub(super) async fn buckets(
-    conn: &mut SqliteConnection,
+    conn: &mut Conn<'_>,
     run: &RunId,
     stage: &StageName,
     keys: Option<&[String]>,
@@ -122,7 +121,7 @@ pub(super) async fn buckets(
 }
 
 /// Takes from a segment what lies outside the window, and then the steps at its ends that have no value.
-async fn narrow(conn: &mut SqliteConnection, segment: &mut Segment, window: &Window, origin: i64) -> Result<()> {
+async fn narrow(conn: &mut Conn<'_>, segment: &mut Segment, window: &Window, origin: i64) -> Result<()> {
     match window.axis {
         Axis::Step => {
             // The cast saturates.
@@ -142,8 +141,7 @@ async fn narrow(conn: &mut SqliteConnection, segment: &mut Segment, window: &Win
     }
     let ends = "SELECT (SELECT min(step) FROM metrics WHERE series = ?1 AND step >= ?2 AND step <= ?3), \
                 (SELECT max(step) FROM metrics WHERE series = ?1 AND step >= ?2 AND step <= ?3)";
-    let ends =
-        sqlx::query(ends).bind(segment.series).bind(segment.low).bind(segment.high).fetch_one(&mut *conn).await?;
+    let ends = query(ends).bind(segment.series).bind(segment.low).bind(segment.high).fetch_one(&mut *conn).await?;
     // One without a value is empty.
     segment.low = ends.try_get::<Option<i64>, _>(0)?.unwrap_or(i64::MAX);
     segment.high = ends.try_get::<Option<i64>, _>(1)?.unwrap_or(i64::MIN);
@@ -159,7 +157,7 @@ fn ms(axis: Axis, place: f64, origin: i64) -> f64 {
 type Found = (usize, Bucket);
 
 /// Adds up segments in about `most` ranges of steps, and no more than that.
-async fn gather(conn: &mut SqliteConnection, segments: &[Segment], most: usize) -> Result<Vec<Found>> {
+async fn gather(conn: &mut Conn<'_>, segments: &[Segment], most: usize) -> Result<Vec<Found>> {
     let (Some(low), Some(high)) = (segments.iter().map(|s| s.low).min(), segments.iter().map(|s| s.high).max()) else {
         return Ok(Vec::new());
     };
@@ -173,7 +171,7 @@ async fn gather(conn: &mut SqliteConnection, segments: &[Segment], most: usize) 
         while let Some((level, from, to)) = ranges.pop() {
             let Some((from, to)) = whole(conn, segment.series, level, from, to, &mut ranges).await? else { continue };
             let sums = if level == 0 { VALUES } else { ROLLUPS };
-            let sums = sqlx::query(sums).bind(segment.series).bind(level as i64).bind(from).bind(to);
+            let sums = query(sums).bind(segment.series).bind(level as i64).bind(from).bind(to);
             for row in sums.bind(low).bind(width).fetch_all(&mut *conn).await? {
                 let bucket = bucket(&row)?;
                 match found.entry((bucket.last_step - low) / width) {
@@ -196,18 +194,19 @@ async fn gather(conn: &mut SqliteConnection, segments: &[Segment], most: usize) 
 
 /// Sums of a series' buckets of level `?2` by ranges of `?6` steps.
 const ROLLUPS: &str = "SELECT *, (SELECT last FROM rollups WHERE series = ?1 AND level = ?2 AND last_step = sums.last_step) AS last \
-    FROM (SELECT min(first_step) AS first_step, max(last_step) AS last_step, sum(count) AS count, sum(odd) AS odd, \
+    FROM (SELECT min(first_step) AS first_step, max(last_step) AS last_step, CAST(sum(count) AS BIGINT) AS count, \
+    CAST(sum(odd) AS BIGINT) AS odd, \
     min(low) AS low, max(high) AS high, sum(sum) AS sum FROM rollups \
     WHERE series = ?1 AND level = ?2 AND last_step >= ?3 AND last_step <= ?4 GROUP BY (last_step - ?5) / ?6) AS sums";
 
 /// The same of its values; `?2` is 0.
-const VALUES: &str = "SELECT *, (SELECT iif(abs(value) < 9e999, value, NULL) FROM metrics WHERE series = ?1 AND step = last_step) AS last \
-    FROM (SELECT min(step) AS first_step, max(step) AS last_step, count(*) AS count, sum(finite IS NULL) AS odd, \
-    min(finite) AS low, max(finite) AS high, sum(finite) AS sum FROM (SELECT step, iif(abs(value) < 9e999, value, NULL) AS finite \
-    FROM metrics WHERE series = ?1 AND step >= ?3 AND step <= ?4 AND ?2 = 0) GROUP BY (step - ?5) / ?6)";
+const VALUES: &str = "SELECT *, (SELECT CASE WHEN abs(value) <= 1.7976931348623157e308 THEN value END FROM metrics WHERE series = ?1 AND step = last_step) AS last \
+    FROM (SELECT min(step) AS first_step, max(step) AS last_step, count(*) AS count, count(*) - count(finite) AS odd, \
+    min(finite) AS low, max(finite) AS high, sum(finite) AS sum FROM (SELECT step, CASE WHEN abs(value) <= 1.7976931348623157e308 THEN value END AS finite \
+    FROM metrics WHERE series = ?1 AND step >= ?3 AND step <= ?4 AND ?2 = 0) AS of_series GROUP BY (step - ?5) / ?6) AS sums";
 
 /// The coarsest level that has enough buckets. Fewer buckets than pixels are drawn exactly, too.
-async fn level(conn: &mut SqliteConnection, segments: &[Segment], most: usize) -> Result<usize> {
+async fn level(conn: &mut Conn<'_>, segments: &[Segment], most: usize) -> Result<usize> {
     for (level, enough) in [(2, most as u64), (1, most as u64 / 2)] {
         if count(conn, segments, level).await? >= enough.max(1) {
             return Ok(level);
@@ -217,7 +216,7 @@ async fn level(conn: &mut SqliteConnection, segments: &[Segment], most: usize) -
 }
 
 /// Number of buckets of a level, or of values, in segments.
-async fn count(conn: &mut SqliteConnection, segments: &[Segment], level: usize) -> Result<u64> {
+async fn count(conn: &mut Conn<'_>, segments: &[Segment], level: usize) -> Result<u64> {
     let mut sum = 0;
     for segment in segments {
         let count = match level {
@@ -226,7 +225,7 @@ async fn count(conn: &mut SqliteConnection, segments: &[Segment], level: usize) 
                 "SELECT count(*) FROM rollups WHERE series = ?1 AND level = ?2 AND last_step >= ?3 AND last_step <= ?4"
             }
         };
-        let count = sqlx::query(count).bind(segment.series).bind(level as i64).bind(segment.low).bind(segment.high);
+        let count = query(count).bind(segment.series).bind(level as i64).bind(segment.low).bind(segment.high);
         sum += count.fetch_one(&mut *conn).await?.try_get::<i64, _>(0)?.unsigned_abs();
     }
     Ok(sum)
@@ -234,7 +233,7 @@ async fn count(conn: &mut SqliteConnection, segments: &[Segment], level: usize) 
 
 /// The part of a range of steps that buckets of a level make up; what is left at its ends goes to `ranges`, for the level below.
 async fn whole(
-    conn: &mut SqliteConnection,
+    conn: &mut Conn<'_>,
     series: i64,
     level: usize,
     from: i64,
@@ -245,7 +244,7 @@ async fn whole(
         return Ok(Some((from, to)).filter(|_| from <= to));
     }
     let first = "SELECT first_step, last_step FROM rollups WHERE series = ? AND level = ? AND last_step >= ? ORDER BY last_step LIMIT 1";
-    let first = sqlx::query(first).bind(series).bind(level as i64).bind(from).fetch_optional(&mut *conn).await?;
+    let first = query(first).bind(series).bind(level as i64).bind(from).fetch_optional(&mut *conn).await?;
     let Some(first) = first else {
         ranges.push((level - 1, from, to));
         return Ok(None);
@@ -254,7 +253,7 @@ async fn whole(
     let begin = if first_step >= from { from } else { first_last.saturating_add(1) };
     let last =
         "SELECT max(last_step) FROM rollups WHERE series = ? AND level = ? AND last_step >= ? AND last_step <= ?";
-    let last = sqlx::query(last).bind(series).bind(level as i64).bind(begin).bind(to).fetch_one(&mut *conn).await?;
+    let last = query(last).bind(series).bind(level as i64).bind(begin).bind(to).fetch_one(&mut *conn).await?;
     let Some(last) = last.try_get::<Option<i64>, _>(0)? else {
         ranges.push((level - 1, from, to));
         return Ok(None);
@@ -265,7 +264,7 @@ async fn whole(
 }
 
 async fn columns(
-    conn: &mut SqliteConnection,
+    conn: &mut Conn<'_>,
     segments: &[Segment],
     found: Vec<Found>,
     window: &Window,
