@@ -185,7 +185,7 @@ impl Records for SqlRecords {
     }
 
     async fn kind_sizes(&self) -> Result<Vec<KindSize>> {
-        usage::kind_sizes(&mut *self.connection().await?).await
+        usage::kind_sizes(&mut self.0.reader().await?.conn()).await
     }
 
     async fn timeline(&self, asked: &HistoryQuery) -> Result<Vec<HistoryRow>> {
