@@ -3,12 +3,14 @@
 use std::io::IsTerminal as _;
 use std::net::{Ipv4Addr, SocketAddr};
 use std::path::PathBuf;
+use std::time::Duration;
 
 use access::{Scopes, Token, TokenOptions, Tokens};
 use clap::Args;
 use coordinator::shell::StreamOffer;
 use coordinator::{Coordinator, Handle};
-use registry::{Holder, Store};
+use registry::catalog::PostgresAddress;
+use registry::{Holder, OpenError, PostgresCatalog, Store};
 use tokio::signal::unix::{SignalKind, signal};
 use webhooks::Hooks;
 
@@ -17,6 +19,9 @@ use super::endpoint_args::EndpointArgs;
 use crate::client;
 use crate::report::print;
 use crate::report::problem::{Problem, Result};
+
+/// Pause before a stand-by tries to lead again.
+const AGAIN: Duration = Duration::from_millis(100);
 
 const TOKENS: &str = "\
 A token file has one line `NAME SCOPES TOKEN` per caller, such as `alice submit,promote` and the output of
@@ -55,6 +60,13 @@ pub(crate) struct ServeArgs {
     /// File with a token of that process, closed to other users
     #[arg(long, env = "STRIDE_STREAM_TOKEN_FILE", value_name = "FILE")]
     stream_token_file: Option<PathBuf>,
+    /// Keep the catalog in PostgreSQL: postgres://USER@HOST/DATABASE?password-file=FILE. Several servers may have it, each
+    /// with its own `--store`; one leads. The blobs must be in a place that all reach (`--blobs`)
+    #[arg(long, env = "STRIDE_CATALOG", value_name = "ADDRESS", hide_env_values = true)]
+    catalog: Option<PostgresAddress>,
+    /// Wait while another server leads the catalog, and take over when it is lost
+    #[arg(long, requires = "catalog")]
+    stand_by: bool,
     #[command(flatten)]
     blobs: super::args::BlobArgs,
     #[command(flatten)]
@@ -79,6 +91,26 @@ impl ServeArgs {
             tokens.add("admin", Scopes::all(), token);
         }
         Ok(tokens)
+    }
+
+    /// Opens the store. A stand-by first waits until it can lead.
+    async fn open(&self) -> Result<Store> {
+        let (blobs, holder) = (self.blobs.blobs.as_ref(), || Holder::this_process("trainer serve"));
+        let Some(address) = &self.catalog else { return Ok(Store::open_with(&self.store, blobs, holder()).await?) };
+        let catalog = PostgresCatalog::from(address.clone());
+        if self.stand_by {
+            print::note(&format!("standing by for {address}"));
+        }
+        loop {
+            if self.stand_by {
+                Store::wait_to_lead(&catalog).await;
+            }
+            match Store::open_on(&catalog, &self.store, blobs, holder()).await {
+                // Another stand-by was faster, or the leader stalls inside a transaction.
+                Err(OpenError::Busy { .. }) if self.stand_by => tokio::time::sleep(AGAIN).await,
+                opened => return Ok(opened?),
+            }
+        }
     }
 
     fn hooks(&self) -> Result<Hooks> {
@@ -136,7 +168,11 @@ pub(crate) async fn serve(args: ServeArgs) -> Result<u8> {
     // Report errors before the store is created.
     config.check()?;
     let open = config.tokens.is_empty();
-    let store = Store::open_with(&args.store, args.blobs.blobs.as_ref(), Holder::this_process("trainer serve")).await?;
+    let store = tokio::select! {
+        store = args.open() => store?,
+        _ = interrupt.recv() => return Ok(0),
+        _ = terminate.recv() => return Ok(0),
+    };
     let handle = Coordinator::start(store.clone(), config).await?;
     let announced = client::announce(&store, &handle)?;
     let token = if open { format!(" --token-file {}", args.store.join("token").display()) } else { String::new() };

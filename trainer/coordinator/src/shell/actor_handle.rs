@@ -429,6 +429,27 @@ impl ActorHandle {
         self.change();
     }
 
+    /// Returns true unless another process may lead the catalog.
+    pub(crate) fn leads(&self) -> bool {
+        self.store.leadership().is_none_or(registry::Leadership::leads)
+    }
+
+    /// Stops the coordinator once another process leads the catalog.
+    pub(crate) async fn end_when_superseded(self: Arc<Self>, mut stopped: watch::Receiver<bool>) {
+        let Some(leadership) = self.store.leadership() else { return };
+        tokio::select! {
+            // An error means that the coordinator has ended.
+            _ = stopped.wait_for(|stop| *stop) => {}
+            () = leadership.superseded() => {
+                let message = format!("another process leads the catalog; this one's epoch {} is over", leadership.epoch());
+                tracing::error!("{message}");
+                let _ = self.failure.set(message);
+                self.stop();
+                self.change();
+            }
+        }
+    }
+
     /// Starts an essential task. If it panics, the coordinator has failed.
     pub(crate) fn spawn(
         self: &Arc<Self>,

@@ -210,16 +210,20 @@ pub(super) async fn no_such_method(method: Method) -> Failure {
     Failure::new(StatusCode::METHOD_NOT_ALLOWED, "method", message)
 }
 
-/// Aborts a waiting request when the coordinator stops or fails.
+/// Aborts a waiting request when the coordinator stops or fails, and answers nothing while another process may lead.
 async fn until_failed(State(actor_handle): State<Arc<ActorHandle>>, request: Request, next: Next) -> Response {
     let mut stopped = actor_handle.stopped();
+    if !actor_handle.leads() {
+        return Failure::not_leading().into_response();
+    }
     tokio::select! {
         biased;
         // An error means that the actor has ended, which counts as a stop.
         _ = stopped.wait_for(|stop| *stop) => Failure::from(actor_handle.over()).into_response(),
         response = next.run(request) => {
             actor_handle.meters.answered(response.status());
-            response
+            // This process may have been stopped since.
+            if actor_handle.leads() { response } else { Failure::not_leading().into_response() }
         }
     }
 }

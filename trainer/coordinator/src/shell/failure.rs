@@ -57,6 +57,12 @@ impl Failure {
             format!("HTTP/1.1 {status}\r\ncontent-type: {kind}\r\nconnection: close\r\ncontent-length: {length}");
         format!("{head}\r\n\r\n{body}").into_bytes()
     }
+
+    /// An answer while another process may lead the catalog.
+    pub(crate) fn not_leading() -> Self {
+        let message = "another process may lead the catalog of this store; ask the other servers".to_owned();
+        Self { retry_after: Some(1), ..Self::new(StatusCode::SERVICE_UNAVAILABLE, "unreachable", message) }
+    }
 }
 
 impl IntoResponse for Failure {

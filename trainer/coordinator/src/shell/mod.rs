@@ -232,8 +232,10 @@ impl Coordinator {
         let (hooks, listed) = watch::channel(config.hooks);
         let telling = webhooks::serve(actor_handle.clone(), listed, config.hook_retry);
         let telling = actor_handle.spawn("the webhooks", telling);
+        let leading = Arc::clone(&actor_handle).end_when_superseded(actor_handle.stopped());
+        let leading = actor_handle.spawn("the leadership", leading);
         let tls = config.tls.clone();
-        let tasks = vec![clock, server, audit, quiet, telling, actor];
+        let tasks = vec![clock, server, audit, quiet, telling, leading, actor];
         Ok(Handle { address, local, tls, token, worker_token, sessions, hooks, actor_handle, stop, tasks })
     }
 }
