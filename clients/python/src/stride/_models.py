@@ -78,13 +78,13 @@ class Owner(Answer):
     """The token that submitted a run, as it was then."""
 
     admin: bool | None = None
-    """Whether it controls everything, whomever it belongs to."""
+    """True if it may control objects of all owners."""
     name: str
     """The token's name; empty for a run of a store that knew no owners."""
     project: str | None = None
     """The token's project."""
     promotes: bool | None = None
-    """Whether its pipelines may move aliases."""
+    """True if its pipelines may move aliases."""
 
 
 class Progress(Answer):
@@ -168,7 +168,7 @@ class RunView(Answer):
     """Stages in topological order, then the stages made by sweeps."""
     state: Literal['running', 'paused', 'finished', 'failed', 'cancelled']
     storage: StorageProblem | None = None
-    """What keeps the coordinator from storing or reading what the run needs."""
+    """The storage problem that blocks the run."""
     sweeps: list[SweepView] | None = None
     """Sweeps that have started."""
     times: Times | None = None
@@ -213,7 +213,7 @@ class StorageProblem(Answer):
     since_ms: int
     """Since when, in milliseconds since 1970."""
     what: str
-    """What is wrong, in words."""
+    """Description of the problem."""
 
 
 class SweepView(Answer):
