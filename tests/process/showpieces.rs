@@ -28,7 +28,6 @@ fn commands(bench: &Bench, block: &str) -> String {
     programs(bench.path());
     let mut said = String::new();
     for line in lines.iter().filter(|line| !line.starts_with("trainer run ")) {
-        println!("$ {line}");
         said += &Running::start(bash(bench.path(), "", line)).wait().expect_code(0).stdout;
     }
     said

@@ -30,7 +30,10 @@ fn golden_nn() {
 fn check_layers(root: &Path) {
     let info = json(&root.join("info.json"));
     let mut seen = 0;
-    let mut files: Vec<_> = std::fs::read_dir(root).unwrap().map(|entry| entry.unwrap().path()).collect();
+    let mut files: Vec<_> = std::fs::read_dir(root)
+        .expect("a readable folder")
+        .map(|entry| entry.expect("a readable folder").path())
+        .collect();
     files.sort();
     for file in files {
         let file_name = name(&file);

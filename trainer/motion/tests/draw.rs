@@ -78,10 +78,10 @@ fn what_was_told_is_drawn() {
 /// Pixels of a sheet.
 fn pixels(rows: &[Row]) -> (Vec<u8>, [usize; 2]) {
     let mut bytes = vec![];
-    draw::sheet_to(rows, 6, Skeleton::of(DataFormat::Humanml3d), Given::default(), &mut bytes).unwrap();
-    let mut reader = png::Decoder::new(std::io::Cursor::new(bytes)).read_info().unwrap();
-    let mut pixels = vec![0; reader.output_buffer_size().unwrap()];
-    reader.next_frame(&mut pixels).unwrap();
+    draw::sheet_to(rows, 6, Skeleton::of(DataFormat::Humanml3d), Given::default(), &mut bytes).expect("a picture");
+    let mut reader = png::Decoder::new(std::io::Cursor::new(bytes)).read_info().expect("a picture");
+    let mut pixels = vec![0; reader.output_buffer_size().expect("a picture")];
+    reader.next_frame(&mut pixels).expect("a picture");
     (pixels, [reader.info().width as usize, reader.info().height as usize])
 }
 

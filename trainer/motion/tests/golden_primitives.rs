@@ -39,9 +39,10 @@ fn golden_primitives() {
     }
 }
 
+#[expect(clippy::print_stdout, reason = "part of a test")]
 fn check_primitives(folder: &Path) {
-    let bytes = std::fs::read(folder.join("quaternions.safetensors")).unwrap();
-    let given = Tensors(SafeTensors::deserialize(&bytes).unwrap());
+    let bytes = std::fs::read(folder.join("quaternions.safetensors")).expect("readable tensors");
+    let given = Tensors(SafeTensors::deserialize(&bytes).expect("readable tensors"));
     let (q, p, v, w) = (given.rows::<4>("q"), given.rows::<4>("p"), given.rows::<3>("v"), given.rows::<3>("w"));
     let flat = |m: [[f64; 3]; 3]| m.as_flattened().to_vec();
     let mut fixed = given.rows::<4>("qfix_in");

@@ -32,6 +32,7 @@ fn golden_metrics() {
     }
 }
 
+#[expect(clippy::print_stdout, reason = "part of a test")]
 fn check_metrics(folder: &Path) {
     let text = std::fs::read_to_string(folder.join("expected.json")).expect("expected.json");
     let expected: serde_json::Map<String, Value> = serde_json::from_str(&text).expect("expected.json");
