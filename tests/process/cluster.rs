@@ -14,7 +14,7 @@ use serde_json::{Value, json};
 
 const TRAINER: &str = env!("CARGO_BIN_EXE_trainer");
 /// A stage of several seconds, and the one before it.
-const VAE: [&str; 8] = [
+pub(super) const VAE: [&str; 8] = [
     "--set",
     "stages.vae.steps=400",
     "--set",
@@ -25,7 +25,7 @@ const VAE: [&str; 8] = [
     "vae",
 ];
 
-fn config() -> PathBuf {
+pub(super) fn config() -> PathBuf {
     Bench::repository().join("configs/smoke.yaml")
 }
 
@@ -48,7 +48,7 @@ fn undisturbed(sets: &[&str]) -> (Value, Curves) {
 
 /// Checks that each value was recorded exactly once at the same step, and that the digests are equal.
 #[track_caller]
-fn equals_reference(cluster: &Cluster, run: &str, view: &Value) {
+pub(super) fn equals_reference(cluster: &Cluster, run: &str, view: &Value) {
     equals(cluster, run, view, reference());
 }
 

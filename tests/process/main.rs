@@ -33,6 +33,7 @@ mod released;
 mod results;
 mod running;
 mod showpieces;
+mod stand_by;
 mod storage;
 mod streaming;
 mod sweeps;

@@ -7,7 +7,7 @@ use std::net::{SocketAddr, TcpListener, TcpStream};
 use std::os::unix::fs::PermissionsExt as _;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use nix::sys::signal::Signal;
 use serde_json::Value;
@@ -37,6 +37,9 @@ pub struct Cluster {
     bench: Bench,
     address: SocketAddr,
     server: Option<Running>,
+    /// Arguments of each server besides address and tokens.
+    of_servers: Vec<String>,
+    stand_by: Option<Running>,
     workers: BTreeMap<String, Running>,
 }
 
@@ -64,7 +67,19 @@ impl Cluster {
         if let Some(store) = store {
             std::os::unix::fs::symlink(store, bench.store()).expect("a link to the store");
         }
-        let mut cluster = Self { bench, address, server: None, workers: BTreeMap::new() };
+        Self::serving_with(bench, address, &[])
+    }
+
+    /// Like [`start`](Self::start), with more arguments for its servers.
+    pub fn start_with(trainer: &str, arguments: &[&str]) -> Self {
+        let bench = Bench::new(trainer).with_token(TOKEN);
+        fs::create_dir_all(bench.path().join("logs")).expect("a folder for logs");
+        Self::serving_with(bench, Self::free_address(), arguments)
+    }
+
+    fn serving_with(bench: Bench, address: SocketAddr, arguments: &[&str]) -> Self {
+        let of_servers = arguments.iter().map(|argument| (*argument).to_owned()).collect();
+        let mut cluster = Self { bench, address, server: None, of_servers, stand_by: None, workers: BTreeMap::new() };
         cluster.serve();
         cluster
     }
@@ -115,6 +130,30 @@ impl Cluster {
 
     /// Starts or restarts the coordinator and waits until it answers.
     pub fn serve(&mut self) {
+        let mut server = self.spawn_server("serve", &[]);
+        wait_for("the coordinator to answer", || {
+            assert!(server.alive(), "the coordinator ended:\n{}", self.said("serve"));
+            self.get("/v1/health")
+        });
+        self.server = Some(server);
+    }
+
+    /// Starts a second server, which stands by at the same address, and waits until it does.
+    pub fn stand_by(&mut self, arguments: &[&str]) {
+        self.stand_by = Some(self.spawn_server("stand-by", arguments));
+        wait_for("the second server to stand by", || self.said("stand-by").contains("standing by").then_some(()));
+    }
+
+    /// Kills the coordinator with `kill -9` and returns the time until the second server answers.
+    pub fn fail_over(&mut self) -> Duration {
+        self.kill_server();
+        let gone = Instant::now();
+        self.server = self.stand_by.take();
+        wait_for("the second server to answer", || self.get("/v1/health"));
+        gone.elapsed()
+    }
+
+    fn spawn_server(&self, who: &str, more: &[&str]) -> Running {
         let address = self.address.to_string();
         let tokens = self.bench.path().join("tokens");
         fs::write(&tokens, format!("admin admin {TOKEN}\nworkers worker {WORKER_TOKEN}\n")).expect("a token file");
@@ -124,12 +163,9 @@ impl Cluster {
         if !self.address.ip().is_loopback() {
             arguments.push("--insecure");
         }
-        let mut server = self.spawn("serve", &[], &arguments);
-        wait_for("the coordinator to answer", || {
-            assert!(server.alive(), "the coordinator ended:\n{}", self.said("serve"));
-            self.get("/v1/health")
-        });
-        self.server = Some(server);
+        arguments.extend(self.of_servers.iter().map(String::as_str));
+        arguments.extend(more);
+        self.spawn(who, &[], &arguments)
     }
 
     /// Kills the coordinator with `kill -9` and waits for its end.
