@@ -27,6 +27,7 @@ pub mod leaderboard;
 mod lease;
 mod lock;
 pub mod migrate;
+mod move_error;
 mod open_error;
 mod proofs;
 mod prove;

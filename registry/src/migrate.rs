@@ -9,25 +9,11 @@ use std::io::ErrorKind;
 use std::path::Path;
 
 use crate::catalog::PostgresAddress;
-use crate::error::QueryError;
 use crate::lock::Holder;
+pub use crate::move_error::MoveError;
 use crate::open_error::OpenError;
 use crate::store::{self, PostgresCatalog, Store};
 use crate::{folder, sql};
-
-/// Error of a move. The former database is unchanged.
-#[derive(Debug, thiserror::Error)]
-pub enum MoveError {
-    /// A database could not be opened.
-    #[error(transparent)]
-    Open(#[from] OpenError),
-    /// The copy failed or differs.
-    #[error("nothing was moved: {0}")]
-    Query(#[from] QueryError),
-    /// The store has its catalog there already, or the place has another one.
-    #[error("{0}")]
-    Refused(String),
-}
 
 /// Moves the catalog of the store in `dir` to an empty database of PostgreSQL. Returns the number of rows. The file stays beside, as
 /// `stride.db.moved`.

@@ -36,7 +36,7 @@ fn commands(bench: &Bench, block: &str) -> String {
 #[test]
 fn control_follows_a_path_without_data_of_others() {
     let bench = Bench::new(TRAINER);
-    train(&bench, "control-quickstart.yaml", 60, &["vae", "mld", "lcm", "first", "control"]);
+    train(&bench, "control-quickstart.yaml", 60, &["vae", "mld", "lcm", "first", "control", "evaluator"]);
     let said = commands(&bench, "control");
     assert!(said.contains("3 target positions: ") && said.contains("walk.png"), "{said}");
     assert!(bench.path().join("walk.png").metadata().is_ok_and(|file| file.len() > 10_000));

@@ -19,7 +19,7 @@ use crate::QueryError;
 use crate::catalog::PostgresAddress;
 use crate::identity::{StoreParts, Verdict};
 use crate::lock::Holder;
-use crate::migrate::MoveError;
+use crate::move_error::MoveError;
 use crate::open_error::OpenError;
 use crate::server_key::{self, ServerKey};
 use crate::store_id::{StoreId, Stored};

@@ -42,7 +42,7 @@ use super::settings::RunSettings;
 use super::tickets::Ticket;
 use super::{
     bundles, checkpoints, curves, draws, events, page_files, polls, queries, scrape, session_calls, settings, spans,
-    tickets, uploads,
+    uploads,
 };
 use crate::view::WorkerView;
 
@@ -121,7 +121,7 @@ fn table() -> Vec<Entry> {
             described::<Nothing, Json<message::Submit>, Json<Submitted>>("Submits a pipeline").with(SUBMISSION)),
         entry("POST", "/v1/draws",                 &[Submit],       CALL,                     SHORT, draws::draw,
             described::<Nothing, Json<Draw>, Json<Drawing>>("Draws motions of models for sentences").with(SUBMISSION)),
-        entry("POST", "/v1/tickets",               &[Submit],       CALL,                     SHORT, tickets::ticket,
+        entry("POST", "/v1/tickets",               &[Submit],       CALL,                     SHORT, session_calls::ticket,
             described::<Nothing, Nothing, Json<Ticket>>("Makes a ticket by which a browser enters a stream once")),
         entry("GET",  "/metrics",                  &[Read],         CALL,                     SHORT, scrape::metrics,
             described::<Nothing, Nothing, Exposition>("Shows the server's own numbers to Prometheus")),

@@ -23,6 +23,7 @@ mod events;
 mod extract;
 mod failure;
 mod launchers;
+mod line;
 mod lines;
 mod listener;
 mod meters;

@@ -13,7 +13,7 @@ use super::actor_handle::ActorHandle;
 use super::body::Message;
 use super::extract::Path;
 use super::failure::Failure;
-use super::lines::Line;
+use super::line::Line;
 use super::secrets::Proof;
 use crate::event::{Effect, Event};
 use crate::rejected::Rejected;

@@ -1,10 +1,11 @@
-//! The calls by which a browser signs in and out ([`sessions`](super::sessions)).
+//! The calls by which a browser signs in and out ([`sessions`](super::sessions)), and enters streams
+//! ([`tickets`](super::tickets)).
 
 use std::sync::Arc;
 
 use access::{Caller, Scope};
 use axum::extract::{Request, State};
-use axum::http::{HeaderName, header};
+use axum::http::{HeaderMap, HeaderName, StatusCode, header};
 use axum::{Extension, Json};
 use schemars::JsonSchema;
 use serde::Serialize;
@@ -15,7 +16,20 @@ use super::auth::{self, Gate};
 use super::clock::wall_clock;
 use super::failure::Failure;
 use super::sessions::{self, Current, Holder, LASTS_S};
+use super::tickets::Ticket;
 use super::token_table::Standing;
+
+/// Makes a ticket for the page that asks.
+pub(crate) async fn ticket(Extension(gate): Extension<Arc<Gate>>, headers: HeaderMap) -> Result<Json<Ticket>, Failure> {
+    let Some(offer) = &gate.stream else {
+        let message = "this server's page has no stream".to_owned();
+        return Err(Failure::new(StatusCode::NOT_FOUND, "not-found", message)
+            .hint("start it with `--stream`; programs show a token to `trainer generate --listen` themselves"));
+    };
+    let origin = headers.get(header::ORIGIN).and_then(|origin| origin.to_str().ok());
+    let origin = origin.ok_or_else(|| Failure::invalid("a ticket is for a page, which sends `Origin`".to_owned()))?;
+    Ok(Json(offer.ticket(origin)))
+}
 
 /// The caller and its scopes, which determine the buttons of the page.
 #[derive(Debug, Serialize, JsonSchema)]

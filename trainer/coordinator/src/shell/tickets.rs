@@ -6,19 +6,16 @@
 //! the list of subprotocols, the only header that it may choose.
 
 use std::collections::HashMap;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Mutex, PoisonError};
 
 use access::{Token, Tokens};
-use axum::http::{HeaderMap, StatusCode, Uri, header};
-use axum::{Extension, Json};
+use axum::http::{HeaderMap, Uri, header};
 use protocol::Digest;
 use registry::ServerKey;
 use schemars::JsonSchema;
 use serde::Serialize;
 
-use super::auth::Gate;
 use super::clock::wall_clock;
-use super::failure::Failure;
 use super::secrets::Secrets;
 use super::sessions::remember;
 
@@ -59,6 +56,16 @@ impl StreamOffer {
     pub(crate) fn origin(&self) -> &str {
         &self.origin
     }
+
+    /// Makes a ticket for a page of `origin`.
+    pub(crate) fn ticket(&self, origin: &str) -> Ticket {
+        let until_ms = wall_clock().0.saturating_add(LASTS_MS);
+        let nonce = Token::random().secret()[..32].to_owned();
+        let proof = secrets(self.token.digest()).of_ticket(origin, until_ms, &nonce);
+        let ticket = format!("{TICKET}{until_ms}.{nonce}.{proof}");
+        let url = format!("{}/v1/stream", self.origin);
+        Ticket { url, protocols: [STREAM_PROTOCOL.to_owned(), ticket], until_ms }
+    }
 }
 
 /// A ticket, with all that a browser needs to use it.
@@ -70,26 +77,6 @@ pub(crate) struct Ticket {
     protocols: [String; 2],
     /// Until when it is good, in milliseconds since 1970.
     until_ms: u64,
-}
-
-/// Makes a ticket for the page that asks.
-pub(crate) async fn ticket(Extension(gate): Extension<Arc<Gate>>, headers: HeaderMap) -> Result<Json<Ticket>, Failure> {
-    let Some(offer) = &gate.stream else {
-        let message = "this server's page has no stream".to_owned();
-        return Err(Failure::new(StatusCode::NOT_FOUND, "not-found", message)
-            .hint("start it with `--stream`; programs show a token to `trainer generate --listen` themselves"));
-    };
-    let origin = headers.get(header::ORIGIN).and_then(|origin| origin.to_str().ok());
-    let origin = origin.ok_or_else(|| Failure::invalid("a ticket is for a page, which sends `Origin`".to_owned()))?;
-    let until_ms = wall_clock().0.saturating_add(LASTS_MS);
-    let nonce = Token::random().secret()[..32].to_owned();
-    let proof = secrets(offer.token.digest()).of_ticket(origin, until_ms, &nonce);
-    let ticket = format!("{TICKET}{until_ms}.{nonce}.{proof}");
-    Ok(Json(Ticket {
-        url: format!("{}/v1/stream", offer.origin),
-        protocols: [STREAM_PROTOCOL.to_owned(), ticket],
-        until_ms,
-    }))
 }
 
 fn secrets(token: Digest) -> Secrets {
