@@ -467,6 +467,8 @@ fn p16_of_16_first_starts_one_has_the_store_and_15_say_who() {
         assert_eq!(said.code, Some(2), "{}", said.stderr);
         assert!(said.stderr.contains(&pid), "it should name process {pid}:\n{}", said.stderr);
     }
+    // The losers may give up before the winner has made the store.
+    wait_for("the winner to serve", || bench.store().join("token").exists().then_some(()));
     winner.signal(Signal::SIGTERM);
     assert_eq!(winner.wait().code, Some(0));
     bench.run(&["registry", "fsck"]).expect_code(0);

@@ -11,7 +11,7 @@ use crate::documented::{bash, programs};
 const TRAINER: &str = env!("CARGO_BIN_EXE_trainer");
 
 /// Beginnings of examples that this test leaves out: the reason, and the test that runs the command.
-const ELSEWHERE: [(&str, &str, &str); 17] = [
+const ELSEWHERE: [(&str, &str, &str); 18] = [
     ("trainer data fetch", "a network", "tests/process/bandai.rs"),
     ("trainer demo", "models of its own", "tests/process/demo.rs"),
     ("trainer doctor", "a server that is away", "tests/process/documented.rs"),
@@ -29,6 +29,7 @@ const ELSEWHERE: [(&str, &str, &str); 17] = [
     ("trainer man", "a manual's folder", "tests/process/documented.rs"),
     ("registry rollback", "an alias that moved twice", "tests/process/registry.rs"),
     ("registry adopt", "a copied bucket", "tests/process/buckets.rs"),
+    ("registry migrate", "a PostgreSQL", "registry/tests/migrate.rs"),
 ];
 
 /// Beginnings of examples whose results others need, in this order; then come the rest.

@@ -118,7 +118,7 @@ pub enum Verb {
     },
     /// Moves a store's catalog between its folder (SQLite) and PostgreSQL, and verifies every row; the blobs stay
     #[command(
-        after_help = "Example:\n  registry migrate --from .stride --to 'postgres://stride@db/stride?password-file=/run/secrets/stride'"
+        after_help = "Example:\n  registry migrate --from .stride --to 'postgres://stride@db/stride?password-file=catalog'"
     )]
     Migrate {
         /// The store's folder, or postgres://USER@HOST/DATABASE?password-file=FILE
