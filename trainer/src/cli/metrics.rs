@@ -127,8 +127,8 @@ async fn write_csv(reader: &Reader, run: &RunId, curves: &[CurveSeries]) -> Resu
             let points = reader.points(run, stage, key, page).await?;
             let Some(last) = points.last() else { break };
             page.after = Some(last.step);
-            let lines: Vec<String> = points.iter().map(|p| format!("{head},{},{}\n", p.step, p.value)).collect();
-            print::out(&lines.concat());
+            let lines: Vec<String> = points.iter().map(|p| format!("{head},{},{}", p.step, p.value)).collect();
+            print::out(&lines.join("\n"));
         }
     }
     Ok(())
