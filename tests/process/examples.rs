@@ -40,8 +40,16 @@ const FIRST: [&str; 5] =
 fn examples(bench: &Bench, command: &[&str], found: &mut BTreeSet<String>) {
     let help = bench.run(&[command, &["--help"]].concat()).expect_code(0).stdout;
     if let Some((_, listed)) = help.split_once("\nExample") {
-        let lines = listed.lines().skip(1).take_while(|line| !line.is_empty());
-        found.extend(lines.map(|line| line.trim().to_owned()));
+        let mut examples: Vec<String> = Vec::new();
+        for line in listed.lines().skip(1).take_while(|line| !line.is_empty()) {
+            let begins = ["trainer ", "registry "].iter().any(|program| line.trim_start().starts_with(program));
+            match examples.last_mut().filter(|_| !begins) {
+                // The help is wrapped to the width of a terminal.
+                Some(example) => *example = format!("{example} {}", line.trim()),
+                None => examples.push(line.trim().to_owned()),
+            }
+        }
+        found.extend(examples);
     }
     let Some((_, below)) = help.split_once("\nCommands:\n") else { return };
     let names = below.lines().take_while(|line| !line.is_empty()).filter_map(|line| {

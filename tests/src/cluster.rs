@@ -140,7 +140,7 @@ impl Cluster {
 
     /// Starts a second server, which stands by at the same address, and waits until it does.
     pub fn stand_by(&mut self, arguments: &[&str]) {
-        self.stand_by = Some(self.spawn_server("stand-by", arguments));
+        self.stand_by = Some(self.spawn_server("stand-by", &[&["--stand-by"], arguments].concat()));
         wait_for("the second server to stand by", || self.said("stand-by").contains("standing by").then_some(()));
     }
 

@@ -19,7 +19,8 @@ from .conftest import TRAINER, address
 VALUES = 1_000_000
 BATCH = 10_000
 """Values of one call, at most."""
-LIMIT_S = 1.0
+LIMIT_S = 1.0 if "release" in Path(TRAINER).parts else 4.0
+"""Seconds; a server that was built without optimisation gets more."""
 SECRET = "the-secret-of-a-worker-that-does-not-compute"
 PIPELINE = "name: million\nseed: 1\ndataset: {format: synthetic}\nstages: {vae: {kind: train.vae}}\n"
 
