@@ -13,7 +13,6 @@ const SECOND: [&str; 2] = ["--store", "second"];
 /// The leader is killed in the middle of a training stage of two workers. The stand-by answers at the same address.
 /// The run ends on the digests of an undisturbed run in SQLite, with every value once.
 #[test]
-#[ignore = "never seen to pass; tried by hand"]
 fn p4_a_stand_by_takes_over_in_the_middle_of_a_training_stage() {
     let Some(postgres) = Postgres::start() else { return };
     let blobs = tempfile::tempdir().expect("a folder for blobs");
