@@ -80,7 +80,7 @@ struct Inner {
     leading: Option<Leading>,
 }
 
-/// What a process has that leads a catalog in PostgreSQL.
+/// The state of a process that leads a catalog in PostgreSQL.
 #[derive(Debug)]
 struct Leading {
     leadership: Leadership,

@@ -83,7 +83,7 @@ impl Postgres {
 
 impl Place for Postgres {
     async fn open(&self) -> Opened {
-        // The leader's time is over and its session goes on, so that only the epoch protects the store.
+        // The leader's time is over, but its session is open. Only the epoch protects the store.
         let over = "DO $$ BEGIN IF to_regclass('leader') IS NOT NULL THEN UPDATE leader SET until = '-infinity'; END IF; END $$";
         self.server.sql(&self.database, over);
         let terms = LeaderTerms { terminates: false, ..LeaderTerms::default() };

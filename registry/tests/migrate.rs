@@ -99,7 +99,7 @@ async fn a_catalog_moves_there_and_back_and_the_former_one_is_refused() {
     let store = open(&dir).await;
     assert!(store.leadership().is_some() && !dir.join("stride.db").exists());
     assert_eq!(answers(&store).await, before);
-    // Numbers continue.
+    // New rows continue the numbers of the old ones.
     store.write(vec![Write::History(vec![HistoryEntry::new(HistoryKind::Left)])]).await.unwrap();
     store.write(vec![Write::Logs { grant: grant("r/s", 1), first: 2, lines: vec!["three".into()] }]).await.unwrap();
     let more = answers(&store).await;

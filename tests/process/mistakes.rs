@@ -203,7 +203,7 @@ fn compare(name: &str, found: &str) {
     assert_eq!(kept.lines().count(), found.lines().count(), "{name}; UPDATE_DOCS=1 writes it anew");
 }
 
-/// Checks a message: it begins with the mistake, and the mistake is not the program's.
+/// Checks that a message starts with the user's mistake and reports no fault of the program.
 fn check(what: &str, code: Option<i32>, said: &str) {
     assert!(matches!(code, Some(2 | 6 | 7)), "{what}: {code:?}\n{said}");
     assert!(said.starts_with("error: ") || said.contains("Usage: "), "{what}: {said}");

@@ -286,7 +286,7 @@ async fn set_run(
     run(conn, set.bind(run_id).bind(pipeline).bind(source).bind(state).bind(key).bind(now).bind(now)).await.map(|_| ())
 }
 
-/// Adds a shard to those that an order stores.
+/// Adds a shard to the shards of an order.
 fn add_shard<'a>(shards: &mut BTreeMap<&'a TaskId, Digest>, task: &'a TaskId, output: Digest) -> Result<()> {
     match shards.insert(task, output) {
         Some(other) if other != output => Err(two_shards(task, &other.to_string(), output)),

@@ -144,7 +144,7 @@ fn mismatched(dir: &Path, mismatch: crate::identity::Mismatch) -> OpenError {
     OpenError::Mismatch { dir: dir.to_owned(), mismatch }
 }
 
-/// What the new leader does before its writer starts.
+/// Prepares the store for the new leader, before its writer starts.
 async fn take_over(
     opening: &Opening<'_>,
     path: &Path,

@@ -92,8 +92,8 @@ pub(crate) async fn reach_epoch(dir: &Path, epoch: u64) -> Result<(), sqlx::Erro
     conn.close().await
 }
 
-/// Makes a pool of read-only connections that connect on first use. With `closed` the database has no writer and no log
-/// while they are open.
+/// Makes a pool of read-only connections that connect on first use. `closed` says that the database has no writer and
+/// no log while they are open.
 pub(crate) fn open_readers(dir: &Path, closed: bool) -> Pool {
     Pool::Sqlite(SqlitePoolOptions::new().max_connections(4).connect_lazy_with(reading(dir, closed)))
 }

@@ -1,7 +1,7 @@
 //! Copies of a whole catalog between databases of either kind, table by table.
 //!
-//! Every table has the same columns in both. A copy is verified: of each table, the rows in both databases have the same number and
-//! the same digest, whatever their order.
+//! Every table has the same columns in both. A copy is verified: each table has the same number of rows in both databases, and
+//! the same digest of them. The digest does not depend on the order of rows.
 
 use std::path::Path;
 
@@ -16,7 +16,7 @@ use crate::QueryError;
 
 type Result<T> = std::result::Result<T, QueryError>;
 
-/// All tables, each after those that it refers to or whose triggers fill it.
+/// All tables. A table follows the tables that it refers to, and those whose triggers fill it.
 pub(super) const TABLES: [&str; 36] = [
     "store",
     "facts",

@@ -14,7 +14,7 @@ pub const CONTENT_POLICY: &str =
 /// The chapter that is shown at the book's own address.
 pub const FIRST: &str = "introduction.html";
 
-// Defines `RENDERED`.
+// The build script writes this file, which defines `RENDERED`.
 include!(concat!(env!("OUT_DIR"), "/rendered.rs"));
 
 static FILES: LazyLock<Vec<File>> =

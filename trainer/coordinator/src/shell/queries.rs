@@ -174,7 +174,7 @@ pub(crate) async fn storage(State(actor_handle): State<Arc<ActorHandle>>) -> Res
         Finding::fail(
             "blobs",
             problem.what,
-            "look whether the disk has space or the bucket answers; training goes on meanwhile",
+            "look whether the disk has space or the bucket answers; training continues meanwhile",
         )
     });
     let (database_bytes, mut findings) = blocking(move || {
