@@ -131,7 +131,7 @@ pub(crate) async fn demo(args: DemoArgs, command: String) -> Result<u8> {
         print::out(&format!(
             "\nNext:\n  trainer generate \"a person claps\" --model {}:1 --store {} -o clap.gif\n  \
              trainer demo --ui{dir}       a page on which both models draw\n  \
-             trainer demo --train{dir}    trains such models in minutes, and shows how they learn",
+             trainer demo --train{dir}    trains such models, and shows how they learn",
             NAMES[1],
             shown(&store)
         ));
