@@ -8,10 +8,10 @@ use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
-use common::{artifact, note, open, version};
+use common::{artifact, fence, grant, note, open, result, run_in, version};
 use protocol::{ArtifactKind, Digest};
 use registry::backup::{BackupError, restore};
-use registry::{ReadStore, Store};
+use registry::{ReadStore, Store, Write};
 
 async fn add(store: &Store, content: &str) -> Digest {
     let model = artifact(store.blobs(), ArtifactKind::Model, content);
@@ -66,6 +66,30 @@ async fn a_backup_of_a_store_in_use_is_restored_as_it_was_at_that_moment() {
     assert_eq!(summary.blobs, 4);
     let read = ReadStore::open(&again).await.unwrap();
     assert_eq!(artifacts(read.versions(&"m".into()).await.unwrap()), [first, later]);
+}
+
+/// Until a collection, the rows of shards remain that the results of a finished run replace. A backup has their rows and
+/// not their blobs.
+#[tokio::test]
+async fn a_backup_between_the_end_of_a_run_and_a_collection_is_restored() {
+    let root = tempfile::tempdir().unwrap();
+    let (dir, backup, back) = (root.path().join("store"), root.path().join("backup"), root.path().join("back"));
+    let store = open(&dir).await;
+    let output = artifact(store.blobs(), ArtifactKind::Shard, "a part of the result");
+    let whole = artifact(store.blobs(), ArtifactKind::Dataset, "the result");
+    store.write(vec![run_in("running"), fence("r/s/0", 1)]).await.unwrap();
+    store.write(vec![Write::Shard { grant: grant("r/s/0", 1), output }]).await.unwrap();
+    store.write(vec![result("k", whole), run_in("finished")]).await.unwrap();
+    assert_eq!(store.shards(&"r".into()).await.unwrap().len(), 1, "nothing was collected yet");
+
+    store.backup(&backup).await.unwrap();
+    restore(&backup, &back, None).await.unwrap();
+    let copy = open(&back).await;
+    assert!(copy.blobs().exists(whole).unwrap() && !copy.blobs().exists(output).unwrap());
+    assert!(copy.fsck().await.unwrap().problems.is_empty());
+    copy.gc(-1000).await.unwrap();
+    assert!(copy.shards(&"r".into()).await.unwrap().is_empty());
+    assert!(copy.fsck().await.unwrap().problems.is_empty());
 }
 
 #[tokio::test]

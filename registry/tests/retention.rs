@@ -5,7 +5,7 @@ mod common;
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use common::{artifact, fence, grant, metrics, open, result, rows};
+use common::{artifact, fence, grant, metrics, open, result, rows, run_in};
 use protocol::stage::{Keep, Mode};
 use protocol::{ArtifactKind, Digest, Manifest, TaskId};
 use registry::testing::slow::SlowBucket;
@@ -80,26 +80,19 @@ async fn checkpoints_are_pruned_by_policy_and_only_the_unneeded_is_collected() {
 async fn shards_go_once_their_run_is_finished_and_pins_stay() {
     let dir = tempfile::tempdir().unwrap();
     let store = open(dir.path()).await;
-    let run = |state: &str| Write::Run {
-        run: "r".into(),
-        pipeline: json!({}),
-        source: String::new(),
-        state: state.into(),
-        idempotency_key: None,
-    };
     let shard = |content| artifact(store.blobs(), ArtifactKind::Shard, content);
     let (first, second) = (shard("first"), shard("second"));
-    store.write(vec![run("failed"), fence("r/s/0", 1), fence("r/s/1", 1)]).await.unwrap();
+    store.write(vec![run_in("failed"), fence("r/s/0", 1), fence("r/s/1", 1)]).await.unwrap();
     for (task, output) in [("r/s/0", first), ("r/s/1", second)] {
         store.write(vec![Write::Shard { grant: grant(task, 1), output }]).await.unwrap();
     }
     store.pin(second, "to look at").await.unwrap();
     for state in ["failed", "cancelled", "paused", "running"] {
-        store.write(vec![run(state)]).await.unwrap();
+        store.write(vec![run_in(state)]).await.unwrap();
         assert!(store.gc(-1000).await.unwrap().remove.is_empty(), "a {state} run may go on");
         assert_eq!(store.shards(&"r".into()).await.unwrap().len(), 2, "a {state} run may go on");
     }
-    store.write(vec![run("finished")]).await.unwrap();
+    store.write(vec![run_in("finished")]).await.unwrap();
     assert_eq!(store.gc(-1000).await.unwrap().remove.len(), 2);
     assert!(store.shards(&"r".into()).await.unwrap().is_empty());
     assert!(store.blobs().exists(second).unwrap());
@@ -134,15 +127,8 @@ fn put_before(dir: &std::path::Path, digest: Digest, minutes: u64) {
 #[tokio::test]
 async fn no_grace_does_not_reach_behind_a_restart_while_a_run_is_under_way() {
     let dir = tempfile::tempdir().unwrap();
-    let run = |state: &str| Write::Run {
-        run: "r".into(),
-        pipeline: json!({}),
-        source: String::new(),
-        state: state.into(),
-        idempotency_key: None,
-    };
     let store = open(dir.path()).await;
-    store.write(vec![run("running")]).await.unwrap();
+    store.write(vec![run_in("running")]).await.unwrap();
     let uploaded = store.blobs().put(b"its outcome is on its way").unwrap();
     let old = store.blobs().put(b"older than any upload waits").unwrap();
     drop(store);
@@ -150,7 +136,7 @@ async fn no_grace_does_not_reach_behind_a_restart_while_a_run_is_under_way() {
     put_before(dir.path(), old, 90);
     let store = open(dir.path()).await;
     assert_eq!(store.gc(0).await.unwrap().remove, [old]);
-    store.write(vec![run("finished")]).await.unwrap();
+    store.write(vec![run_in("finished")]).await.unwrap();
     assert_eq!(store.gc(0).await.unwrap().remove, [uploaded]);
 }
 

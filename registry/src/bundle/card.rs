@@ -69,19 +69,7 @@ pub fn card(version: &Version, manifest: &Manifest, model: &Model, parts: &BTree
         Some(sampler) => line(format_args!("Default settings, as evaluated: {sampler}.")),
         None => line(format_args!("Not evaluated; sampling uses the papers' settings.")),
     }
-    line(format_args!("\n## Metrics\n"));
-    let measured = leaderboard::measured(version);
-    if measured.is_empty() {
-        line(format_args!("None."));
-    } else {
-        line(format_args!("| evaluation | metric | value, ± half the 95 % interval |\n|---|---|---:|"));
-        for (stage, measures) in &measured {
-            for (metric, measure) in leaderboard::in_order(measures) {
-                let stage = stage.as_deref().unwrap_or("-");
-                line(format_args!("| {} | {} | {} |", cell(stage), cell(metric), leaderboard::in_words(measure)));
-            }
-        }
-    }
+    line(format_args!("\n## Metrics\n\n{}", metrics(version)));
     line(format_args!(
         "\n## How to generate motions\n\n```sh\nregistry import {name}-{number}.tar.zst\n\
          trainer generate \"a person walks in a circle\" --model {name}@latest -o walk.bvh\n```\n\n\
@@ -91,6 +79,18 @@ pub fn card(version: &Version, manifest: &Manifest, model: &Model, parts: &BTree
         manifest.files.values().map(|file| file.bytes).sum::<u64>(),
     ));
     text
+}
+
+/// The table of what was measured.
+fn metrics(version: &Version) -> String {
+    let mut lines = vec!["| evaluation | metric | value, ± half the 95 % interval |\n|---|---|---:|".to_owned()];
+    for (stage, measures) in leaderboard::measured(version) {
+        let stage = cell(stage.as_deref().unwrap_or("-"));
+        for (metric, measure) in leaderboard::in_order(&measures) {
+            lines.push(format!("| {stage} | {} | {} |", cell(metric), leaderboard::in_words(measure)));
+        }
+    }
+    if lines.len() == 1 { "None.".to_owned() } else { lines.join("\n") }
 }
 
 /// Formats the shown keys of a part's meta in a line.

@@ -167,7 +167,7 @@ impl Place {
             Self::Here(store) => Ok(run(command.clone(), store, &user()).await),
             Self::Reading(store) => Ok(read(command.clone(), store).await),
             Self::At(server) => {
-                let sent = server.request(Method::POST, "/v1/registry").json(command).send().await;
+                let sent = server.send(server.request(Method::POST, "/v1/registry").json(command)).await;
                 match check(sent).await? {
                     Ok(response) => response.json().await.map_err(|e| CallError::Incomplete(explain(&e))),
                     Err(refused) => Ok(Answer::refused(refused)),
@@ -328,7 +328,8 @@ async fn import(place: &Place, file: &Path, model: Option<&str>) -> Result<Answe
                 }
             };
             let request = server.request(Method::POST, &path).header(CONTENT_LENGTH, bytes);
-            match check(request.body(Body::wrap_stream(pieces(file))).send().await).await? {
+            let sent = server.send(request.body(Body::wrap_stream(pieces(file)))).await;
+            match check(sent).await? {
                 Ok(response) => {
                     let mut answer: Answer = response.json().await.map_err(|e| CallError::Incomplete(explain(&e)))?;
                     if let Some(Data::Imported { file, .. }) = &mut answer.data {
@@ -367,7 +368,7 @@ impl Source for Place {
                         None,
                     )
                 };
-                let sent = server.request(Method::GET, &format!("/v1/blobs/{digest}")).send().await;
+                let sent = server.send(server.request(Method::GET, &format!("/v1/blobs/{digest}"))).await;
                 let mut response = check(sent).await.map_err(lost)??;
                 while let Some(part) = response.chunk().await.map_err(|e| lost(CallError::Incomplete(explain(&e))))? {
                     into(&part).map_err(unwritten)?;

@@ -8,7 +8,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use protocol::message::Grant;
-use protocol::{Digest, Fence, TaskId};
+use protocol::{Digest, Fence, RunId, TaskId};
 
 use super::error::write_error;
 use super::recording::Recording;
@@ -44,19 +44,13 @@ pub(super) async fn apply(
             Write::Run { run, pipeline, source, state, idempotency_key } => {
                 set_run(conn, run.as_str(), &pipeline.to_string(), source, state, idempotency_key.as_deref()).await?;
             }
-            Write::Submission { run: of, digest } => {
-                let set = query("INSERT INTO submissions (run, digest) VALUES (?, ?) ON CONFLICT DO NOTHING");
-                run(conn, set.bind(of.as_str()).bind(digest.to_string())).await?;
-            }
+            Write::Submission { run, digest } => add_submission(conn, run, *digest).await?,
             Write::RunOwner { run, owner } => owners::own_run(conn, run, owner).await?,
             Write::ModelOwner { model, owner } => owners::claim(conn, model, owner).await?,
-            Write::RunState { run: of, state } => {
-                let set = query("UPDATE runs SET state = ?, updated_ms = ? WHERE run = ?");
-                run(conn, set.bind(state).bind(now).bind(of.as_str())).await?;
-            }
+            Write::RunState { run, state } => set_run_state(conn, run, state, now).await?,
             Write::RunEnded { run: of, state, view, archive } => {
-                let set = query("UPDATE runs SET state = ?, updated_ms = ?, view = ?, archive = ? WHERE run = ?");
-                let set = set.bind(state).bind(now).bind(view).bind(archive);
+                set_run_state(conn, of, state, now).await?;
+                let set = query("UPDATE runs SET view = ?, archive = ? WHERE run = ?").bind(view).bind(archive);
                 run(conn, set.bind(of.as_str())).await?;
             }
             Write::Archive { key, run: of, stage, execution } => {
@@ -67,29 +61,15 @@ pub(super) async fn apply(
             Write::Logs { grant, first, lines } => logs::add(conn, grant, *first, lines).await?,
             Write::Checkpoint { grant, step, manifest, metrics } => {
                 proven(conn, proofs, *manifest).await?;
-                one_checkpoint_a_step(conn, &grant.task, *step, *manifest).await?;
-                let insert = query(
-                    "INSERT INTO checkpoints (task, attempt, step, manifest, metrics, at_ms) VALUES (?, ?, ?, ?, ?, ?) \
-                     ON CONFLICT DO NOTHING",
-                );
-                let insert = insert.bind(grant.task.as_str()).bind(int(grant.attempt.0)).bind(int(*step));
-                run(conn, insert.bind(manifest.to_string()).bind(json(metrics)).bind(clock::now_ms())).await?;
+                add_checkpoint(conn, grant, *step, *manifest, &json(metrics)).await?;
             }
             Write::Shard { grant, output } => {
                 proven(conn, proofs, *output).await?;
                 add_shard(&mut shards, &grant.task, *output)?;
             }
             Write::StageResult { grant: _, key, run, stage, kind, outputs, metrics, inputs, wall_s } => {
-                let made = Made {
-                    key: *key,
-                    run: run.as_str(),
-                    stage: stage.as_str(),
-                    kind,
-                    outputs,
-                    metrics,
-                    inputs,
-                    wall_s: *wall_s,
-                };
+                let (run, stage) = (run.as_str(), stage.as_str());
+                let made = Made { key: *key, run, stage, kind, outputs, metrics, inputs, wall_s: *wall_s };
                 set_result(conn, proofs, &made).await?;
             }
             Write::Version { model, artifact, metrics, source } => {
@@ -97,22 +77,35 @@ pub(super) async fn apply(
                 moves::register(conn, model, *artifact, kind, metrics, source).await?;
             }
             Write::Promote { model, alias, artifact, require, reason, actor } => {
-                let order = PromoteOrder {
-                    model: model.clone(),
-                    alias: alias.clone(),
-                    to: Which::Artifact(*artifact),
-                    expect: None,
-                    require: require.clone(),
-                    reason: reason.clone(),
-                    actor: actor.clone(),
-                };
-                moves::promote(conn, &order).await?;
+                let (model, alias, to) = (model.clone(), alias.clone(), Which::Artifact(*artifact));
+                let (require, reason, actor) = (require.clone(), reason.clone(), actor.clone());
+                moves::promote(conn, &PromoteOrder { model, alias, to, expect: None, require, reason, actor }).await?;
             }
         }
     }
     add_facts(conn, &decisions).await?;
     add_shards(conn, &shards).await?;
     fences.write(conn).await
+}
+
+async fn add_submission(conn: &mut Conn<'_>, of: &RunId, digest: Digest) -> Result<()> {
+    let set = query("INSERT INTO submissions (run, digest) VALUES (?, ?) ON CONFLICT DO NOTHING");
+    run(conn, set.bind(of.as_str()).bind(digest.to_string())).await.map(drop)
+}
+
+async fn set_run_state(conn: &mut Conn<'_>, of: &RunId, state: &str, now: i64) -> Result<()> {
+    let set = query("UPDATE runs SET state = ?, updated_ms = ? WHERE run = ?");
+    run(conn, set.bind(state).bind(now).bind(of.as_str())).await.map(drop)
+}
+
+async fn add_checkpoint(conn: &mut Conn<'_>, grant: &Grant, step: u64, manifest: Digest, metrics: &str) -> Result<()> {
+    one_checkpoint_a_step(conn, &grant.task, step, manifest).await?;
+    let insert = query(
+        "INSERT INTO checkpoints (task, attempt, step, manifest, metrics, at_ms) VALUES (?, ?, ?, ?, ?, ?) \
+         ON CONFLICT DO NOTHING",
+    );
+    let insert = insert.bind(grant.task.as_str()).bind(int(grant.attempt.0)).bind(int(step));
+    run(conn, insert.bind(manifest.to_string()).bind(metrics).bind(clock::now_ms())).await.map(drop)
 }
 
 /// Checks that an artifact which a row is about to name is proven, and records its blobs as stored.

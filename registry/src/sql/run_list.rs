@@ -58,58 +58,9 @@ pub(super) async fn page(conn: &mut Conn<'_>, asked: &RunListQuery, group: Optio
         _ if !conn.is_sqlite() => None,
         words => Some(candidates(conn, words, asked.order, after).await?),
     };
-    let mut find = Builder::new("SELECT * FROM (");
-    let all = [RunState::Running, RunState::Paused, RunState::Finished, RunState::Failed, RunState::Cancelled];
-    let states: Vec<RunState> = match asked.states.is_empty() {
-        // The indexes begin with these columns; without them, the list is read in its own order.
-        true if asked.pipeline.is_none() && owner.is_none() && asked.order != RunOrder::Changed => Vec::new(),
-        true => all.to_vec(),
-        false => all.into_iter().filter(|state| asked.states.contains(state)).collect(),
-    };
-    let limit = i64::from(asked.limit) + 1;
     let is_indexed = conn.is_sqlite();
-    let part = |find: &mut Builder<'_>, state: Option<RunState>| {
-        find.push("SELECT * FROM (SELECT * FROM run_list WHERE true");
-        if let Some(state) = state {
-            find.push(" AND state = ").push_bind(state.name());
-        }
-        if let Some(pipeline) = &asked.pipeline {
-            find.push(" AND pipeline = ").push_bind(pipeline.clone());
-        }
-        if let Some(owner) = owner {
-            find.push(" AND owner = ").push_bind(owner.as_str().to_owned());
-        }
-        if let Some(found) = &found {
-            find.push(" AND number IN {numbers ?}").bind(json(found));
-        }
-        match (asked.order, after) {
-            (_, None) => {}
-            (RunOrder::Newest, Some(after)) => drop(find.push(" AND number < ").push_bind(after.number)),
-            (RunOrder::Oldest, Some(after)) => drop(find.push(" AND number > ").push_bind(after.number)),
-            (RunOrder::Changed, Some(after)) => {
-                find.push(" AND (changed_ms, number) < (").push_bind(after.changed_ms).push(", ");
-                find.push_bind(after.number).push(")");
-            }
-        }
-        // A word that folds in other ways than SQLite's is left to the index.
-        for word in words.iter().filter(|word| !is_indexed || word.is_ascii() || word.chars().count() < INDEXED) {
-            let text = " AND {find}({lower}(run || ' ' || pipeline || ' ' || owner || ' ' || token || ' ' || note), ";
-            find.push(text).push_bind(word.clone()).push(") > 0");
-        }
-        find.push(order(asked.order)).push(" LIMIT ").push_bind(limit).push(") AS part");
-    };
-    match states.split_first() {
-        None => part(&mut find, None),
-        Some((first, others)) => {
-            part(&mut find, Some(*first));
-            for state in others {
-                find.push(" UNION ALL ");
-                part(&mut find, Some(*state));
-            }
-        }
-    }
-    find.push(") AS parts").push(order(asked.order)).push(" LIMIT ").push_bind(limit);
-    let rows = find.build().fetch_all(conn).await?;
+    let selection = Selection { asked, owner, after, words: &words, found: found.as_deref(), is_indexed };
+    let rows = selection.query().build().fetch_all(conn).await?;
     let shown = rows.len().min(asked.limit as usize);
     let more = rows.len() > shown;
     let last = rows[..shown].last().map(place).transpose()?;
@@ -122,6 +73,85 @@ pub(super) async fn page(conn: &mut Conn<'_>, asked: &RunListQuery, group: Optio
     };
     let rows = rows[..shown].iter().map(summary).collect::<Result<_>>()?;
     Ok(RunPage { rows, next: next.map(Place::text) })
+}
+
+/// The rows of one page of the list.
+struct Selection<'a> {
+    asked: &'a RunListQuery,
+    owner: Option<&'a Group>,
+    after: Option<Place>,
+    words: &'a [String],
+    /// Numbers of the runs that may have the words, if an index knows them.
+    found: Option<&'a [i64]>,
+    is_indexed: bool,
+}
+
+impl Selection<'_> {
+    /// One query for each state, because the indexes begin with the state. Reads one row more than the page has.
+    fn query(&self) -> Builder<'static> {
+        let mut find = Builder::new("SELECT * FROM (");
+        match self.states().split_first() {
+            None => self.add_part(&mut find, None),
+            Some((first, others)) => {
+                self.add_part(&mut find, Some(*first));
+                for state in others {
+                    find.push(" UNION ALL ");
+                    self.add_part(&mut find, Some(*state));
+                }
+            }
+        }
+        find.push(") AS parts").push(order(self.asked.order)).push(" LIMIT ").push_bind(self.limit());
+        find
+    }
+
+    fn limit(&self) -> i64 {
+        i64::from(self.asked.limit) + 1
+    }
+
+    /// The states to read one by one; empty if the list is read in its own order.
+    fn states(&self) -> Vec<RunState> {
+        let all = [RunState::Running, RunState::Paused, RunState::Finished, RunState::Failed, RunState::Cancelled];
+        let asked = self.asked;
+        if !asked.states.is_empty() {
+            return all.into_iter().filter(|state| asked.states.contains(state)).collect();
+        }
+        if asked.pipeline.is_none() && self.owner.is_none() && asked.order != RunOrder::Changed {
+            return Vec::new();
+        }
+        all.to_vec()
+    }
+
+    fn add_part(&self, find: &mut Builder<'_>, state: Option<RunState>) {
+        find.push("SELECT * FROM (SELECT * FROM run_list WHERE true");
+        if let Some(state) = state {
+            find.push(" AND state = ").push_bind(state.name());
+        }
+        if let Some(pipeline) = &self.asked.pipeline {
+            find.push(" AND pipeline = ").push_bind(pipeline.clone());
+        }
+        if let Some(owner) = self.owner {
+            find.push(" AND owner = ").push_bind(owner.as_str().to_owned());
+        }
+        if let Some(found) = self.found {
+            find.push(" AND number IN {numbers ?}").bind(json(found));
+        }
+        match (self.asked.order, self.after) {
+            (_, None) => {}
+            (RunOrder::Newest, Some(after)) => drop(find.push(" AND number < ").push_bind(after.number)),
+            (RunOrder::Oldest, Some(after)) => drop(find.push(" AND number > ").push_bind(after.number)),
+            (RunOrder::Changed, Some(after)) => {
+                find.push(" AND (changed_ms, number) < (").push_bind(after.changed_ms).push(", ");
+                find.push_bind(after.number).push(")");
+            }
+        }
+        // A word that folds in other ways than SQLite's is left to the index.
+        let by_index = |word: &String| self.is_indexed && !word.is_ascii() && word.chars().count() >= INDEXED;
+        for word in self.words.iter().filter(|word| !by_index(word)) {
+            let text = " AND {find}({lower}(run || ' ' || pipeline || ' ' || owner || ' ' || token || ' ' || note), ";
+            find.push(text).push_bind(word.clone()).push(") > 0");
+        }
+        find.push(order(self.asked.order)).push(" LIMIT ").push_bind(self.limit()).push(") AS part");
+    }
 }
 
 fn order(order: RunOrder) -> &'static str {

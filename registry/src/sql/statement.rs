@@ -376,7 +376,7 @@ pub(super) fn int(number: u64) -> i64 {
     i64::try_from(number).unwrap_or(i64::MAX)
 }
 
-pub(super) fn json<T: serde::Serialize>(value: &T) -> String {
+pub(super) fn json<T: serde::Serialize + ?Sized>(value: &T) -> String {
     // Maps of names to numbers or digests always serialise.
     serde_json::to_string(value).unwrap_or_else(|e| panic!("cannot serialise a row: {e}"))
 }

@@ -75,6 +75,12 @@ pub fn fence(task: &str, fence: u64) -> Write {
     Write::Fence { task: TaskId::new(task), fence: Fence(fence) }
 }
 
+/// The row of run `r` in a state.
+pub fn run_in(state: &str) -> Write {
+    let (run, source, idempotency_key) = ("r".into(), String::new(), None);
+    Write::Run { run, pipeline: json!({}), source, state: state.into(), idempotency_key }
+}
+
 /// A write that no other row refers to.
 pub fn note(what: impl Into<serde_json::Value>) -> Write {
     static NEXT: std::sync::atomic::AtomicU64 = std::sync::atomic::AtomicU64::new(1);

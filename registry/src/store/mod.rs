@@ -16,33 +16,34 @@
 //! One process holds a store. With PostgreSQL several folders may belong to a store, and one process leads
 //! ([`Leadership`]). A second one gets the holder's name and sends its requests there over HTTP.
 
-use std::fs::{self, DirBuilder};
+mod opening;
+mod parts;
+
 use std::io;
-use std::os::unix::fs::{DirBuilderExt, MetadataExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
-use checkpoint::BlobError;
 use protocol::stage::Keep;
 use protocol::{Alias, Digest, Group, ModelName, RunId, TaskId};
 
-use crate::blob::disk::{free_bytes, write_whole};
-use crate::blob::place::{Location, Place};
+use self::opening::{Asked, Purpose};
+use self::parts::{Inspection, RequestedPlace, make_folder, refuse_other_files, remembered_catalog, there};
+pub(crate) use self::parts::{forget_catalog, remember_catalog};
+use crate::blob::place::Place;
 use crate::blob::{Backend, BlobStore};
 use crate::calls::Calls;
 use crate::catalog::{Catalog, Done, Order, PostgresAddress, PromoteOrder, Records, RollbackOrder, Which};
 use crate::forget::Forgotten;
-use crate::identity::{self, Held, Marker, MarkerError, StoreParts, Verdict, Witness};
-use crate::lease::{self, Lease, LeaseTerms};
-use crate::lock::{self, Holder, SharedLock, StoreLock, Taken, network_filesystem};
+use crate::identity;
+use crate::lease::{Lease, LeaseTerms};
+use crate::lock::{self, Holder, SharedLock, StoreLock, network_filesystem};
 use crate::open_error::OpenError;
 use crate::proofs::Proofs;
-use crate::reserve::{self, OPEN_NEEDS_BYTES};
 use crate::scoped::ScopedRecords;
 use crate::server_key::{self, ServerKey};
-use crate::sql::{self, LeaderTerms, Leadership, Link, Opened, Session, SqlCatalog, SqlRecords, Writer};
-use crate::store_id::{StoreId, Stored};
+use crate::sql::{self, LeaderTerms, Leadership, SqlRecords};
+use crate::store_id::StoreId;
 use crate::versions::{Expect, Pick, Promotion};
 use crate::{WriteError, clock, folder};
 
@@ -269,7 +270,7 @@ impl Store {
     ) -> Result<Self, OpenError> {
         make_folder(dir)?;
         let asked = Asked { place: RequestedPlace::Given(blobs), terms, ..Asked::to(Purpose::Work) };
-        Self::take_by(dir, asked, holder).await
+        opening::open(dir, asked, holder).await
     }
 
     /// Opens or creates a store whose catalog is in PostgreSQL, and leads it. `dir` is this process's own folder.
@@ -282,7 +283,7 @@ impl Store {
         make_folder(dir)?;
         let asked =
             Asked { place: RequestedPlace::named(blobs), catalog: Some(catalog.clone()), ..Asked::to(Purpose::Work) };
-        Self::take_by(dir, asked, holder).await
+        opening::open(dir, asked, holder).await
     }
 
     /// Opens or creates a store whose catalog is in PostgreSQL over a given backend. For tests.
@@ -295,7 +296,7 @@ impl Store {
         make_folder(dir)?;
         let asked =
             Asked { place: RequestedPlace::Given(blobs), catalog: Some(catalog.clone()), ..Asked::to(Purpose::Work) };
-        Self::take_by(dir, asked, holder).await
+        opening::open(dir, asked, holder).await
     }
 
     /// Returns once no other process leads the catalog.
@@ -328,108 +329,7 @@ impl Store {
     }
 
     async fn take(dir: &Path, place: RequestedPlace, holder: Holder, purpose: Purpose) -> Result<Self, OpenError> {
-        Self::take_by(dir, Asked { place, ..Asked::to(purpose) }, holder).await
-    }
-
-    async fn take_by(dir: &Path, asked: Asked, holder: Holder) -> Result<Self, OpenError> {
-        let io = |path: &Path, e: io::Error| OpenError::io(path, &e);
-        let dir = dir.canonicalize().map_err(|e| io(dir, e))?;
-        close_to_others(&dir).map_err(|e| io(&dir, e))?;
-        if let Some(kind) = network_filesystem(&dir).map_err(|e| io(&dir, e))? {
-            return Err(OpenError::NetworkFilesystem { dir, kind });
-        }
-        let path = dir.join("lock");
-        let lock = match StoreLock::take(&path, holder).await.map_err(|e| io(&path, e))? {
-            Taken::Ours(lock) => Arc::new(lock),
-            Taken::Busy(holder) => return Err(OpenError::Busy { dir, holder }),
-        };
-        let free = free_bytes(&dir).map_err(|e| io(&dir, e))?;
-        if asked.purpose == Purpose::Collect {
-            reserve::release_if_full(&dir);
-        } else if free < OPEN_NEEDS_BYTES {
-            let message = format!("{free} bytes are free, {OPEN_NEEDS_BYTES} are needed");
-            return Err(OpenError::Full { path: dir, message });
-        }
-        let catalog = choose_catalog(&dir, asked.catalog.clone())?;
-        // Read under the lock, so that no other process is creating the store.
-        let adopt = asked.purpose == Purpose::Adopt;
-        let mut inspection = Inspection::of(&dir, &asked.place, adopt).await?;
-        // The leader of a catalog needs no lease on the blobs: the marker has its epoch.
-        let is_leased = catalog.is_none() && inspection.location.is_shared(&dir);
-        if is_leased && inspection.found.marker().is_some_and(|marker| marker.held.is_some()) {
-            wait_until_free(&dir, &inspection, asked.terms).await?;
-            inspection = Inspection::of(&dir, &asked.place, adopt).await?;
-        }
-        let is_new = !folder::has_database(&dir) && inspection.found.evidence().is_none();
-        if inspection.to_remember && (is_new || catalog.is_some()) && !adopt {
-            // Written before the database exists; an existing database has a known place of blobs.
-            inspection.place.remember(&dir).map_err(|e| io(&dir, e))?;
-        }
-        let begun = Instant::now();
-        let Database { opened: Opened { mut link, store: id, verdict }, led } =
-            Database::open(&dir, &mut inspection, catalog.as_ref(), adopt, &lock.holder()).await?;
-        if inspection.to_remember && adopt {
-            inspection.place.remember(&dir).map_err(|e| io(&dir, e))?;
-        }
-        let (location, opening) = (inspection.location, dir.clone());
-        let opened = tokio::task::spawn_blocking(move || location.open()).await;
-        let blobs = opened.map_err(|e| io(&opening, io::Error::other(e)))?.map_err(|e| io(&opening, e))?;
-        let mut marker = inspection.found.marker().cloned();
-        if let Verdict::New | Verdict::Unfinished(_) = verdict {
-            marker = Some(mark(&dir, &blobs, marker, &Stored { id: id.clone(), epoch: 0, commits: 0 }, None).await?);
-        }
-        let stored = match (&mut link, &catalog, &led) {
-            (Link::Sqlite(conn), _, _) => sql::sqlite::raise_epoch(&dir, conn).await?,
-            (link, Some(catalog), Some((epoch, _))) => {
-                sql::postgres::raise_epoch(&catalog.address, link, *epoch).await?
-            }
-            (Link::Postgres(_), _, _) => return Err(OpenError::NotAStore(dir)),
-        };
-        let held = is_leased.then(|| lease::held(&dir, &lock.holder())).transpose().map_err(|e| io(&dir, e))?;
-        let leased_at = Instant::now();
-        let marker = mark(&dir, &blobs, marker, &stored, held).await?;
-        let lease = is_leased.then(|| Lease::begin(blobs.place(), marker, leased_at, asked.terms));
-        let lease = lease.transpose().map_err(|e| io(&dir, e))?;
-        if let Some(lease) = &lease {
-            let check = lease.checked();
-            blobs.permit_removals_by(move || check.may_remove());
-        }
-        let leading = led.zip(catalog.as_ref()).map(|((_, server_key), catalog)| {
-            let leadership = Leadership::begin(stored.epoch, catalog.terms, begun);
-            let check = leadership.clone();
-            blobs.permit_removals_by(move || check.may_remove());
-            Leading { leadership, server_key }
-        });
-        let witness = Witness::begin(&dir, &stored).map_err(|e| io(&dir, e))?;
-        reserve::keep(&dir);
-        remove_files_of_earlier_builds(&dir).map_err(|e| io(&dir, e))?;
-        // By the writer's connection: a reader's would close the database later than the store.
-        for (task, held) in sql::held(&mut link).await.map_err(|e| io(&dir, io::Error::other(e)))? {
-            held.into_iter().for_each(|digest| blobs.hold(&task, digest));
-        }
-        let session = Session {
-            link,
-            epoch: stored.epoch,
-            commits: stored.commits,
-            witness,
-            leading: leading
-                .as_ref()
-                .map(|leading| leading.leadership.clone())
-                .zip(catalog.as_ref().map(|c| c.address.clone())),
-        };
-        let proofs = Arc::new(Proofs::new(lease.as_ref().map(Lease::checked)));
-        let writer = Writer::start(session, Arc::clone(&proofs), Arc::clone(&lock)).map_err(|e| io(&dir, e))?;
-        let readers = match &catalog {
-            None => sql::sqlite::open_readers(&dir, false),
-            Some(catalog) => sql::postgres::open_readers(&catalog.address)?,
-        };
-        let records = Arc::new(SqlRecords::new(readers));
-        let catalog_ = Box::new(SqlCatalog { writer, records: Arc::clone(&records) });
-        let opened_ms = clock::now_ms();
-        let address = catalog.map(|catalog| catalog.address);
-        let calls = Calls::default();
-        let read = ReadStore(Arc::new(Reading { dir, id, opened_ms, blobs, calls, records, address, _closed: None }));
-        Ok(Self(Arc::new(Inner { read, catalog: catalog_, _lease: lease, lock, proofs, leading })))
+        opening::open(dir, Asked { place, ..Asked::to(purpose) }, holder).await
     }
 
     /// Returns the catalog: all data except the blobs.
@@ -589,272 +489,6 @@ impl Store {
 
     pub(crate) async fn order(&self, order: Order) -> Result<Done, WriteError> {
         self.0.catalog.commit(order).await
-    }
-}
-
-/// Restricts the folder to its user; without access to it, its files are out of reach. A folder of another user, or one
-/// opened to a group by hand, is unchanged.
-fn close_to_others(dir: &Path) -> io::Result<()> {
-    let metadata = fs::metadata(dir)?;
-    let mode = metadata.permissions().mode();
-    if mode & 0o007 != 0 && metadata.uid() == nix::unistd::geteuid().as_raw() {
-        fs::set_permissions(dir, fs::Permissions::from_mode(mode & !0o077))?;
-    }
-    Ok(())
-}
-
-/// Removes the lists of blobs that earlier builds kept beside the database. Rows and memory replace them.
-fn remove_files_of_earlier_builds(dir: &Path) -> io::Result<()> {
-    for name in ["blobs/held", "blobs/touched"] {
-        match fs::remove_file(dir.join(name)) {
-            Err(e) if e.kind() != io::ErrorKind::NotFound => return Err(e),
-            _ => {}
-        }
-    }
-    Ok(())
-}
-
-fn make_folder(dir: &Path) -> Result<(), OpenError> {
-    DirBuilder::new().recursive(true).mode(0o700).create(dir).map_err(|e| OpenError::io(dir, &e))
-}
-
-/// Name of the file with the address of the database.
-const CATALOG: &str = "CATALOG";
-
-/// Returns the address of the database that the folder records; `None` if the database is in the folder.
-fn remembered_catalog(dir: &Path) -> Result<Option<PostgresAddress>, OpenError> {
-    let path = dir.join(CATALOG);
-    let text = match fs::read_to_string(&path) {
-        Ok(text) => text,
-        Err(e) if matches!(e.kind(), io::ErrorKind::NotFound | io::ErrorKind::NotADirectory) => return Ok(None),
-        Err(e) => return Err(OpenError::io(&path, &e)),
-    };
-    text.trim().parse().map(Some).map_err(|message| OpenError::Other { path, message })
-}
-
-/// Returns the catalog in PostgreSQL that the caller asked for or that the folder records, and records it.
-fn choose_catalog(dir: &Path, asked: Option<PostgresCatalog>) -> Result<Option<PostgresCatalog>, OpenError> {
-    let remembered = remembered_catalog(dir)?;
-    let Some(asked) = asked else { return Ok(remembered.map(PostgresCatalog::from)) };
-    let path = dir.join(CATALOG);
-    if folder::has_database(dir) {
-        let message = format!("its database is `{}`; `registry migrate` moves it", folder::DATABASE);
-        return Err(OpenError::Other { path: dir.to_owned(), message });
-    }
-    if let Some(other) = remembered.as_ref().filter(|other| !other.is_same_database(&asked.address)) {
-        let message = format!("its catalog is {other}, not {}; choose another folder with `--store`", asked.address);
-        return Err(OpenError::Other { path, message });
-    }
-    remember_catalog(dir, &asked.address)?;
-    Ok(Some(asked))
-}
-
-/// Records the address of the database.
-pub(crate) fn remember_catalog(dir: &Path, address: &PostgresAddress) -> Result<(), OpenError> {
-    let path = dir.join(CATALOG);
-    let text = format!("{}\n", address.to_remember());
-    write_whole(&path, text.as_bytes()).map_err(|e| OpenError::io(&path, &e))
-}
-
-/// Removes the record; the database is in the folder from then on.
-pub(crate) fn forget_catalog(dir: &Path) -> Result<(), OpenError> {
-    let path = dir.join(CATALOG);
-    match fs::remove_file(&path) {
-        Err(e) if e.kind() != io::ErrorKind::NotFound => Err(OpenError::io(&path, &e)),
-        _ => Ok(()),
-    }
-}
-
-/// An open database; for the leader of a catalog, also its first epoch and the key of its server.
-struct Database {
-    opened: Opened,
-    led: Option<(u64, ServerKey)>,
-}
-
-impl Database {
-    async fn open(
-        dir: &Path,
-        inspection: &mut Inspection,
-        catalog: Option<&PostgresCatalog>,
-        adopt: bool,
-        holder: &Holder,
-    ) -> Result<Self, OpenError> {
-        let Some(PostgresCatalog { address, terms }) = catalog else {
-            let opened = sql::sqlite::open_writer(dir, &inspection.found, adopt).await?;
-            return Ok(Self { opened, led: None });
-        };
-        inspection.found.name_database(sql::postgres::name(address));
-        let opening = sql::postgres::Opening { address, dir, found: &inspection.found, adopt, terms: *terms, holder };
-        let led = sql::postgres::open_writer(&opening).await?;
-        Ok(Self { opened: led.opened, led: Some((led.epoch, led.server_key)) })
-    }
-}
-
-/// A request to open a store.
-struct Asked {
-    place: RequestedPlace,
-    purpose: Purpose,
-    terms: LeaseTerms,
-    /// The catalog in PostgreSQL, if the caller names one.
-    catalog: Option<PostgresCatalog>,
-}
-
-impl Asked {
-    fn to(purpose: Purpose) -> Self {
-        Self { place: RequestedPlace::Remembered, purpose, terms: LeaseTerms::default(), catalog: None }
-    }
-}
-
-/// Purpose of opening a store.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Purpose {
-    Work,
-    Collect,
-    Adopt,
-}
-
-/// The requested place of the blobs.
-#[derive(Debug, Clone)]
-enum RequestedPlace {
-    /// The place recorded in the folder.
-    Remembered,
-    /// A place named by the caller.
-    Named(Place),
-    /// A backend of the caller.
-    Given(Arc<dyn Backend>),
-}
-
-impl RequestedPlace {
-    fn named(place: Option<&Place>) -> Self {
-        place.map_or(Self::Remembered, |place| Self::Named(place.clone()))
-    }
-}
-
-/// The parts of a store other than its database.
-struct Inspection {
-    place: Place,
-    /// True if the folder does not record the place yet.
-    to_remember: bool,
-    location: Location,
-    blobs: Arc<dyn Backend>,
-    found: StoreParts,
-}
-
-impl Inspection {
-    /// Reads the parts and changes nothing. A place other than the recorded one is an error, unless the blobs were
-    /// `moved` there or the store does not exist yet.
-    async fn of(dir: &Path, asked: &RequestedPlace, moved: bool) -> Result<Self, OpenError> {
-        let (dir, asked) = (dir.to_owned(), asked.clone());
-        let path = dir.clone();
-        let looking = tokio::task::spawn_blocking(move || Self::inspect(&dir, asked, moved));
-        looking.await.map_err(|e| OpenError::io(&path, &io::Error::other(e)))?
-    }
-
-    fn inspect(dir: &Path, asked: RequestedPlace, moved: bool) -> Result<Self, OpenError> {
-        let io = |e: io::Error| OpenError::io(&dir.join("blobs/PLACE"), &e);
-        let here = Place::Folder(std::path::absolute(dir).map_err(io)?);
-        let remembered = Place::remembered(dir).map_err(io)?;
-        let is_new = remembered.is_none() && !folder::has_database(dir);
-        let current = remembered.unwrap_or(here);
-        let (asked, given) = match asked {
-            RequestedPlace::Remembered => (current.clone(), None),
-            RequestedPlace::Named(place) => (place, None),
-            RequestedPlace::Given(blobs) => (current.clone(), Some(blobs)),
-        };
-        let to_remember = asked != current;
-        if to_remember && !moved && !is_new {
-            return Err(OpenError::Elsewhere { dir: dir.to_owned(), place: current, asked });
-        }
-        let place = asked;
-        let blobs_error = |e: BlobError| OpenError::Blobs { dir: dir.to_owned(), message: e.to_string() };
-        let location = match given {
-            Some(blobs) => Location::Given(blobs, dir.to_owned()),
-            None => place.locate(dir).map_err(blobs_error)?,
-        };
-        let blobs = location.to_read().map_err(io)?;
-        let found = StoreParts::read(dir, &*blobs).map_err(|e| match e {
-            MarkerError::Blob(e) => blobs_error(e),
-            MarkerError::Mismatch(mismatch) => OpenError::Mismatch { dir: dir.to_owned(), mismatch },
-        })?;
-        if to_remember && moved && found.marker().is_none() {
-            let marker = blobs.marker_place();
-            let message = format!("`{marker}` does not exist; copy the store's blobs and this marker there first");
-            return Err(OpenError::Blobs { dir: dir.to_owned(), message });
-        }
-        Ok(Self { place, to_remember, location, blobs, found })
-    }
-}
-
-/// Refuses a folder that is not, and never was, a store.
-async fn there(dir: &Path) -> Result<(), OpenError> {
-    if folder::has_database(dir) || remembered_catalog(dir)?.is_some() {
-        return Ok(());
-    }
-    match Inspection::of(dir, &RequestedPlace::Remembered, false).await?.found.evidence() {
-        Some(_) => Ok(()),
-        None => Err(OpenError::NotAStore(dir.to_owned())),
-    }
-}
-
-/// Waits until no other process holds the blobs of a store that is about to be opened.
-async fn wait_until_free(dir: &Path, inspection: &Inspection, terms: LeaseTerms) -> Result<(), OpenError> {
-    let own = lease::lock_of(dir).map_err(|e| OpenError::io(dir, &e))?;
-    let (place, marker) = (Arc::clone(&inspection.blobs), inspection.blobs.marker_place());
-    let waiting = tokio::task::spawn_blocking(move || lease::wait_until_free(&*place, &own, terms));
-    let failed = |message: String| OpenError::Blobs { dir: dir.to_owned(), message };
-    let waited = waiting.await.map_err(|e| failed(e.to_string()))?.map_err(|e| failed(e.to_string()))?;
-    waited.map_err(|by| OpenError::Held { dir: dir.to_owned(), by, marker })
-}
-
-/// Replaces the `old` marker beside the blobs by one of the opened store.
-async fn mark(
-    dir: &Path,
-    blobs: &BlobStore,
-    old: Option<Marker>,
-    stored: &Stored,
-    held: Option<Held>,
-) -> Result<Marker, OpenError> {
-    let marker = Marker { store: stored.id.clone(), epoch: stored.epoch, held };
-    let (place, written) = (blobs.place(), marker.clone());
-    let writing = tokio::task::spawn_blocking(move || written.write(old.as_ref(), &*place));
-    let failed = |message: String| OpenError::Blobs { dir: dir.to_owned(), message };
-    if writing.await.map_err(|e| failed(e.to_string()))?.map_err(|e| failed(e.to_string()))? {
-        return Ok(marker);
-    }
-    let place = blobs.place().marker_place();
-    Err(failed(format!(
-        "another process has just taken these blobs for its store: `{place}` has changed; each store needs its own place"
-    )))
-}
-
-/// Names that a store's folder may have before its database exists.
-const OF_A_STORE: [&str; 8] =
-    ["lock", CATALOG, "blobs", "staging", "witness", "witness.new", "reserve", server_key::FILE];
-
-/// Refuses to create a store in a folder with other files.
-fn refuse_other_files(dir: &Path) -> Result<(), OpenError> {
-    let entries = match fs::read_dir(dir) {
-        Ok(entries) => entries,
-        Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(()),
-        Err(e) => return Err(OpenError::io(dir, &e)),
-    };
-    let mut other = Vec::new();
-    for entry in entries {
-        let name = entry.map_err(|e| OpenError::io(dir, &e))?.file_name();
-        let name = name.to_string_lossy();
-        // SQLite puts a log beside the database, and a journal while it is created.
-        if !OF_A_STORE.contains(&&*name) && !name.starts_with(folder::DATABASE) {
-            other.push(format!("`{name}`"));
-        }
-    }
-    other.sort();
-    match other.len() {
-        0 => Ok(()),
-        1..=3 => Err(OpenError::NotEmpty { dir: dir.to_owned(), found: other.join(", ") }),
-        more => {
-            let found = format!("{} and {} more", other[..3].join(", "), more - 3);
-            Err(OpenError::NotEmpty { dir: dir.to_owned(), found })
-        }
     }
 }
 
