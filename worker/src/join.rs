@@ -1,9 +1,10 @@
 //! The life cycle of a worker process.
 
+use std::io;
 use std::net::{IpAddr, SocketAddr, ToSocketAddrs, UdpSocket};
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::thread;
+use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
 use access::Server;
@@ -145,7 +146,6 @@ pub fn join(options: Options) -> Result<(), JoinError> {
 }
 
 fn work(options: Options, device: Device, kinds: Arc<dyn Kinds>, timing: Timing) -> Result<(), JoinError> {
-    let system = |what| move |source| JoinError::System { what, source };
     let name = name(&options)?;
     if !options.server.is_encrypted() && !options.server.is_local() {
         tracing::warn!(
@@ -167,27 +167,9 @@ fn work(options: Options, device: Device, kinds: Arc<dyn Kinds>, timing: Timing)
     runtime.block_on(watch).map_err(system("signal handling"))?;
 
     let cache = Arc::new(cache);
-    let preparer = {
-        let shared = shared.clone();
-        let client = client.clone();
-        let cache = cache.clone();
-        let run = move || shared.preparation.run(&client, &cache);
-        thread::Builder::new().name("prepare".to_owned()).spawn(run).map_err(system("the prefetch thread"))?
-    };
+    let preparer = start_preparing(&shared, &client, &cache)?;
     let bench = Bench { kinds, client: client.clone(), cache, data, device, limits: options.limits.clone() };
-    let stage = {
-        let shared = shared.clone();
-        let run = move || {
-            process::compute_here();
-            stage_thread::run(&shared, &bench);
-        };
-        // Graphs of several thousand nodes are dropped recursively.
-        thread::Builder::new()
-            .name("stage".to_owned())
-            .stack_size(64 << 20)
-            .spawn(run)
-            .map_err(system("the stage thread"))?
-    };
+    let stage = start_stages(&shared, bench)?;
     let offer = Join {
         protocol: PROTOCOL_VERSION,
         worker: name,
@@ -210,6 +192,29 @@ fn work(options: Options, device: Device, kinds: Arc<dyn Kinds>, timing: Timing)
         tracing::debug!("cannot tell the coordinator that this worker leaves; its lease will expire");
     }
     Ok(())
+}
+
+fn system(what: &'static str) -> impl Fn(io::Error) -> JoinError {
+    move |source| JoinError::System { what, source }
+}
+
+/// Starts the thread that fetches inputs ahead.
+fn start_preparing(shared: &Arc<Shared>, client: &Client, cache: &Arc<Cache>) -> Result<JoinHandle<()>, JoinError> {
+    let (shared, client, cache) = (shared.clone(), client.clone(), Arc::clone(cache));
+    let run = move || shared.preparation.run(&client, &cache);
+    thread::Builder::new().name("prepare".to_owned()).spawn(run).map_err(system("the prefetch thread"))
+}
+
+/// Starts the thread on which stages compute.
+fn start_stages(shared: &Arc<Shared>, bench: Bench) -> Result<JoinHandle<()>, JoinError> {
+    let shared = shared.clone();
+    let run = move || {
+        process::compute_here();
+        stage_thread::run(&shared, &bench);
+    };
+    // Graphs of several thousand nodes are dropped recursively.
+    let builder = thread::Builder::new().name("stage".to_owned()).stack_size(64 << 20);
+    builder.spawn(run).map_err(system("the stage thread"))
 }
 
 /// The worker's name, which defaults to one made of host and process.

@@ -4,6 +4,7 @@
 use std::collections::BTreeSet;
 use std::path::PathBuf;
 
+use burn::tensor::Device;
 use clap::Args;
 use mocap::export::{Motion, Outs, write_all};
 use mocap::requests::Request;
@@ -11,7 +12,9 @@ use motion::features::recover_joints;
 use motion::vocabulary::Vocabulary;
 use motion::{Dataset, Skeleton};
 use protocol::Seed;
-use serde_json::json;
+use protocol::message::RunView;
+use protocol::stage::Sampler;
+use serde_json::{Value, json};
 use stages::generate::Generator;
 
 use super::generate::{exported, is_known};
@@ -91,60 +94,14 @@ pub(crate) async fn gallery(args: GalleryArgs) -> Result<u8> {
         return Err(Problem::usage(format!("no stage of run `{}` has a model yet", run.run)));
     }
     let (device, _) = model::device(args.backend.as_deref())?;
-
-    // One row per sentence and seed, one column per model.
-    let mut rows: Vec<Vec<Motion>> = vec![Vec::new(); requests.len() * seeds.len()];
-    let mut lengths: Vec<Option<usize>> = vec![None; rows.len()];
-    let real = real.map(|dataset| real_clips(&dataset, &requests)).unwrap_or_default();
-    for (clip, rows) in real.into_iter().zip(rows.chunks_mut(seeds.len().max(1))) {
-        // The other seeds of a sentence have the same real clip.
-        rows.iter_mut().take(1).for_each(|row| row.extend(clip.clone()));
-    }
-    let (mut drawn, mut shown) = (Vec::new(), BTreeSet::new());
-    for name in &names {
-        let found = model::stage(&reader, &run, name).await?;
-        // Two stages may have the same model, such as a student and its registered version.
-        if !shown.insert(found.artifact) {
-            continue;
-        }
-        let generator = Generator::load(&found.manifest, &found.blobs, &device).map_err(Problem::failed)?;
-        let sampler = match args.sampler.sampler(args.steps, generator.sampler(), &found.measured) {
-            Ok(sampler) => sampler,
-            // The evaluations use several samplers: use the papers' sampler of its kind, which the page notes.
-            Err(_) => args.sampler.sampler(args.steps, generator.sampler(), &[]).map_err(Problem::usage)?,
-        };
-        generator.check_sampler(&sampler).map_err(model::refused)?;
-        let fps = Skeleton::of(generator.format()).fps;
-        for (i, request) in requests.iter().enumerate() {
-            is_known(&generator, name, &request.caption)?;
-            for (k, seed) in seeds.iter().enumerate() {
-                let row = i * seeds.len() + k;
-                // The first model sets the length for all, so that the motions are comparable.
-                let frames = match (request.length, lengths[row]) {
-                    (Some(length), _) => length.frames(fps),
-                    (None, Some(frames)) => frames,
-                    (None, None) => generator.frames(&request.caption, Seed(*seed)).map_err(model::refused)?,
-                };
-                lengths[row] = Some(frames);
-                let motion = generator.generate(&request.caption, Some(frames), Some(&sampler), Seed(*seed));
-                let motion = motion.map_err(model::refused)?;
-                let note = format!("{sampler}, {:.0} ms", motion.timing.total().as_secs_f64() * 1e3);
-                rows[row].push(exported(name, note, motion, Vec::new()));
-            }
-        }
-        drawn.push(json!({"stage": name, "sampler": sampler}));
-    }
+    let mut grid = Grid { requests: &requests, seeds: &seeds, rows: vec![Vec::new(); requests.len() * seeds.len()] };
+    grid.add_real(real.as_ref());
+    let drawn = grid.add_models(&args, &reader, &run, &names, &device).await?;
     reader.close().await;
-    let titles = requests.iter().flat_map(|request| {
-        let one = seeds.len() == 1;
-        seeds.iter().map(move |seed| match one {
-            true => request.caption.clone(),
-            false => format!("{} (seed {seed})", request.caption),
-        })
-    });
-    let sections: Vec<(String, Vec<&Motion>)> = titles.zip(rows.iter().map(|row| row.iter().collect())).collect();
+    let sections: Vec<(String, Vec<&Motion>)> =
+        grid.titles().into_iter().zip(grid.rows.iter().map(|row| row.iter().collect())).collect();
     write_all(&format!("Models of {}", run.run), &sections, &args.out).map_err(out::refused)?;
-    let count: usize = rows.iter().map(Vec::len).sum();
+    let count: usize = grid.rows.iter().map(Vec::len).sum();
     match args.report {
         Output::Json => print::json(&json!({
             "schema_version": 1,
@@ -163,6 +120,91 @@ pub(crate) async fn gallery(args: GalleryArgs) -> Result<u8> {
         )),
     }
     Ok(0)
+}
+
+/// A row for each sentence and seed; a column for the real clips, then one for each model.
+struct Grid<'a> {
+    requests: &'a [Request],
+    seeds: &'a [u64],
+    rows: Vec<Vec<Motion>>,
+}
+
+impl Grid<'_> {
+    /// The other seeds of a sentence have the same real clip, so only the first row shows it.
+    fn add_real(&mut self, dataset: Option<&Dataset>) {
+        let real = dataset.map(|dataset| real_clips(dataset, self.requests)).unwrap_or_default();
+        for (clip, rows) in real.into_iter().zip(self.rows.chunks_mut(self.seeds.len().max(1))) {
+            rows.iter_mut().take(1).for_each(|row| row.extend(clip.clone()));
+        }
+    }
+
+    /// Draws with the models of `names`, and returns what drew.
+    async fn add_models(
+        &mut self,
+        args: &GalleryArgs,
+        reader: &Reader,
+        run: &RunView,
+        names: &[&str],
+        device: &Device,
+    ) -> Result<Vec<Value>> {
+        let mut lengths: Vec<Option<usize>> = vec![None; self.rows.len()];
+        let (mut drawn, mut shown) = (Vec::new(), BTreeSet::new());
+        for name in names {
+            let found = model::stage(reader, run, name).await?;
+            // Two stages may have the same model, such as a student and its registered version.
+            if !shown.insert(found.artifact) {
+                continue;
+            }
+            let generator = Generator::load(&found.manifest, &found.blobs, device).map_err(Problem::failed)?;
+            let sampler = match args.sampler.sampler(args.steps, generator.sampler(), &found.measured) {
+                Ok(sampler) => sampler,
+                // The evaluations use several samplers: use the papers' sampler of its kind, which the page notes.
+                Err(_) => args.sampler.sampler(args.steps, generator.sampler(), &[]).map_err(Problem::usage)?,
+            };
+            generator.check_sampler(&sampler).map_err(model::refused)?;
+            self.add_model(name, &generator, &sampler, &mut lengths)?;
+            drawn.push(json!({"stage": name, "sampler": sampler}));
+        }
+        Ok(drawn)
+    }
+
+    /// The first model sets the length for all, so that the motions are comparable.
+    fn add_model(
+        &mut self,
+        name: &str,
+        generator: &Generator,
+        sampler: &Sampler,
+        lengths: &mut [Option<usize>],
+    ) -> Result<()> {
+        let fps = Skeleton::of(generator.format()).fps;
+        for (i, request) in self.requests.iter().enumerate() {
+            is_known(generator, name, &request.caption)?;
+            for (k, seed) in self.seeds.iter().enumerate() {
+                let row = i * self.seeds.len() + k;
+                let frames = match (request.length, lengths[row]) {
+                    (Some(length), _) => length.frames(fps),
+                    (None, Some(frames)) => frames,
+                    (None, None) => generator.frames(&request.caption, Seed(*seed)).map_err(model::refused)?,
+                };
+                lengths[row] = Some(frames);
+                let motion = generator.generate(&request.caption, Some(frames), Some(sampler), Seed(*seed));
+                let motion = motion.map_err(model::refused)?;
+                let note = format!("{sampler}, {:.0} ms", motion.timing.total().as_secs_f64() * 1e3);
+                self.rows[row].push(exported(name, note, motion, Vec::new()));
+            }
+        }
+        Ok(())
+    }
+
+    fn titles(&self) -> Vec<String> {
+        let titles = self.requests.iter().flat_map(|request| {
+            self.seeds.iter().map(move |seed| match self.seeds.len() {
+                1 => request.caption.clone(),
+                _ => format!("{} (seed {seed})", request.caption),
+            })
+        });
+        titles.collect()
+    }
 }
 
 /// Finds for each sentence the training clip with the nearest caption; two sentences have different clips.

@@ -189,65 +189,24 @@ pub(crate) async fn generate(args: GenerateArgs) -> Result<u8> {
 
     let sampler = args.sampler.sampler(args.steps, generator.sampler(), &measured);
     let sampler = sampler.map_err(|why| Problem::usage(format!("{label}: {why}")))?;
-    if let Some((low, high)) = generator.family().exceeded_range(sampler.guidance) {
-        let guidance = sampler.guidance;
-        print::note(&format!(
-            "note: {label} was trained for guidance {low} to {high}; at {guidance} the motion may be arbitrary"
-        ));
-    }
+    note_guidance(&generator, &label, &sampler);
     let edit = args.edit.as_deref().map(|path| Edit::read(path, &args.keep, &generator)).transpose()?;
-    let skeleton = Skeleton::of(generator.format());
-    let length = |request: &Request| request.length.map(|length| length.frames(skeleton.fps));
-    let targets = args.control.targets(&generator, &label, requests.first().and_then(length))?;
-    let shared = Shared { label, sampler, loaded };
-
+    let fps = Skeleton::of(generator.format()).fps;
+    let first = requests.first().and_then(|request| request.length);
+    let targets = args.control.targets(&generator, &label, first.map(|length| length.frames(fps)))?;
     if vocabulary.is_none() {
-        let label = &shared.label;
         print::note(&format!(
             "note: this store has no training captions of {label}, so words that it never saw cannot be named"
         ));
     }
-    let (mut rows, mut motions): (Vec<Row>, Vec<Vec<Motion>>) = (Vec::new(), Vec::new());
+    let shared = Shared { label, sampler, loaded };
+    let mut session =
+        Session { args: &args, generator, vocabulary, edit, targets, outs, count, shared, rows: Vec::new() };
+    let mut motions = Vec::new();
     for request in &requests {
-        let mut known = is_known(&generator, &shared.label, &request.caption)?;
-        let known_to_encoder = vocabulary.as_ref().filter(|_| known);
-        let compared = unknown_words::compare(known_to_encoder, &shared.label, &request.caption);
-        known &= compared.as_ref().is_none_or(|words| words.unknown.is_empty() || words.has_known);
-        let mut drawn = Vec::new();
-        for seed in &seeds {
-            let (motion, kept) =
-                draw(&generator, request, Seed(*seed), &shared.sampler, edit.as_ref(), targets.as_ref())?;
-            let number = rows.len() + 1;
-            let arrays = args.write_arrays(&motion, number, count)?;
-            let (timing, missed) = (motion.timing, targets.as_ref().and_then(|targets| targets.missed(&motion)));
-            let note = format!("{}, {}, seed {seed}", shared.label, shared.sampler);
-            let waypoints = targets.as_ref().map(|targets| targets.waypoints.clone()).unwrap_or_default();
-            let motion = Motion { kept: kept.clone(), ..exported(&request.caption, note, motion, waypoints) };
-            let motion = args.out.prepared(motion);
-            let written = outs.write(number, &motion).map_err(out::refused)?;
-            let frames = motion.frames();
-            rows.push(Row {
-                prompt: request.caption.clone(),
-                seed: *seed,
-                frames,
-                seconds: frames as f64 / skeleton.fps,
-                known,
-                words: compared.clone(),
-                kept,
-                timing,
-                missed,
-                files: out::names(&written).chain(arrays).collect(),
-                off: out::off_metres(&written),
-            });
-            if outs.wants_all() {
-                drawn.push(motion);
-            } else if let (Output::Json, Some(row)) = (args.report(), rows.last()) {
-                // This motion has no more files, so its line is printed at once.
-                print::out(&row.json(&shared, &[]).to_string());
-            }
-        }
-        motions.push(drawn);
+        motions.push(session.draw_all(request, &seeds)?);
     }
+    let Session { edit, outs, shared, rows, .. } = session;
     let together = write_together(&outs, &shared.label, &requests, &motions)?;
     match args.report() {
         Output::Json if outs.wants_all() => {
@@ -257,6 +216,82 @@ pub(crate) async fn generate(args: GenerateArgs) -> Result<u8> {
         Output::Table => print::out(&table(&rows, &shared, &together, edit.as_ref())),
     }
     Ok(0)
+}
+
+fn note_guidance(generator: &Generator, label: &str, sampler: &Sampler) {
+    if let Some((low, high)) = generator.family().exceeded_range(sampler.guidance) {
+        let guidance = sampler.guidance;
+        print::note(&format!(
+            "note: {label} was trained for guidance {low} to {high}; at {guidance} the motion may be arbitrary"
+        ));
+    }
+}
+
+/// One call of the command: the loaded model, and the motions that it has drawn.
+struct Session<'a> {
+    args: &'a GenerateArgs,
+    generator: Generator,
+    vocabulary: Option<Vocabulary>,
+    edit: Option<Edit>,
+    targets: Option<Targets>,
+    outs: Outs,
+    /// Number of motions in all.
+    count: usize,
+    shared: Shared,
+    rows: Vec<Row>,
+}
+
+impl Session<'_> {
+    /// Draws a sentence with each seed. Returns the motions that files with several motions need.
+    fn draw_all(&mut self, request: &Request, seeds: &[u64]) -> Result<Vec<Motion>> {
+        let label = &self.shared.label;
+        let mut known = is_known(&self.generator, label, &request.caption)?;
+        let known_to_encoder = self.vocabulary.as_ref().filter(|_| known);
+        let words = unknown_words::compare(known_to_encoder, label, &request.caption);
+        known &= words.as_ref().is_none_or(|words| words.unknown.is_empty() || words.has_known);
+        let mut drawn = Vec::new();
+        for seed in seeds {
+            let motion = self.draw_one(request, *seed, known, words.as_ref())?;
+            if self.outs.wants_all() {
+                drawn.push(motion);
+            } else if let (Output::Json, Some(row)) = (self.args.report(), self.rows.last()) {
+                // This motion has no more files, so its line is printed at once.
+                print::out(&row.json(&self.shared, &[]).to_string());
+            }
+        }
+        Ok(drawn)
+    }
+
+    /// Draws a motion, writes its files and adds its row.
+    fn draw_one(&mut self, request: &Request, seed: u64, known: bool, words: Option<&Compared>) -> Result<Motion> {
+        let Self { args, shared, targets, .. } = self;
+        let targets = targets.as_ref();
+        let (motion, kept) = draw(&self.generator, request, Seed(seed), &shared.sampler, self.edit.as_ref(), targets)?;
+        let number = self.rows.len() + 1;
+        let arrays = args.write_arrays(&motion, number, self.count)?;
+        let timing = motion.timing;
+        let missed = targets.and_then(|targets| targets.missed(&motion));
+        let note = format!("{}, {}, seed {seed}", shared.label, shared.sampler);
+        let waypoints = targets.map(|targets| targets.waypoints.clone()).unwrap_or_default();
+        let motion = Motion { kept: kept.clone(), ..exported(&request.caption, note, motion, waypoints) };
+        let motion = args.out.prepared(motion);
+        let written = self.outs.write(number, &motion).map_err(out::refused)?;
+        let frames = motion.frames();
+        self.rows.push(Row {
+            prompt: request.caption.clone(),
+            seed,
+            frames,
+            seconds: frames as f64 / motion.skeleton.fps,
+            known,
+            words: words.cloned(),
+            kept,
+            timing,
+            missed,
+            files: out::names(&written).chain(arrays).collect(),
+            off: out::off_metres(&written),
+        });
+        Ok(motion)
+    }
 }
 
 /// Returns true if the model recognises a word of the sentence; prints a note if not.

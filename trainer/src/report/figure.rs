@@ -92,79 +92,106 @@ pub(crate) fn svg(title: &str, panels: &[Panel]) -> String {
     for (i, panel) in panels.iter().enumerate() {
         let (x, y) = (WIDTH * (i % COLUMNS) as f64, 28.0 + HEIGHT * (i / COLUMNS) as f64);
         let _ = writeln!(out, r#"<g transform="translate({x},{y})">"#);
-        draw(&mut out, panel, &names);
+        let plotted = Plotted::new(panel);
+        plotted.draw_axes(&mut out);
+        plotted.draw_lines(&mut out, &names);
         let _ = writeln!(out, "</g>");
     }
     out + "</svg>\n"
 }
 
-fn draw(out: &mut String, panel: &Panel, names: &[&String]) {
-    let finite = |points: &Vec<(f64, f64)>| -> Vec<(f64, f64)> {
-        points.iter().copied().filter(|(x, y)| x.is_finite() && y.is_finite()).collect()
-    };
-    let lines: Vec<(&String, Vec<(f64, f64)>)> =
-        panel.lines.iter().map(|(name, points)| (name, finite(points))).collect();
-    let bands: BTreeMap<&String, Vec<(f64, f64, f64)>> = panel
-        .bands
-        .iter()
-        .map(|(name, band)| {
-            let finite = |(x, low, high): &&(f64, f64, f64)| x.is_finite() && low.is_finite() && high.is_finite();
-            (name, band.iter().filter(finite).copied().collect())
-        })
-        .collect();
-    let mut all: Vec<(f64, f64)> = lines.iter().flat_map(|(_, points)| points.iter().copied()).collect();
-    all.extend(bands.values().flatten().flat_map(|(x, low, high)| [(*x, *low), (*x, *high)]));
-    let x = Axis::new(all.iter().map(|point| point.0), LEFT, WIDTH - RIGHT);
-    let y = Axis::new(all.iter().map(|point| point.1), HEIGHT - BOTTOM, TOP);
-    let mut line = |text: std::fmt::Arguments<'_>| {
-        let _ = writeln!(out, "{text}");
-    };
-    for mark in y.marks() {
-        let (at, end, label) = (y.at(mark), WIDTH - RIGHT, print::number(mark));
-        line(format_args!(r##"<line x1="{LEFT}" x2="{end}" y1="{at:.1}" y2="{at:.1}" stroke="#dedfe0"/>"##));
-        line(format_args!(r#"<text x="{:.1}" y="{:.1}" text-anchor="end">{label}</text>"#, LEFT - 8.0, at + 4.0));
+/// Lines and bands of a panel without what is no number, and its axes.
+struct Plotted<'a> {
+    panel: &'a Panel,
+    lines: Vec<(&'a String, Vec<(f64, f64)>)>,
+    bands: BTreeMap<&'a String, Vec<(f64, f64, f64)>>,
+    x: Axis,
+    y: Axis,
+    /// The values on the x axis, in order.
+    values: Vec<f64>,
+}
+
+impl<'a> Plotted<'a> {
+    fn new(panel: &'a Panel) -> Self {
+        let finite = |points: &Vec<(f64, f64)>| -> Vec<(f64, f64)> {
+            points.iter().copied().filter(|(x, y)| x.is_finite() && y.is_finite()).collect()
+        };
+        let lines: Vec<_> = panel.lines.iter().map(|(name, points)| (name, finite(points))).collect();
+        let is_finite = |(x, low, high): &&(f64, f64, f64)| x.is_finite() && low.is_finite() && high.is_finite();
+        let finite = |band: &Vec<(f64, f64, f64)>| band.iter().filter(is_finite).copied().collect();
+        let bands: BTreeMap<_, Vec<_>> = panel.bands.iter().map(|(name, band)| (name, finite(band))).collect();
+        let mut all: Vec<(f64, f64)> = lines.iter().flat_map(|(_, points)| points.iter().copied()).collect();
+        all.extend(bands.values().flatten().flat_map(|(x, low, high)| [(*x, *low), (*x, *high)]));
+        let x = Axis::new(all.iter().map(|point| point.0), LEFT, WIDTH - RIGHT);
+        let y = Axis::new(all.iter().map(|point| point.1), HEIGHT - BOTTOM, TOP);
+        let mut values: Vec<f64> = all.iter().map(|point| point.0).collect();
+        values.sort_by(f64::total_cmp);
+        values.dedup();
+        Self { panel, lines, bands, x, y, values }
     }
-    // Mark the values themselves if they are few and their labels do not touch.
-    let mut values: Vec<f64> = all.iter().map(|point| point.0).collect();
-    values.sort_by(f64::total_cmp);
-    values.dedup();
-    let apart = values.windows(2).all(|pair| x.at(pair[1]) - x.at(pair[0]) >= APART);
-    let marks = if (1..=8).contains(&values.len()) && apart { values } else { x.marks() };
-    for mark in marks {
-        let whole = mark.fract() == 0.0 && mark.abs() < 1e6;
-        let label = if whole { format!("{mark:.0}") } else { print::number(mark) };
-        let (at, bottom) = (x.at(mark), HEIGHT - BOTTOM);
-        line(format_args!(r##"<line x1="{at:.1}" x2="{at:.1}" y1="{TOP}" y2="{bottom}" stroke="#dedfe0"/>"##));
-        line(format_args!(r#"<text x="{at:.1}" y="{}" text-anchor="middle">{label}</text>"#, bottom + 18.0));
+
+    /// Marks the values themselves if they are few and their labels do not touch.
+    fn x_marks(&self) -> Vec<f64> {
+        let apart = self.values.windows(2).all(|pair| self.x.at(pair[1]) - self.x.at(pair[0]) >= APART);
+        if (1..=8).contains(&self.values.len()) && apart { self.values.clone() } else { self.x.marks() }
     }
-    let middle = (LEFT + WIDTH - RIGHT) / 2.0;
-    let (below, label) = (HEIGHT - 14.0, escape(&panel.x));
-    line(format_args!(r#"<text x="{middle}" y="{below}" text-anchor="middle">{label}</text>"#));
-    line(format_args!(r#"<text x="{LEFT}" y="{}" font-weight="bold">{}</text>"#, TOP - 34.0, escape(&panel.y)));
-    for (i, (name, points)) in lines.iter().enumerate() {
-        let colour = COLOURS[i % COLOURS.len()];
-        let title = escape(name);
-        let path: Vec<String> = points.iter().map(|(a, b)| format!("{:.1},{:.1}", x.at(*a), y.at(*b))).collect();
-        line(format_args!(r#"<g stroke="{colour}" fill="{colour}"><title>{title}</title>"#));
-        if let Some(band) = bands.get(name).filter(|band| !band.is_empty()) {
-            let low = band.iter().map(|(a, low, _)| (a, low));
-            let high = band.iter().rev().map(|(a, _, high)| (a, high));
-            let edge: Vec<String> = low.chain(high).map(|(a, b)| format!("{:.1},{:.1}", x.at(*a), y.at(*b))).collect();
-            line(format_args!(r#"<polygon points="{}" stroke="none" fill-opacity=".2"/>"#, edge.join(" ")));
-        }
-        line(format_args!(r#"<polyline points="{}" fill="none" stroke-width="1.8"/>"#, path.join(" ")));
-        for (a, b) in points.iter().filter(|_| points.len() <= MARKED) {
-            line(format_args!(r#"<circle cx="{:.1}" cy="{:.1}" r="2.5"/>"#, x.at(*a), y.at(*b)));
-        }
-        line(format_args!("</g>"));
-        if names.len() > 1 {
-            let at = LEFT + (WIDTH - LEFT - RIGHT) / names.len() as f64 * i as f64;
-            line(format_args!(r#"<text x="{at:.1}" y="{}" fill="{colour}">{title}</text>"#, TOP - 14.0));
-        }
+
+    fn point(&self, a: f64, b: f64) -> String {
+        format!("{:.1},{:.1}", self.x.at(a), self.y.at(b))
     }
-    for at in panel.odd.iter().filter(|at| at.is_finite()).map(|at| x.at(*at)) {
-        let (from, to) = (HEIGHT - BOTTOM, HEIGHT - BOTTOM - 8.0);
-        line(format_args!(r##"<line x1="{at:.1}" x2="{at:.1}" y1="{from}" y2="{to}" stroke="#c0142c"/>"##));
+
+    fn draw_axes(&self, out: &mut String) {
+        let mut line = |text: std::fmt::Arguments<'_>| {
+            let _ = writeln!(out, "{text}");
+        };
+        for mark in self.y.marks() {
+            let (at, end, label) = (self.y.at(mark), WIDTH - RIGHT, print::number(mark));
+            line(format_args!(r##"<line x1="{LEFT}" x2="{end}" y1="{at:.1}" y2="{at:.1}" stroke="#dedfe0"/>"##));
+            line(format_args!(r#"<text x="{:.1}" y="{:.1}" text-anchor="end">{label}</text>"#, LEFT - 8.0, at + 4.0));
+        }
+        for mark in self.x_marks() {
+            let whole = mark.fract() == 0.0 && mark.abs() < 1e6;
+            let label = if whole { format!("{mark:.0}") } else { print::number(mark) };
+            let (at, bottom) = (self.x.at(mark), HEIGHT - BOTTOM);
+            line(format_args!(r##"<line x1="{at:.1}" x2="{at:.1}" y1="{TOP}" y2="{bottom}" stroke="#dedfe0"/>"##));
+            line(format_args!(r#"<text x="{at:.1}" y="{}" text-anchor="middle">{label}</text>"#, bottom + 18.0));
+        }
+        let middle = (LEFT + WIDTH - RIGHT) / 2.0;
+        let (below, label) = (HEIGHT - 14.0, escape(&self.panel.x));
+        line(format_args!(r#"<text x="{middle}" y="{below}" text-anchor="middle">{label}</text>"#));
+        let title = escape(&self.panel.y);
+        line(format_args!(r#"<text x="{LEFT}" y="{}" font-weight="bold">{title}</text>"#, TOP - 34.0));
+    }
+
+    fn draw_lines(&self, out: &mut String, names: &[&String]) {
+        let mut line = |text: std::fmt::Arguments<'_>| {
+            let _ = writeln!(out, "{text}");
+        };
+        for (i, (name, points)) in self.lines.iter().enumerate() {
+            let colour = COLOURS[i % COLOURS.len()];
+            let title = escape(name);
+            let path: Vec<String> = points.iter().map(|(a, b)| self.point(*a, *b)).collect();
+            line(format_args!(r#"<g stroke="{colour}" fill="{colour}"><title>{title}</title>"#));
+            if let Some(band) = self.bands.get(name).filter(|band| !band.is_empty()) {
+                let low = band.iter().map(|(a, low, _)| (a, low));
+                let high = band.iter().rev().map(|(a, _, high)| (a, high));
+                let edge: Vec<String> = low.chain(high).map(|(a, b)| self.point(*a, *b)).collect();
+                line(format_args!(r#"<polygon points="{}" stroke="none" fill-opacity=".2"/>"#, edge.join(" ")));
+            }
+            line(format_args!(r#"<polyline points="{}" fill="none" stroke-width="1.8"/>"#, path.join(" ")));
+            for (a, b) in points.iter().filter(|_| points.len() <= MARKED) {
+                line(format_args!(r#"<circle cx="{:.1}" cy="{:.1}" r="2.5"/>"#, self.x.at(*a), self.y.at(*b)));
+            }
+            line(format_args!("</g>"));
+            if names.len() > 1 {
+                let at = LEFT + (WIDTH - LEFT - RIGHT) / names.len() as f64 * i as f64;
+                line(format_args!(r#"<text x="{at:.1}" y="{}" fill="{colour}">{title}</text>"#, TOP - 14.0));
+            }
+        }
+        for at in self.panel.odd.iter().filter(|at| at.is_finite()).map(|at| self.x.at(*at)) {
+            let (from, to) = (HEIGHT - BOTTOM, HEIGHT - BOTTOM - 8.0);
+            line(format_args!(r##"<line x1="{at:.1}" x2="{at:.1}" y1="{from}" y2="{to}" stroke="#c0142c"/>"##));
+        }
     }
 }
 
