@@ -3,7 +3,8 @@
 //! A reduce-scatter and an all-gather. A member's contiguous slices are a few nodes of the summation
 //! tree. The buffer is cut into one chunk per member. Member m receives every node's partial sum of chunk m, follows
 //! the tree to the root, and sends the result to all. No addition depends on the order of arrival. Partial sums are
-//! computed in pieces during sending, so the buffer exists once per slice and once for the sum.
+//! computed in pieces during sending, so the buffer exists once per slice and once for the sum. Members of one machine
+//! pass numbers by [`memory`](super::memory): for a peer the parts of all nodes, then the sum of the own chunk.
 //!
 //! Drain requests precede the parts. All members OR them over the same messages, so that all stop after the same step.
 
@@ -14,11 +15,14 @@ use bytemuck::cast_slice;
 use protocol::message::LossCause;
 
 use super::frame::{Frame, Head, Kind, PIECE, Payload};
+use super::memory::Announcement;
 use super::mesh::{Halt, Mesh};
 use super::tree::{self, Node};
 
 const DRAIN: u32 = 1;
 const SAVED: u32 = 2;
+/// The sender has mapped the receiver's memory.
+const MAPPED: u32 = 4;
 
 /// Returns a reason to give up, if there is one; called often.
 pub(crate) type Interrupt<'a> = &'a (dyn Fn() -> Option<Halt> + Sync);
@@ -97,7 +101,7 @@ pub(crate) fn exchange(mesh: &Mesh, contribution: &Contribution<'_>, interrupt: 
     known.sort_by_key(|(node, _)| node.start);
     let mut sum = vec![0.0; length];
     tree::sum(&root, &known, &mut sum[chunk.clone()]);
-    gather(mesh, &barrier, contribution.step, &mut sum, interrupt)?;
+    gather(mesh, &barrier, contribution, &mut sum, interrupt)?;
     if let Some(slow) = mesh.pace.end(mesh.others()) {
         mesh.complain(slow);
     }
@@ -139,7 +143,11 @@ fn receive_parts(
                 format!("is at step {} with {} slices; expected {} slices", begin.step, begin.a, contribution.slices),
             ));
         }
-        let (at, stored) = numbers(&begin).ok_or_else(|| disagree(peer, "sends a malformed greeting".to_owned()))?;
+        let greeting = Greeting::read(begin.bytes());
+        let greeting = greeting.ok_or_else(|| disagree(peer, "sends a malformed greeting".to_owned()))?;
+        let (at, stored) = (greeting.length, greeting.durable);
+        let announced = greeting.announced.filter(|_| mesh.may_share_memory(peer, barrier, interrupt) == Ok(true));
+        mesh.memory(peer).greeted(begin.step, announced.as_ref(), begin.b & MAPPED != 0);
         received.drain |= begin.b & DRAIN != 0;
         if begin.b & SAVED != 0 {
             mesh.pace.excuse();
@@ -162,12 +170,17 @@ fn receive_parts(
             let mut numbers = Vec::with_capacity(chunk.len());
             for (p, range) in pieces(&chunk).enumerate() {
                 let (at, frame) = mesh.next_timed(peer, barrier, interrupt)?;
-                let frame = expect(frame, Kind::Part, mesh, peer)?;
                 came = at;
+                let unexpected = || disagree(peer, format!("sends an unexpected part at node {n}, piece {p}"));
                 let place = (frame.a, frame.b) == (number(n), number(p));
-                let Some(part) = floats(frame).filter(|part| place && part.len() == range.len()) else {
-                    return Err(disagree(peer, format!("sends an unexpected part at node {n}, piece {p}")));
-                };
+                if place && p == 0 && frame.kind == Kind::SharedPart {
+                    numbers = vec![0.0; chunk.len()];
+                    let whole = mesh.memory(peer).read(n * chunk.len(), &mut numbers);
+                    whole.then_some(()).ok_or_else(unexpected)?;
+                    break;
+                }
+                let frame = expect(frame, Kind::Part, mesh, peer)?;
+                let part = floats(frame).filter(|part| place && part.len() == range.len()).ok_or_else(unexpected)?;
                 if numbers.is_empty() && range.len() == chunk.len() { numbers = part } else { numbers.extend(part) }
             }
             received.sums.push((node, numbers));
@@ -178,23 +191,45 @@ fn receive_parts(
 }
 
 /// Sends this member's chunk of the sum and receives the others': the all-gather.
-fn gather(mesh: &Mesh, barrier: &str, step: u64, sum: &mut [f32], interrupt: Interrupt<'_>) -> Result<(), Halt> {
-    let own = mesh.config.rank;
-    let size = mesh.size();
-    let length = sum.len();
+fn gather(
+    mesh: &Mesh,
+    barrier: &str,
+    contribution: &Contribution<'_>,
+    sum: &mut [f32],
+    interrupt: Interrupt<'_>,
+) -> Result<(), Halt> {
+    let (step, slices) = (contribution.step, contribution.slices);
+    let (own, size, length) = (mesh.config.rank, mesh.size(), sum.len());
+    // In a member's memory for a peer, the parts of its nodes come first.
+    let begin = |from: usize, to: usize| {
+        tree::cover(slices, &tree::share(slices, from, size)).len() * tree::share(length, to, size).len()
+    };
+    let chunk = tree::share(length, own, size);
     for peer in mesh.others() {
-        for (p, range) in pieces(&tree::share(length, own, size)).enumerate() {
+        if let Some(memory) = mesh.memory(peer).outgoing().filter(|_| !chunk.is_empty()) {
+            let at = begin(own, peer);
+            memory.numbers(at..at + chunk.len()).copy_from_slice(&sum[chunk.clone()]);
+            mesh.send(peer, barrier, Head::new(Kind::SharedSum, step, 0, 0), &[], interrupt)?;
+            continue;
+        }
+        for (p, range) in pieces(&chunk).enumerate() {
             let head = Head::new(Kind::Sum, step, 0, number(p));
             mesh.send(peer, barrier, head, cast_slice(&sum[range]), interrupt)?;
         }
     }
     for peer in mesh.others() {
-        for (p, range) in pieces(&tree::share(length, peer, size)).enumerate() {
-            let frame = expect(mesh.next(peer, barrier, interrupt)?, Kind::Sum, mesh, peer)?;
+        let chunk = tree::share(length, peer, size);
+        for (p, range) in pieces(&chunk).enumerate() {
+            let frame = mesh.next(peer, barrier, interrupt)?;
+            let unexpected = || disagree(mesh, barrier, peer, &format!("sends an unexpected sum at piece {p}"));
             let place = frame.b == number(p) && frame.step == step;
-            let Some(part) = floats(frame).filter(|part| place && part.len() == range.len()) else {
-                return Err(disagree(mesh, barrier, peer, &format!("sends an unexpected sum at piece {p}")));
-            };
+            if place && p == 0 && frame.kind == Kind::SharedSum {
+                let whole = mesh.memory(peer).read(begin(peer, own), &mut sum[chunk.clone()]);
+                whole.then_some(()).ok_or_else(unexpected)?;
+                break;
+            }
+            let frame = expect(frame, Kind::Sum, mesh, peer)?;
+            let part = floats(frame).filter(|part| place && part.len() == range.len()).ok_or_else(unexpected)?;
             sum[range].copy_from_slice(&part);
         }
     }
@@ -210,23 +245,37 @@ fn send_parts(
     nodes: &[Node],
     interrupt: Interrupt<'_>,
 ) -> Result<(), Halt> {
-    let flags = (if contribution.drain { DRAIN } else { 0 }) | (if contribution.saved { SAVED } else { 0 });
-    let length = contribution.parts.first().map(|(_, part)| part.len());
-    let mut greeting = [0u8; 16];
-    greeting[..8].copy_from_slice(&(length.unwrap_or(0) as u64).to_le_bytes());
-    greeting[8..].copy_from_slice(&contribution.durable.to_le_bytes());
-    let head = Head::new(Kind::Begin, contribution.step, number(contribution.slices), flags);
-    mesh.send(peer, barrier, head, &greeting, interrupt)?;
-    let chunk = length.map_or(0..0, |length| tree::share(length, peer, mesh.size()));
+    let step = contribution.step;
+    let length = contribution.parts.first().map_or(0, |(_, part)| part.len());
+    let chunk = tree::share(length, peer, mesh.size());
+    let own = tree::share(length, mesh.config.rank, mesh.size());
+    let local = mesh.may_share_memory(peer, barrier, interrupt)?;
+    let mut memory = mesh.memory(peer);
+    let numbers = Some(nodes.len() * chunk.len() + own.len()).filter(|numbers| local && *numbers > 0);
+    let announced = numbers.and_then(|numbers| memory.announce(step, numbers));
+    let greeting = Greeting { length: length as u64, durable: contribution.durable, announced };
+    let flags = [(contribution.drain, DRAIN), (contribution.saved, SAVED), (memory.has_incoming(), MAPPED)];
+    let flags = flags.iter().filter(|(is_set, _)| *is_set).fold(0, |all, (_, flag)| all | flag);
+    let head = Head::new(Kind::Begin, step, number(contribution.slices), flags);
+    mesh.send(peer, barrier, head, &greeting.to_bytes(), interrupt)?;
+    let sum = |node: &Node, range: Range<usize>, out: &mut [f32]| {
+        let parts = &contribution.parts[within(&contribution.parts, node)];
+        let leaves: Vec<(Node, &[f32])> =
+            parts.iter().map(|(slice, part)| (slice.clone(), &part[range.clone()])).collect();
+        tree::sum(node, &leaves, out);
+    };
     let mut piece = vec![0.0f32; PIECE.min(chunk.len())];
     for (n, node) in nodes.iter().enumerate() {
+        if let Some(memory) = memory.outgoing().filter(|_| !chunk.is_empty()) {
+            sum(node, chunk.clone(), memory.numbers(n * chunk.len()..(n + 1) * chunk.len()));
+            let head = Head::new(Kind::SharedPart, step, number(n), 0);
+            mesh.send(peer, barrier, head, &[], interrupt)?;
+            continue;
+        }
         for (p, range) in pieces(&chunk).enumerate() {
-            let parts = &contribution.parts[within(&contribution.parts, node)];
-            let leaves: Vec<(Node, &[f32])> =
-                parts.iter().map(|(slice, part)| (slice.clone(), &part[range.clone()])).collect();
             let out = &mut piece[..range.len()];
-            tree::sum(node, &leaves, out);
-            let head = Head::new(Kind::Part, contribution.step, number(n), number(p));
+            sum(node, range, out);
+            let head = Head::new(Kind::Part, step, number(n), number(p));
             mesh.send(peer, barrier, head, cast_slice(out), interrupt)?;
         }
     }
@@ -234,13 +283,32 @@ fn send_parts(
     Ok(())
 }
 
-fn number(n: usize) -> u32 {
-    u32::try_from(n).expect("slices and pieces are counted in thousands")
+/// Payload of a `Begin` frame.
+struct Greeting {
+    /// Floats in the buffer; 0 if the sender has no slice.
+    length: u64,
+    /// [`Contribution::durable`].
+    durable: u64,
+    announced: Option<Announcement>,
 }
 
-fn numbers(begin: &Frame) -> Option<(u64, u64)> {
-    let (a, b) = begin.bytes().split_at_checked(8)?;
-    Some((u64::from_le_bytes(a.try_into().ok()?), u64::from_le_bytes(b.try_into().ok()?)))
+impl Greeting {
+    fn to_bytes(&self) -> Vec<u8> {
+        let mut bytes = [self.length.to_le_bytes(), self.durable.to_le_bytes()].concat();
+        bytes.extend(self.announced.iter().flat_map(|announced| announced.to_bytes()));
+        bytes
+    }
+
+    fn read(bytes: &[u8]) -> Option<Self> {
+        let (length, rest) = bytes.split_first_chunk()?;
+        let (durable, rest) = rest.split_first_chunk()?;
+        let announced = if rest.is_empty() { None } else { Some(Announcement::read(rest)?) };
+        Some(Self { length: u64::from_le_bytes(*length), durable: u64::from_le_bytes(*durable), announced })
+    }
+}
+
+fn number(n: usize) -> u32 {
+    u32::try_from(n).expect("slices and pieces are counted in thousands")
 }
 
 fn floats(frame: Frame) -> Option<Vec<f32>> {

@@ -4,7 +4,7 @@
 //!
 //! | at | bytes | content |
 //! |---|---|---|
-//! | 0 | 4 | magic `STR4`: its last byte is the version of these frames and of their contents |
+//! | 0 | 4 | magic `STR5`: its last byte is the version of these frames and of their contents |
 //! | 4 | 1 | kind |
 //! | 5 | 3 | zero |
 //! | 8 | 8 | `step`: the training step, or another number by kind |
@@ -22,7 +22,7 @@ use std::io::{self, Read, Write};
 
 use super::seal::{Seal, TAG};
 
-const MAGIC: [u8; 4] = *b"STR4";
+const MAGIC: [u8; 4] = *b"STR5";
 /// Bytes of the header that the tag covers.
 const SIGNED: usize = 28;
 const HEADER: usize = SIGNED + TAG;
@@ -58,7 +58,8 @@ pub(crate) enum Kind {
     StateLength = 8,
     /// Rendezvous: the next piece of a state.
     State = 9,
-    /// Exchange: `a` slices, `b` flags; payload: floats in the buffer and the lead's last durable row, 8 bytes each.
+    /// Exchange: `a` slices, `b` flags; payload: floats in the buffer and the lead's last durable row, 8 bytes each, and
+    /// the announcement of the sender's memory, if any.
     Begin = 10,
     /// Exchange: partial sum of node `a`, piece `b` of the receiver's chunk.
     Part = 11,
@@ -66,6 +67,10 @@ pub(crate) enum Kind {
     Sum = 12,
     /// A probe from a stranger, answered with the same frame.
     Probe = 13,
+    /// Exchange: like `Part`, for the whole chunk, which is in the sender's memory.
+    SharedPart = 14,
+    /// Exchange: like `Sum`, for the whole chunk, which is in the sender's memory.
+    SharedSum = 15,
 }
 
 impl Kind {
@@ -84,6 +89,8 @@ impl Kind {
             11 => Self::Part,
             12 => Self::Sum,
             13 => Self::Probe,
+            14 => Self::SharedPart,
+            15 => Self::SharedSum,
             _ => return None,
         })
     }
@@ -152,7 +159,7 @@ pub(crate) enum FrameError {
     Closed,
     #[error("the connection failed: {0}")]
     Io(#[source] io::Error),
-    #[error("not a frame of this build: it starts with `{}`; expected `STR4`; use the same build for all workers", .0.escape_ascii())]
+    #[error("not a frame of this build: it starts with `{}`; expected `STR5`; use the same build for all workers", .0.escape_ascii())]
     Magic([u8; 4]),
     #[error("a frame has the unknown kind {0}; use the same build for all workers")]
     Kind(u8),

@@ -22,6 +22,8 @@ pub(super) struct Link {
     /// A clone of the socket, to end the connection during a write.
     pub(super) socket: TcpStream,
     pub(super) writer: Mutex<Writer>,
+    /// True if the connection stays on this machine.
+    pub(super) is_local: bool,
 }
 
 /// The socket with the seal of its outgoing frames.

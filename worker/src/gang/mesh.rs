@@ -11,7 +11,7 @@ use std::collections::VecDeque;
 use std::io;
 use std::net::{Shutdown, TcpStream};
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
-use std::sync::{Arc, Mutex, Weak};
+use std::sync::{Arc, Mutex, MutexGuard, Weak};
 use std::thread;
 use std::time::{Duration, Instant};
 
@@ -24,6 +24,7 @@ use super::frame::{self, Frame, FrameError, Head, Kind, MAX_PAYLOAD};
 use super::handshake::{self, HandshakeError, Session};
 use super::link::{BLINK, Heard, Link, Pulse, Sign, Writer};
 use super::member::{MeshConfig, Phase, Timing, spawn};
+use super::memory::Between;
 use super::pace::Pace;
 use super::seal::Seal;
 use crate::event_count::{EventCount, lock};
@@ -80,6 +81,10 @@ pub(crate) struct Mesh {
     /// The rank that the stage waits for, plus one; 0 if it waits for none.
     waits_for: AtomicUsize,
     pub(super) pace: Pace,
+    /// Memory between this member and each peer. Only the stage's threads use it.
+    memory: Vec<Mutex<Between>>,
+    /// True if gradients pass over connections alone, also on one machine.
+    uses_no_memory: AtomicBool,
     closed: AtomicBool,
 }
 
@@ -103,7 +108,10 @@ impl Mesh {
         let waits_for = AtomicUsize::new(0);
         let closed = AtomicBool::new(false);
         let pace = Pace::new(config.members.len(), timing.slow);
-        let mesh = Arc::new(Self { config, timing, peers, event_count, wake, waits_for, pace, closed });
+        let memory = config.members.iter().map(|_| Mutex::default()).collect();
+        let uses_no_memory = AtomicBool::new(false);
+        let mesh = Self { config, timing, peers, event_count, wake, waits_for, pace, memory, uses_no_memory, closed };
+        let mesh = Arc::new(mesh);
         if mesh.size() > 1 {
             let gang: Arc<dyn Gang> = mesh.clone();
             endpoint.announce(&mesh.config, Arc::downgrade(&gang));
@@ -220,6 +228,12 @@ impl Mesh {
         self.closed.load(Ordering::SeqCst)
     }
 
+    /// Makes gradients pass over connections alone, which a test may slow down.
+    #[cfg(test)]
+    pub(crate) fn use_no_memory(&self) {
+        self.uses_no_memory.store(true, Ordering::SeqCst);
+    }
+
     /// Number of unread frames from `rank`.
     #[cfg(test)]
     pub(crate) fn queued(&self, rank: usize) -> usize {
@@ -305,6 +319,7 @@ impl Mesh {
     /// Adds a connection whose other side has authenticated as `rank`.
     fn attach(self: &Arc<Self>, rank: usize, stream: TcpStream, session: Session) {
         let Session { sends, receives } = session;
+        let is_local = !sends.is_encrypted();
         let pulse = lock(&self.peers)[rank].pulse.clone();
         let both = stream.try_clone().and_then(|reader| {
             // Keep-alives arrive far more often than this; the timeout only bounds the life of a reader.
@@ -316,6 +331,7 @@ impl Mesh {
                 Link {
                     socket,
                     writer: Mutex::new(Writer { stream, seal: sends, pulse: pulse.clone(), signed: Instant::now() }),
+                    is_local,
                 },
             ))
         });
@@ -375,6 +391,22 @@ impl Mesh {
             }
         }
         self.event_count.notify();
+    }
+
+    /// The memory between this member and `rank`.
+    pub(super) fn memory(&self, rank: usize) -> MutexGuard<'_, Between> {
+        lock(&self.memory[rank])
+    }
+
+    /// Waits for a link to `rank`. Returns true if both ends are on this machine and may share memory.
+    pub(super) fn may_share_memory(
+        &self,
+        rank: usize,
+        barrier: &str,
+        interrupt: &dyn Fn() -> Option<Halt>,
+    ) -> Result<bool, Halt> {
+        let link = self.wait(rank, barrier, interrupt, |peer| peer.link.clone())?;
+        Ok(link.is_local && !self.uses_no_memory.load(Ordering::SeqCst))
     }
 
     /// Waits for a link to `rank` and sends over it. `interrupt` returns a reason to give up.

@@ -6,6 +6,7 @@ mod frame;
 pub(crate) mod handshake;
 mod link;
 pub(crate) mod member;
+mod memory;
 pub(crate) mod mesh;
 mod pace;
 pub(crate) mod rendezvous;

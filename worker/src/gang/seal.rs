@@ -52,6 +52,11 @@ impl Seal {
         Self { means: Means::Encrypted(Box::new(LessSafeKey::new(key))), next: 0, encrypted: Vec::new() }
     }
 
+    /// Returns true if the connection leaves the machine.
+    pub(super) fn is_encrypted(&self) -> bool {
+        matches!(self.means, Means::Encrypted(_))
+    }
+
     /// Seals a single frame of a handshake with a checksum.
     pub(super) fn checksum() -> Self {
         Self::tagged([0; 32])

@@ -92,6 +92,7 @@ fn pair(timing: Timing) -> (Relay, [Arc<Mesh>; 2]) {
     let relay = Relay::to(gang.seats[0].endpoint.address());
     Arc::get_mut(&mut gang).expect("not shared yet").seats[0].member.peer_address = relay.address.to_string();
     let meshes = [0, 1].map(|own| mesh(&gang, &[0, 1], own, "s").0);
+    meshes.iter().for_each(|mesh| mesh.use_no_memory());
     thread::scope(|scope| {
         for mesh in &meshes {
             scope.spawn(|| assert_eq!(rendezvous::rendezvous(mesh, Some(5), &[], &|| None), Ok(Met::Keep)));
