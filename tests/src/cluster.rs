@@ -40,6 +40,8 @@ pub struct Cluster {
     /// Arguments of each server besides address and tokens.
     of_servers: Vec<String>,
     stand_by: Option<Running>,
+    /// Address of the server that stands by.
+    second: Option<SocketAddr>,
     workers: BTreeMap<String, Running>,
 }
 
@@ -79,7 +81,8 @@ impl Cluster {
 
     fn serving_with(bench: Bench, address: SocketAddr, arguments: &[&str]) -> Self {
         let of_servers = arguments.iter().map(|argument| (*argument).to_owned()).collect();
-        let mut cluster = Self { bench, address, server: None, of_servers, stand_by: None, workers: BTreeMap::new() };
+        let (server, stand_by, second, workers) = (None, None, None, BTreeMap::new());
+        let mut cluster = Self { bench, address, server, of_servers, stand_by, second, workers };
         cluster.serve();
         cluster
     }
@@ -130,7 +133,7 @@ impl Cluster {
 
     /// Starts or restarts the coordinator and waits until it answers.
     pub fn serve(&mut self) {
-        let mut server = self.spawn_server("serve", &[]);
+        let mut server = self.spawn_server("serve", self.address, &[]);
         wait_for("the coordinator to answer", || {
             assert!(server.alive(), "the coordinator ended:\n{}", self.said("serve"));
             self.get("/v1/health")
@@ -138,9 +141,12 @@ impl Cluster {
         self.server = Some(server);
     }
 
-    /// Starts a second server, which stands by at the same address, and waits until it does.
+    /// Starts a second server, which stands by at another address, and waits until it does. Workers that join later
+    /// know both addresses.
     pub fn stand_by(&mut self, arguments: &[&str]) {
-        self.stand_by = Some(self.spawn_server("stand-by", &[&["--stand-by"], arguments].concat()));
+        let address = Self::free_address();
+        self.second = Some(address);
+        self.stand_by = Some(self.spawn_server("stand-by", address, &[&["--stand-by"], arguments].concat()));
         wait_for("the second server to stand by", || self.said("stand-by").contains("standing by").then_some(()));
     }
 
@@ -149,12 +155,13 @@ impl Cluster {
         self.kill_server();
         let gone = Instant::now();
         self.server = self.stand_by.take();
+        self.address = self.second.take().expect("a second server");
         wait_for("the second server to answer", || self.get("/v1/health"));
         gone.elapsed()
     }
 
-    fn spawn_server(&self, who: &str, more: &[&str]) -> Running {
-        let address = self.address.to_string();
+    fn spawn_server(&self, who: &str, address: SocketAddr, more: &[&str]) -> Running {
+        let address = address.to_string();
         let tokens = self.bench.path().join("tokens");
         fs::write(&tokens, format!("admin admin {TOKEN}\nworkers worker {WORKER_TOKEN}\n")).expect("a token file");
         fs::set_permissions(&tokens, fs::Permissions::from_mode(0o600)).expect("ours");
@@ -193,7 +200,8 @@ impl Cluster {
 
     /// Starts a worker with more arguments, by a wrapping command.
     pub fn join_by(&mut self, name: &str, wrap: &[String], more: &[&str]) {
-        self.join_at(&self.url(), name, wrap, more);
+        let urls = self.second.iter().fold(self.url(), |urls, second| format!("{urls},http://{second}"));
+        self.join_at(&urls, name, wrap, more);
     }
 
     /// Like [`join_by`](Self::join_by), with another URL of the coordinator.

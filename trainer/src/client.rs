@@ -77,9 +77,10 @@ impl Client {
     }
 
     async fn try_send(&self, request: RequestBuilder) -> Result<Response> {
-        let url = self.server.url();
-        request.send().await.map_err(|error| {
-            let problem = Problem::new(exit::UNREACHABLE, anyhow::anyhow!("cannot reach `{url}`: {}", explain(&error)));
+        self.server.send(request).await.map_err(|error| {
+            let urls = self.server.urls();
+            let problem =
+                Problem::new(exit::UNREACHABLE, anyhow::anyhow!("cannot reach `{urls}`: {}", explain(&error)));
             problem.hint("start it with `trainer serve`, or give its address with --server")
         })
     }

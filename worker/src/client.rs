@@ -110,6 +110,10 @@ impl Client {
         self.server.request(method, path).timeout(timeout)
     }
 
+    async fn send(&self, request: RequestBuilder) -> Result<Response, CallError> {
+        check(self.server.send(request).await).await
+    }
+
     /// Blocks on a call. The calling thread must not be the runtime's.
     pub(crate) fn wait<T>(&self, call: impl Future<Output = T>) -> T {
         self.runtime.block_on(call)
@@ -161,7 +165,7 @@ impl Client {
         if let Some(receipt) = receipt {
             request = request.header(RECEIPT_HEADER, receipt);
         }
-        answer(check(request.send().await).await?).await
+        answer(self.send(request).await?).await
     }
 
     /// Sends a part that begins at `offset` of a blob of `bytes` bytes.
@@ -176,7 +180,7 @@ impl Client {
         let request = self.request(reqwest::Method::PUT, &format!("/v1/blobs/{digest}"), LONG);
         let request = in_the_name_of(request, credential)?.header("content-type", "application/octet-stream");
         let request = request.header("x-stride-bytes", bytes).header("x-stride-offset", offset);
-        answer(check(request.body(part).send().await).await?).await
+        answer(self.send(request.body(part)).await?).await
     }
 
     /// Requests a blob from `offset` to its end.
@@ -188,7 +192,7 @@ impl Client {
         if let Some(process) = &*lock(&self.process) {
             request = request.header(PROCESS_HEADER, header(process)?).header(SECRET_HEADER, self.secret.secret());
         }
-        let response = check(request.send().await).await?;
+        let response = self.send(request).await?;
         match (offset, response.status()) {
             (0, _) | (_, StatusCode::PARTIAL_CONTENT) => Ok(Download(response)),
             (_, status) => {
@@ -205,7 +209,7 @@ impl Client {
         timeout: Duration,
     ) -> Result<Response, CallError> {
         let request = self.request(reqwest::Method::POST, path, timeout).header(SECRET_HEADER, secret);
-        check(request.json(what).send().await).await
+        self.send(request.json(what)).await
     }
 }
 

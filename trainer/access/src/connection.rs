@@ -2,9 +2,11 @@
 
 use std::net::IpAddr;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
 
-use reqwest::{Method, RequestBuilder, Url};
+use reqwest::{Method, Request, RequestBuilder, Response, StatusCode, Url};
 
 use crate::secret::{FileError, Token};
 use crate::tls;
@@ -52,75 +54,43 @@ impl ConnectError {
     }
 }
 
-/// A server's address, the token sent to it and the certificates trusted for it.
+/// Most addresses of a server: the leader's and those of its stand-bys.
+const ADDRESSES: usize = 8;
+
+/// A server's addresses, the token sent to it and the certificates trusted for it. With several addresses, one process
+/// serves at a time: the leader. Clones share the address that answered last.
 #[derive(Debug, Clone)]
 pub struct Server {
     http: reqwest::Client,
-    base: String,
+    addresses: Arc<[Address]>,
+    current: Arc<AtomicUsize>,
     token: Option<Token>,
 }
 
-impl Server {
-    /// Creates a client of the server at `url`; `HOST:PORT` alone means `http://`. With `ca`, only certificates signed
-    /// by it are trusted.
-    ///
-    /// # Errors
-    /// [`ConnectError::Unencrypted`] if the token would leave this machine over plain HTTP; errors for invalid
-    /// addresses and files.
-    pub fn new(url: &str, token: Option<Token>, ca: Option<&Path>) -> Result<Self, ConnectError> {
-        let server = Self::insecure(url, token, ca)?;
-        if server.token.is_some() && !server.is_encrypted() && !server.is_local() {
-            return Err(ConnectError::Unencrypted(server.base));
-        }
-        Ok(server)
-    }
+#[derive(Debug)]
+struct Address {
+    url: Url,
+    /// The URL as text, without a trailing slash.
+    text: String,
+}
 
-    /// Like [`Server::new`], but allows the token to cross a network unencrypted.
-    pub fn insecure(url: &str, token: Option<Token>, ca: Option<&Path>) -> Result<Self, ConnectError> {
-        let base = url.trim().trim_end_matches('/');
+impl Address {
+    fn read(text: &str) -> Result<Self, ConnectError> {
+        let wrong = |why: String| ConnectError::Url { url: text.to_owned(), why };
+        let base = text.trim().trim_end_matches('/');
         let base = if base.contains("://") { base.to_owned() } else { format!("http://{base}") };
-        let wrong = |why: String| ConnectError::Url { url: url.to_owned(), why };
-        let parsed = Url::parse(&base).map_err(|error| wrong(error.to_string()))?;
-        if !matches!(parsed.scheme(), "http" | "https") || parsed.host().is_none() {
+        let url = Url::parse(&base).map_err(|error| wrong(error.to_string()))?;
+        if !matches!(url.scheme(), "http" | "https") || url.host().is_none() {
             return Err(wrong("unsupported scheme or missing host".to_owned()));
         }
-        if !matches!(parsed.path(), "" | "/") || parsed.query().is_some() || !parsed.username().is_empty() {
+        if !matches!(url.path(), "" | "/") || url.query().is_some() || !url.username().is_empty() {
             return Err(wrong("it must not have a path, a query or a user name".to_owned()));
         }
-        let http = reqwest::Client::builder()
-            .connect_timeout(Duration::from_secs(5))
-            .pool_idle_timeout(IDLE)
-            .tcp_nodelay(true)
-            // Redirects are not followed: the server never sends any, and another host must not get the token.
-            .redirect(reqwest::redirect::Policy::none());
-        let http = match (parsed.scheme(), ca) {
-            ("https", Some(ca)) => http.tls_backend_preconfigured(tls::pinned(ca)?),
-            ("https", None) => {
-                tls::install_provider();
-                http
-            }
-            (_, Some(_)) => return Err(ConnectError::Plain(base)),
-            (_, None) => http.tls_backend_preconfigured(tls::nobody()),
-        };
-        let http = http.build().map_err(|error| ConnectError::Client(explain(&error)))?;
-        Ok(Self { http, base, token })
+        Ok(Self { url, text: base })
     }
 
-    /// The address without a trailing slash.
-    pub fn url(&self) -> &str {
-        &self.base
-    }
-
-    /// Returns true if the connection uses TLS.
-    pub fn is_encrypted(&self) -> bool {
-        self.base.starts_with("https://")
-    }
-
-    /// Returns true if the address is on this machine, so that no packet leaves it. The only name accepted is
-    /// `localhost`.
-    pub fn is_local(&self) -> bool {
-        let url = Url::parse(&self.base).ok();
-        let host = url.as_ref().and_then(Url::host_str).unwrap_or_default();
+    fn is_local(&self) -> bool {
+        let host = self.url.host_str().unwrap_or_default();
         let name = host.trim_end_matches('.');
         match host.trim_matches(['[', ']']).parse::<IpAddr>() {
             Ok(address) => address.is_loopback() || address.is_unspecified(),
@@ -128,13 +98,134 @@ impl Server {
         }
     }
 
+    fn is_of(&self, url: &Url) -> bool {
+        self.url.origin() == url.origin()
+    }
+}
+
+impl Server {
+    /// Creates a client of the server at `url`; `HOST:PORT` alone means `http://`. Several URLs are separated by commas.
+    /// With `ca`, only certificates signed by it are trusted.
+    ///
+    /// # Errors
+    /// [`ConnectError::Unencrypted`] if the token would leave this machine over plain HTTP; errors for invalid
+    /// addresses and files.
+    pub fn new(url: &str, token: Option<Token>, ca: Option<&Path>) -> Result<Self, ConnectError> {
+        let server = Self::insecure(url, token, ca)?;
+        let exposed = server.addresses.iter().find(|address| !address.is_local());
+        match exposed.filter(|_| server.token.is_some() && !server.is_encrypted()) {
+            Some(address) => Err(ConnectError::Unencrypted(address.text.clone())),
+            None => Ok(server),
+        }
+    }
+
+    /// Like [`Server::new`], but allows the token to cross a network unencrypted.
+    pub fn insecure(url: &str, token: Option<Token>, ca: Option<&Path>) -> Result<Self, ConnectError> {
+        let wrong = |why: String| ConnectError::Url { url: url.to_owned(), why };
+        let addresses = url.split(',').map(Address::read).collect::<Result<Vec<_>, _>>()?;
+        let scheme = addresses.first().map_or("http", |address| address.url.scheme());
+        if addresses.iter().any(|address| address.url.scheme() != scheme) {
+            return Err(wrong("some addresses are encrypted and others are not".to_owned()));
+        }
+        if addresses.len() > ADDRESSES {
+            return Err(wrong(format!("it has {} addresses, at most {ADDRESSES} are allowed", addresses.len())));
+        }
+        let http = reqwest::Client::builder()
+            .connect_timeout(Duration::from_secs(5))
+            .pool_idle_timeout(IDLE)
+            .tcp_nodelay(true)
+            // Redirects are not followed: the server never sends any, and another host must not get the token.
+            .redirect(reqwest::redirect::Policy::none());
+        let http = match (scheme, ca) {
+            ("https", Some(ca)) => http.tls_backend_preconfigured(tls::pinned(ca)?),
+            ("https", None) => {
+                tls::install_provider();
+                http
+            }
+            (_, Some(_)) => return Err(ConnectError::Plain(url.to_owned())),
+            (_, None) => http.tls_backend_preconfigured(tls::nobody()),
+        };
+        let http = http.build().map_err(|error| ConnectError::Client(explain(&error)))?;
+        Ok(Self { http, addresses: addresses.into(), current: Arc::default(), token })
+    }
+
+    fn current(&self) -> &Address {
+        &self.addresses[self.current.load(Ordering::Relaxed) % self.addresses.len()]
+    }
+
+    /// The address that answered last, without a trailing slash.
+    pub fn url(&self) -> &str {
+        &self.current().text
+    }
+
+    /// All addresses, separated by commas.
+    pub fn urls(&self) -> String {
+        let texts: Vec<&str> = self.addresses.iter().map(|address| address.text.as_str()).collect();
+        texts.join(",")
+    }
+
+    /// Returns true if the connection uses TLS.
+    pub fn is_encrypted(&self) -> bool {
+        self.current().url.scheme() == "https"
+    }
+
+    /// Returns true if all addresses are on this machine, so that no packet leaves it. The only name accepted is
+    /// `localhost`.
+    pub fn is_local(&self) -> bool {
+        self.addresses.iter().all(Address::is_local)
+    }
+
     /// Builds a request of `path`, which starts with a slash.
     pub fn request(&self, method: Method, path: &str) -> RequestBuilder {
-        let request = self.http.request(method, format!("{}{path}", self.base));
+        let request = self.http.request(method, format!("{}{path}", self.url()));
         match &self.token {
             Some(token) => request.bearer_auth(token.secret()),
             None => request,
         }
+    }
+
+    /// Sends a request of [`Self::request`]. An address that accepts no connection is left for the next one, at once. One
+    /// that breaks off, is silent or no longer leads is left too, but not asked again: the call may have been done there.
+    pub async fn send(&self, request: RequestBuilder) -> reqwest::Result<Response> {
+        let mut request = request.build()?;
+        let mut more = self.addresses.len();
+        loop {
+            more -= 1;
+            let url = request.url().clone();
+            let spare = request.try_clone();
+            let sent = self.http.execute(request).await;
+            let is_left = match &sent {
+                Ok(answer) => answer.status() == StatusCode::SERVICE_UNAVAILABLE,
+                Err(_) => true,
+            };
+            if !is_left {
+                return sent;
+            }
+            self.leave(&url);
+            let refused = sent.as_ref().is_err_and(reqwest::Error::is_connect);
+            match spare.filter(|_| refused && more > 0) {
+                Some(spare) => request = self.moved(spare),
+                None => return sent,
+            }
+        }
+    }
+
+    /// Turns to the address after the one of `url`, unless another call has done so.
+    fn leave(&self, url: &Url) {
+        let here = self.current.load(Ordering::Relaxed) % self.addresses.len();
+        if self.addresses[here].is_of(url) {
+            let next = (here + 1) % self.addresses.len();
+            let _ = self.current.compare_exchange(here, next, Ordering::Relaxed, Ordering::Relaxed);
+        }
+    }
+
+    /// The same request at the current address.
+    fn moved(&self, mut request: Request) -> Request {
+        let mut url = self.current().url.clone();
+        url.set_path(request.url().path());
+        url.set_query(request.url().query());
+        *request.url_mut() = url;
+        request
     }
 }
 
@@ -183,6 +274,9 @@ mod tests {
     fn addresses_are_whole_and_nothing_more() {
         let url = |text: &str| Server::new(text, None, None).map(|server| server.url().to_owned());
         assert_eq!(url("127.0.0.1:7700/").unwrap(), "http://127.0.0.1:7700");
+        assert_eq!(url("a:1, b:2").unwrap(), "http://a:1");
+        assert_eq!(Server::new("a:1, b:2/", None, None).unwrap().urls(), "http://a:1,http://b:2");
+        assert!(matches!(url("http://a:1,https://b:2"), Err(ConnectError::Url { .. })));
         assert_eq!(url("http://[::1]:7700").unwrap(), "http://[::1]:7700");
         for wrong in ["", "ftp://host", "http://host/path", "http://user@host:1", "http://host?x", "unix:///run"] {
             assert!(matches!(url(wrong), Err(ConnectError::Url { .. })), "{wrong}");

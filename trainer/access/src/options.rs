@@ -52,7 +52,7 @@ impl ConnectionOptions {
 /// Options for a server and its connection.
 #[derive(Debug, Clone, Default, clap::Args)]
 pub struct ServerOptions {
-    /// Server to ask instead of the store's folder
+    /// Server to ask instead of the store's folder; addresses of a server and its stand-bys are separated by commas
     #[arg(long, env = "STRIDE_SERVER", value_name = "URL", global = true)]
     pub server: Option<String>,
     #[command(flatten)]

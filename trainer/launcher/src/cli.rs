@@ -204,7 +204,7 @@ impl FollowArgs {
             (None, Engine::Local) => this_program().unwrap_or_else(|| "trainer".to_owned()),
             (None, Engine::Slurm | Engine::Ssh | Engine::Kubernetes) => "trainer".to_owned(),
         };
-        let url = self.worker_url.clone().unwrap_or_else(|| server.url().to_owned());
+        let url = self.worker_url.clone().unwrap_or_else(|| server.urls());
         let worker = WorkerCommand { program, url, backend: self.kind.backend, labels: self.kind.labels(), more };
         let engine = self.kind.engine(engine, worker)?;
         let (min, max) = self.workers;

@@ -55,7 +55,7 @@ pub async fn demand(
     let unreachable =
         |error: &reqwest::Error| FollowError::Unreachable { url: server.url().to_owned(), why: explain(error) };
     let request = server.request(Method::GET, &path).timeout(wait + ENGINE);
-    let answer = request.send().await.map_err(|error| unreachable(&error))?;
+    let answer = server.send(request).await.map_err(|error| unreachable(&error))?;
     let status = answer.status();
     let body = answer.bytes().await.map_err(|error| unreachable(&error))?;
     if status.is_success() {

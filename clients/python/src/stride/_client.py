@@ -43,7 +43,8 @@ def connect(url: str | None = None, *, token: str | None = None, timeout: float 
     """Connects to a server.
 
     Args:
-        url: Address of the server; ``STRIDE_SERVER`` by default.
+        url: Address of the server; ``STRIDE_SERVER`` by default. Those of a server and its stand-bys are separated by
+            commas.
         token: Token to show; by default that of ``STRIDE_TOKEN``, or of the file ``STRIDE_TOKEN_FILE``.
         timeout: Seconds after which a call fails.
 
@@ -67,8 +68,8 @@ class Server:
 
     def __init__(self, url: str, token: str | None, timeout: float) -> None:
         headers = {"authorization": f"Bearer {token}"} if token else {}
-        self.url = url.rstrip("/")
-        self._http = httpx.Client(base_url=self.url, headers=headers, timeout=timeout)
+        self._urls = [part.strip().rstrip("/") for part in url.split(",")]
+        self._http = httpx.Client(headers=headers, timeout=timeout)
 
     def __enter__(self) -> Server:
         return self
@@ -80,6 +81,16 @@ class Server:
 
     def __repr__(self) -> str:
         return f"Server({self.url!r})"
+
+    @property
+    def url(self) -> str:
+        """The address that answered last."""
+        return self._urls[0]
+
+    def _leave(self, url: str) -> None:
+        """Turns to the next address, unless another thread has done so."""
+        if url == self._urls[0]:
+            self._urls = [*self._urls[1:], url]
 
     def close(self) -> None:
         """Closes the connection."""
@@ -94,11 +105,21 @@ class Server:
         body: object = None,
         headers: Mapping[str, str] | None = None,
     ) -> httpx.Response:
+        others = len(self._urls) - 1
         for _ in range(TRIES):
+            url = self.url
             try:
-                answer = self._http.request(method, path, params=params, json=body, headers=headers)
+                answer = self._http.request(method, url + path, params=params, json=body, headers=headers)
             except httpx.HTTPError as error:
-                raise StrideError("away", f"cannot reach {self.url}: {error}", "start it with `trainer serve`") from error
+                self._leave(url)
+                # Nothing was sent, so the next address may be asked the same.
+                if isinstance(error, httpx.ConnectError | httpx.ConnectTimeout) and others > 0:
+                    others -= 1
+                    continue
+                urls = ", ".join(self._urls)
+                raise StrideError("away", f"cannot reach {urls}: {error}", "start it with `trainer serve`") from error
+            if answer.status_code == 503:
+                self._leave(url)
             if answer.status_code != 429:
                 break
             time.sleep(min(5.0, float(answer.headers.get("retry-after", "1"))))
