@@ -48,13 +48,9 @@ pub(super) async fn apply(
             Write::RunOwner { run, owner } => owners::own_run(conn, run, owner).await?,
             Write::ModelOwner { model, owner } => owners::claim(conn, model, owner).await?,
             Write::RunState { run, state } => set_run_state(conn, run, state, now).await?,
-            Write::RunEnded { run: of, state, view, archive } => {
-                set_run_state(conn, of, state, now).await?;
-                let set = query("UPDATE runs SET view = ?, archive = ? WHERE run = ?").bind(view).bind(archive);
-                run(conn, set.bind(of.as_str())).await?;
-            }
-            Write::Archive { key, run: of, stage, execution } => {
-                set_archive(conn, *key, of.as_str(), stage.as_str(), execution.as_deref()).await?;
+            Write::RunEnded { run, state, view, archive } => end_run(conn, run, state, view, archive, now).await?,
+            Write::Archive { key, run, stage, execution } => {
+                set_archive(conn, *key, run.as_str(), stage.as_str(), execution.as_deref()).await?;
             }
             Write::History(entries) => history::add(conn, entries, now).await?,
             Write::Metrics { grant, rows } => recording.add(conn, grant, rows).await?,
@@ -96,6 +92,12 @@ async fn add_submission(conn: &mut Conn<'_>, of: &RunId, digest: Digest) -> Resu
 async fn set_run_state(conn: &mut Conn<'_>, of: &RunId, state: &str, now: i64) -> Result<()> {
     let set = query("UPDATE runs SET state = ?, updated_ms = ? WHERE run = ?");
     run(conn, set.bind(state).bind(now).bind(of.as_str())).await.map(drop)
+}
+
+async fn end_run(conn: &mut Conn<'_>, of: &RunId, state: &str, view: &str, archive: &str, now: i64) -> Result<()> {
+    set_run_state(conn, of, state, now).await?;
+    let set = query("UPDATE runs SET view = ?, archive = ? WHERE run = ?").bind(view).bind(archive);
+    run(conn, set.bind(of.as_str())).await.map(drop)
 }
 
 async fn add_checkpoint(conn: &mut Conn<'_>, grant: &Grant, step: u64, manifest: Digest, metrics: &str) -> Result<()> {

@@ -104,29 +104,7 @@ pub fn to_bytes(rig: &Rig, fps: f64, metres_per_unit: f64, name: &str) -> Result
     let mut file = File::default();
     let binds: Vec<f32> = rest.iter().flat_map(|at| inverse_bind(*at)).collect();
     let binds = file.floats(&binds, 16, "MAT4", None);
-    let mut primitives = Vec::new();
-    let mut materials = Vec::new();
-    for (side, word, colour) in COLOURS {
-        let shape = figure(rig, &rest, metres_per_unit, side);
-        if shape.positions.is_empty() {
-            continue;
-        }
-        let weights = vec![[1.0_f32, 0.0, 0.0, 0.0]; shape.joints.len()].concat();
-        primitives.push(json!({
-            "attributes": {
-                "POSITION": file.floats(&shape.positions, 3, "VEC3", Some(ARRAY_BUFFER)),
-                "NORMAL": file.floats(&shape.normals, 3, "VEC3", Some(ARRAY_BUFFER)),
-                "JOINTS_0": file.joints(&shape.joints),
-                "WEIGHTS_0": file.floats(&weights, 4, "VEC4", Some(ARRAY_BUFFER)),
-            },
-            "material": materials.len(),
-        }));
-        let [r, g, b] = colour.map(linear);
-        materials.push(json!({
-            "name": word,
-            "pbrMetallicRoughness": {"baseColorFactor": [r, g, b, 1.0], "metallicFactor": 0.0, "roughnessFactor": 0.8},
-        }));
-    }
+    let (primitives, materials) = mesh(rig, &rest, metres_per_unit, &mut file);
     let (channels, samplers) = animation(rig, &times, metres_per_unit, &mut file);
 
     let mut described: Vec<Value> = rig.nodes.iter().enumerate().map(|(i, _)| node(&rig.nodes, i, &rest)).collect();
@@ -148,6 +126,34 @@ pub fn to_bytes(rig: &Rig, fps: f64, metres_per_unit: f64, name: &str) -> Result
     document["nodes"] = json!(described);
     document["scenes"] = json!([{"nodes": roots}]);
     Ok(file.finish(document))
+}
+
+/// The primitives of the figure, one for each side and colour, and their materials.
+fn mesh(rig: &Rig, rest: &[Vec3], metres_per_unit: f64, file: &mut File) -> (Vec<Value>, Vec<Value>) {
+    let mut primitives = Vec::new();
+    let mut materials = Vec::new();
+    for (side, word, colour) in COLOURS {
+        let shape = figure(rig, rest, metres_per_unit, side);
+        if shape.positions.is_empty() {
+            continue;
+        }
+        let weights = vec![[1.0_f32, 0.0, 0.0, 0.0]; shape.joints.len()].concat();
+        primitives.push(json!({
+            "attributes": {
+                "POSITION": file.floats(&shape.positions, 3, "VEC3", Some(ARRAY_BUFFER)),
+                "NORMAL": file.floats(&shape.normals, 3, "VEC3", Some(ARRAY_BUFFER)),
+                "JOINTS_0": file.joints(&shape.joints),
+                "WEIGHTS_0": file.floats(&weights, 4, "VEC4", Some(ARRAY_BUFFER)),
+            },
+            "material": materials.len(),
+        }));
+        let [r, g, b] = colour.map(linear);
+        materials.push(json!({
+            "name": word,
+            "pbrMetallicRoughness": {"baseColorFactor": [r, g, b, 1.0], "metallicFactor": 0.0, "roughnessFactor": 0.8},
+        }));
+    }
+    (primitives, materials)
 }
 
 /// A node in the rest pose. The root is placed so that the feet are on the floor.

@@ -411,11 +411,7 @@ impl Reader {
                 Some(stages)
             }
             Err(cycle) => {
-                let first = cycle.first().cloned();
-                let path = cycle.iter().map(|name| format!("`{name}`")).collect::<Vec<_>>().join(" -> ");
-                let at = written.iter().find(|w| Some(&w.name) == first.as_ref()).map_or(root.at, |w| w.key_at);
-                let help = "each stage of the cycle reads the next one; change an input of one of them";
-                self.mistake(at, "stages", format!("stages form a cycle: {path}"), Some(help.into()));
+                self.refuse_cycle(root, written, &cycle);
                 None
             }
         };
@@ -425,6 +421,13 @@ impl Reader {
             }
         }
         sorted
+    }
+
+    fn refuse_cycle(&mut self, root: &Node, written: &[Written], cycle: &[StageName]) {
+        let path = cycle.iter().map(|name| format!("`{name}`")).collect::<Vec<_>>().join(" -> ");
+        let at = written.iter().find(|w| Some(&w.name) == cycle.first()).map_or(root.at, |w| w.key_at);
+        let help = "each stage of the cycle reads the next one; change an input of one of them";
+        self.mistake(at, "stages", format!("stages form a cycle: {path}"), Some(help.into()));
     }
 
     /// Reports a problem at the position of its field, or of the field's nearest parent.

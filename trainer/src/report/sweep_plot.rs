@@ -57,18 +57,13 @@ pub(crate) fn svg(sweep: &SweepView) -> String {
     let mut order: Vec<usize> = (0..sweep.trials.len()).collect();
     order.sort_by_key(|trial| (sweep.best == Some(*trial), sweep.trials[*trial].results.len()));
     for trial in order.into_iter().map(|trial| &sweep.trials[trial]) {
+        let (colour, width) = stroke(sweep, trial);
         let points: Vec<(f64, f64)> = sweep
             .rungs
             .iter()
             .zip(&trial.results)
             .filter_map(|(steps, value)| Some((x.at(*steps as f64), y.at((*value)?))))
             .collect();
-        let (colour, width) = match trial.state {
-            _ if sweep.best == Some(trial.trial) => ("#d65430", 2.5),
-            TrialState::Finished | TrialState::Running => ("#246ec8", 1.5),
-            TrialState::Failed => ("#b08bb0", 1.0),
-            TrialState::Waiting | TrialState::Paused | TrialState::Stopped => ("#9aa0a6", 1.0),
-        };
         let path: Vec<String> = points.iter().map(|(x, y)| format!("{x:.1},{y:.1}")).collect();
         let name =
             escape(&format!("trial {}: {}", trial.trial, serde_json::to_string(&trial.values).unwrap_or_default()));
@@ -81,6 +76,16 @@ pub(crate) fn svg(sweep: &SweepView) -> String {
     }
     line(format_args!("</svg>"));
     out
+}
+
+/// Colour and width of a trial's line.
+fn stroke(sweep: &SweepView, trial: &TrialView) -> (&'static str, f64) {
+    match trial.state {
+        _ if sweep.best == Some(trial.trial) => ("#d65430", 2.5),
+        TrialState::Finished | TrialState::Running => ("#246ec8", 1.5),
+        TrialState::Failed => ("#b08bb0", 1.0),
+        TrialState::Waiting | TrialState::Paused | TrialState::Stopped => ("#9aa0a6", 1.0),
+    }
 }
 
 /// Width and height of a panel of [`scatter`].

@@ -9,7 +9,7 @@
 //! Drain requests precede the parts. All members OR them over the same messages, so that all stop after the same step.
 
 use std::ops::Range;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use bytemuck::cast_slice;
 use protocol::message::LossCause;
@@ -167,27 +167,42 @@ fn receive_parts(
         }
         let chunk = tree::share(length, own, size);
         for (n, node) in nodes.into_iter().enumerate() {
-            let mut numbers = Vec::with_capacity(chunk.len());
-            for (p, range) in pieces(&chunk).enumerate() {
-                let (at, frame) = mesh.next_timed(peer, barrier, interrupt)?;
-                came = at;
-                let unexpected = || disagree(peer, format!("sends an unexpected part at node {n}, piece {p}"));
-                let place = (frame.a, frame.b) == (number(n), number(p));
-                if place && p == 0 && frame.kind == Kind::SharedPart {
-                    numbers = vec![0.0; chunk.len()];
-                    let whole = mesh.memory(peer).read(n * chunk.len(), &mut numbers);
-                    whole.then_some(()).ok_or_else(unexpected)?;
-                    break;
-                }
-                let frame = expect(frame, Kind::Part, mesh, peer)?;
-                let part = floats(frame).filter(|part| place && part.len() == range.len()).ok_or_else(unexpected)?;
-                if numbers.is_empty() && range.len() == chunk.len() { numbers = part } else { numbers.extend(part) }
-            }
+            let (at, numbers) = receive_part(mesh, barrier, peer, n, &chunk, interrupt)?;
+            came = at.unwrap_or(came);
             received.sums.push((node, numbers));
         }
         mesh.pace.received(peer, came);
     }
     Ok(received)
+}
+
+/// Receives this member's chunk of node `n` of a peer, with the time of the last frame.
+fn receive_part(
+    mesh: &Mesh,
+    barrier: &str,
+    peer: usize,
+    n: usize,
+    chunk: &Range<usize>,
+    interrupt: Interrupt<'_>,
+) -> Result<(Option<Instant>, Vec<f32>), Halt> {
+    let mut came = None;
+    let mut numbers = Vec::with_capacity(chunk.len());
+    for (p, range) in pieces(chunk).enumerate() {
+        let (at, frame) = mesh.next_timed(peer, barrier, interrupt)?;
+        came = Some(at);
+        let unexpected = || disagree(mesh, barrier, peer, &format!("sends an unexpected part at node {n}, piece {p}"));
+        let place = (frame.a, frame.b) == (number(n), number(p));
+        if place && p == 0 && frame.kind == Kind::SharedPart {
+            numbers = vec![0.0; chunk.len()];
+            let whole = mesh.memory(peer).read(n * chunk.len(), &mut numbers);
+            whole.then_some(()).ok_or_else(unexpected)?;
+            break;
+        }
+        let frame = expect(frame, Kind::Part, mesh, peer)?;
+        let part = floats(frame).filter(|part| place && part.len() == range.len()).ok_or_else(unexpected)?;
+        if numbers.is_empty() && range.len() == chunk.len() { numbers = part } else { numbers.extend(part) }
+    }
+    Ok((came, numbers))
 }
 
 /// Sends this member's chunk of the sum and receives the others': the all-gather.

@@ -97,12 +97,7 @@ pub fn sample(
         }
         let count = |(t, n): (&f32, &usize)| ((cosine(*t) * *n as f32) as usize).max(1);
         let counts: Vec<usize> = times.iter().zip(&counted).map(count).collect();
-        let mut masked = vec![false; ids.len()];
-        for (b, count) in counts.iter().enumerate() {
-            let mut order: Vec<usize> = (0..positions).filter(|p| open(b, *p)).map(|p| b * positions + p).collect();
-            order.sort_by(|x, y| scores[*y].total_cmp(&scores[*x]));
-            order.into_iter().take(*count).for_each(|at| masked[at] = true);
-        }
+        let masked = least_certain(&counts, &scores, open);
         ids.iter_mut().zip(&masked).filter(|(_, masked)| **masked).for_each(|(id, _)| *id = config.mask());
         let seen = ids.clone();
         let logits = logits(network, condition, &ids, Some(&visible), &mut Dropout::off());
@@ -120,6 +115,18 @@ pub fn sample(
         see(&Step { seen: &seen, logits: &logits, drawn: &drawn, counts: &counts, scores: &scores });
     }
     ids
+}
+
+/// Chooses the places to mask: of each clip the open ones with the highest scores, as many as `counts` says.
+fn least_certain(counts: &[usize], scores: &[f32], open: impl Fn(usize, usize) -> bool) -> Vec<bool> {
+    let positions = scores.len() / counts.len().max(1);
+    let mut masked = vec![false; scores.len()];
+    for (b, count) in counts.iter().enumerate() {
+        let mut order: Vec<usize> = (0..positions).filter(|p| open(b, *p)).map(|p| b * positions + p).collect();
+        order.sort_by(|x, y| scores[*y].total_cmp(&scores[*x]));
+        order.into_iter().take(*count).for_each(|at| masked[at] = true);
+    }
+    masked
 }
 
 /// Lays out known tokens, masks, the end and padding.

@@ -165,6 +165,7 @@ pub(super) fn joints(pose: &Pose, skeleton: &Skeleton) -> [f64; 66] {
     let pelvis_turn = quat::mul(quat::mul(turn_y(pose.yaw), turn_x(pose.pitch)), turn_z(pose.roll));
     let hip = |pelvis: Vec3, side: usize| quat::add(pelvis, quat::rotate(pelvis_turn, bone(1 + side)));
 
+    // The pelvis sinks until both legs reach the ground.
     let mut pelvis = pose.pelvis;
     for side in 0..2 {
         let Leg::Foot { toe, yaw, pitch } = pose.legs[side] else { continue };
@@ -202,14 +203,7 @@ pub(super) fn joints(pose: &Pose, skeleton: &Skeleton) -> [f64; 66] {
         place(&mut out, 10 + side, toe);
     }
 
-    // The bend of the spine is spread evenly over its three joints.
-    let third = quat::mul(quat::mul(turn_y(pose.twist / 3.0), turn_x(pose.bend / 3.0)), turn_z(-pose.side / 3.0));
-    let (mut turn, mut at) = (pelvis_turn, pelvis);
-    for j in [3, 6, 9] {
-        turn = quat::mul(turn, third);
-        at = quat::add(at, quat::rotate(turn, bone(j)));
-        place(&mut out, j, at);
-    }
+    let (turn, at) = spine(&mut out, pose, (pelvis_turn, pelvis), bone);
     let neck = quat::add(at, quat::rotate(turn, bone(12)));
     let head = quat::mul(turn, turn_x(pose.nod));
     place(&mut out, 12, neck);
@@ -218,6 +212,19 @@ pub(super) fn joints(pose: &Pose, skeleton: &Skeleton) -> [f64; 66] {
         arm(&mut out, &pose.arms[side], side, (at, turn), lengths, bone);
     }
     out
+}
+
+/// Places the spine from the pelvis up. Its bend is spread evenly over three joints; returns the turn and place of the
+/// last.
+fn spine(out: &mut [f64; 66], pose: &Pose, pelvis: (Quat, Vec3), bone: impl Fn(usize) -> Vec3) -> (Quat, Vec3) {
+    let third = quat::mul(quat::mul(turn_y(pose.twist / 3.0), turn_x(pose.bend / 3.0)), turn_z(-pose.side / 3.0));
+    let (mut turn, mut at) = pelvis;
+    for j in [3, 6, 9] {
+        turn = quat::mul(turn, third);
+        at = quat::add(at, quat::rotate(turn, bone(j)));
+        place(out, j, at);
+    }
+    (turn, at)
 }
 
 fn place(out: &mut [f64; 66], j: usize, at: Vec3) {

@@ -106,9 +106,8 @@ impl Progress {
         let is_at_work = stage.state == StageState::Running && progress.total > 0;
         let changes = self.changes.get(&stage.name).map(Vec::as_slice).unwrap_or_default();
         let passed = changes.iter().filter(|change| (shown.done..progress.done).contains(&change.at));
-        for LossChange { at, what, setting } in passed {
-            let (name, at, total) = (stage.name.as_str(), grouped(*at), grouped(progress.total));
-            lines.push(format!("{name:>14}  from step {at} of {total}: {what} (`{setting}`)"));
+        for change in passed {
+            lines.push(loss_changes(stage, change));
             shown.curve.forget_losses();
         }
         shown.done = progress.done;
@@ -155,6 +154,11 @@ impl Progress {
         }
         lines
     }
+}
+
+fn loss_changes(stage: &StageView, LossChange { at, what, setting }: &LossChange) -> String {
+    let (name, at, total) = (stage.name.as_str(), grouped(*at), grouped(stage.progress.total));
+    format!("{name:>14}  from step {at} of {total}: {what} (`{setting}`)")
 }
 
 fn style() -> ProgressStyle {

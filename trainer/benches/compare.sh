@@ -1,0 +1,15 @@
+#!/usr/bin/env bash
+# Training and sampling beside PyTorch on this machine's CPU: `trainer/benches/compare.sh [--sizes quickstart|published] [--seconds N]`.
+# Needs STRIDE_SHARED (its `bench/pytorch` has the same networks and steps in PyTorch) and python3 with venv; installs PyTorch from PyPI.
+# Writes docs/performance.md for the quickstart's sizes. Takes half an hour on a quiet machine; say so if others compute beside it.
+set -euo pipefail
+cd "$(dirname "$0")/../.."
+target=${CARGO_TARGET_DIR:-target}
+environment=${STRIDE_TORCH_ENV:-$target/torch}
+[ -x "$environment/bin/python" ] || python3 -m venv "$environment"
+"$environment/bin/python" -m pip install --quiet --disable-pip-version-check torch safetensors numpy
+if [ -z "${STRIDE_TRAINER:-}" ]; then
+    cargo build --release --locked -p trainer
+    export STRIDE_TRAINER=$target/release/trainer
+fi
+exec "$environment/bin/python" trainer/benches/compare.py "$@"
