@@ -469,7 +469,8 @@ async fn resume(args: ResumeArgs) -> Result<u8> {
         }
     };
     let view = client.control(&found.run, "resume").await?;
-    remote::show(&view, args.output);
+    let whys = summary::whys(client.settings(&view.run).await?);
+    remote::show(&view, &whys, args.output);
     Ok(0)
 }
 
