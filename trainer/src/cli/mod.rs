@@ -45,6 +45,7 @@ use crate::local::{cost, pipeline_file, plan, run, verify};
 use crate::reader::Reader;
 use crate::report::print::{self, Output};
 use crate::report::problem::{Problem, Result, exit};
+use crate::report::summary;
 
 /// Trains text-to-motion models across workers and stores the results
 #[derive(Debug, Parser)]

@@ -169,7 +169,7 @@ export function run(context, name) {
       ${rest ? html`<pre class="rest" tabindex="0">${plain(rest)}</pre>` : nothing}
       <p>${prose(whatToDo(message) ?? OTHERWISE)} <a href=${CAUSES}>Causes of failed stages</a></p>
       <p class="dim small">${stage.kind}${(last?.attempt ?? stage.attempt) > 0 ? ` · attempt ${last?.attempt ?? stage.attempt}` : ""}${worker ? html` · worker ${worker}` : nothing}${stage.wall_s > 0 ? ` · after ${duration(stage.wall_s)}` : ""}</p>
-      ${around.length > 0 ? html`<div class="lines few" tabindex="0" role="group" aria-label="The last lines of its log">${around.map((line) => logLine(line, false, line === marked))}</div>` : nothing}
+      ${around.length > 0 ? html`<div class="lines few" tabindex="0" role="group" aria-label="The last lines of its log"><div>${around.map((line) => logLine(line, false, line === marked))}</div></div>` : nothing}
       ${controls(run.owner) ? nothing : command(`trainer resume ${run.run}`, context)}
     </section>`;
   }
