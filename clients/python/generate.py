@@ -16,7 +16,7 @@ HERE = Path(__file__).parent
 DOCUMENT = HERE.parents[1] / "docs" / "openapi.json"
 MODELS = HERE / "src" / "stride" / "_models.py"
 
-ROOTS = ["Drawing", "HistoryRow", "LogRow", "Promotion", "RunSummary", "RunView", "Version"]
+ROOTS = ["Drawing", "HistoryRow", "LogRow", "Promotion", "RunSettings", "RunSummary", "RunView", "Version"]
 """The types that the client gives; those that they name come with them."""
 
 PLAIN = {"string": "str", "integer": "int", "number": "float", "boolean": "bool", "null": "None"}

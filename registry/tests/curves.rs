@@ -100,10 +100,18 @@ async fn what_is_no_number_is_marked_and_hides_no_peak() {
     let json = serde_json::to_value(&drawn).unwrap();
     assert_eq!(serde_json::from_value::<Buckets>(json).unwrap(), drawn);
 
+    let points = store.points(&"r".into(), &"s".into(), None, Page::ALL).await.unwrap();
+    assert!(points["loss"].points[5_002].value.is_nan(), "an infinite value is the same in JSON and packed");
+
     store.write(vec![fence("r/s", 2)]).await.unwrap();
     record(&store, "r/s", 2, (0..100).map(|step| row(step, f64::NAN)).collect()).await;
     let drawn = check(&store, Window { buckets: 1, ..WHOLE }).await;
     assert!(drawn.max[0].is_nan() && drawn.last[0].is_nan() && drawn.nan[0] == 100);
+
+    store.write(vec![fence("r/s", 3)]).await.unwrap();
+    record(&store, "r/s", 3, (0..100).map(|step| row(step, f64::MAX)).collect()).await;
+    let drawn = self::drawn(&store, Window { buckets: 1, ..WHOLE }).await;
+    assert!(drawn.max[0] == f64::MAX && drawn.mean[0].is_nan(), "a sum beyond all numbers: {drawn:?}");
 }
 
 #[tokio::test]

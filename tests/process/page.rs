@@ -54,7 +54,7 @@ fn a_run_and_the_next_one_are_seen_on_the_page() {
 
     // Only what depends on the changed setting ran again, and the page names the setting.
     browser.go(&format!("{url}/runs/{second}"));
-    browser.until("[...document.querySelectorAll('.because')].some((e) => e.textContent.includes('lr 5e-4 → 1e-3'))");
+    browser.until("[...document.querySelectorAll('.because')].some((e) => e.textContent.includes('lr 5e-4 -> 1e-3'))");
     browser.until("document.querySelectorAll('.u-wrap canvas').length > 0");
     let beyond = "[...document.querySelectorAll('a.node')].filter((node) => { const box = node.querySelector('.box').getBBox(); \
                   return [...node.querySelectorAll('text')].some((text) => text.getBBox().x + text.getBBox().width > box.x + box.width); \
@@ -99,17 +99,28 @@ fn a_run_and_the_next_one_are_seen_on_the_page() {
     browser.resize(PHONE);
     keep(&mut browser, "draw-phone.png", PHONE);
 
-    // Each checkpoint that is kept draws the same sentence.
+    // Each checkpoint that is kept draws the same sentence without being asked for, once it is near the screen.
     browser.resize(DESK);
     browser.go(&format!("{url}/runs/{first}/mld"));
-    let press = "[...document.querySelectorAll('section[aria-labelledby=kept] button')].find((button) => button.textContent === 'Draw them')";
-    browser.until(press);
-    browser.evaluate(&format!("{press}.click()"));
+    browser.until("document.querySelector('section[aria-labelledby=kept]')");
+    browser.evaluate("document.querySelector('section[aria-labelledby=kept]').scrollIntoView()");
     browser.until("document.querySelectorAll('svg.still').length === 4");
+    let memory =
+        "[...document.querySelectorAll('.fact')].some((fact) => /^Memory[0-9.]+ [MG]B$/.test(fact.textContent.trim()))";
+    assert_eq!(browser.evaluate(memory), json!(true), "the most memory that it had");
     browser.evaluate("document.querySelector('section[aria-labelledby=kept]').scrollIntoView()");
     keep(&mut browser, "checkpoints.png", DESK);
     browser.resize(PHONE);
     keep(&mut browser, "checkpoints-phone.png", PHONE);
+    // Who opens the view again sees the same draw, not a new run.
+    let draws =
+        "fetch('/v1/runs?pipeline=draw&limit=200').then((answer) => answer.json()).then(({ items }) => items.length)";
+    let before_again = browser.evaluate(draws);
+    browser.go(&format!("{url}/runs/{first}/mld"));
+    browser.until("document.querySelector('section[aria-labelledby=kept]')");
+    browser.evaluate("document.querySelector('section[aria-labelledby=kept]').scrollIntoView()");
+    browser.until("document.querySelectorAll('svg.still').length === 4");
+    assert_eq!(browser.evaluate(draws), before_again);
     let complaints = browser.complaints();
     assert_eq!(complaints.len(), before, "{complaints:#?}");
 }

@@ -8,6 +8,7 @@ use std::time::SystemTime;
 use cluster_tests::{Bench, Running, wait_for};
 use nix::sys::signal::Signal;
 use protocol::Digest;
+use serde_json::Value;
 
 const TRAINER: &str = env!("CARGO_BIN_EXE_trainer");
 
@@ -103,6 +104,17 @@ fn reading_a_store_that_nobody_holds_changes_nothing() {
     assert!(fs::metadata(bench.store().join("stride.db-wal")).expect("a log").len() > 0);
     assert_eq!(state(&bench, "@last"), [&*interrupted, "interrupted", "ready"], "nobody works on it");
     assert_eq!(state(&bench, &finished), [&*finished, "finished", "ran"]);
+    let status = bench.run(&["status", &finished]).expect_code(0).stdout;
+    let vae = status.lines().find(|line| line.starts_with("vae ")).expect("a row");
+    assert!(vae.contains("iB  ") && vae.ends_with(" new"), "memory, and why it ran: {status}");
+    let json = bench.run(&["status", &interrupted, "-o", "json"]).expect_code(0).json();
+    let why = json["stages"]
+        .as_array()
+        .expect("stages")
+        .iter()
+        .find(|stage| stage["name"] == "vae")
+        .map(|stage| &stage["why"]);
+    assert_eq!(why, Some(&Value::from("steps 12 -> 20000")), "{json}");
     let logs = bench.run(&["logs"]).expect_code(0).stdout;
     assert!(logs.starts_with("dataset w1 "), "{logs}");
     let values = bench.run(&["metrics", &finished, "--stage", "vae", "--key", "loss", "--csv"]).expect_code(0).stdout;

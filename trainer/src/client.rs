@@ -4,7 +4,7 @@
 use std::path::Path;
 
 use access::{Server, ServerOptions, explain, local};
-use coordinator::shell::{CurveSeries, Curves, StageMetrics};
+use coordinator::shell::{CurveSeries, Curves, RunSettings, StageMetrics};
 use coordinator::{Config, Coordinator, Handle, WorkerView};
 use protocol::message::{ApiError, Listing, RunSummary, RunView, Submit};
 use protocol::{Digest, RunId};
@@ -151,6 +151,11 @@ impl Client {
 
     pub(crate) async fn run(&self, run: &RunId) -> Result<RunView> {
         self.get(&format!("/v1/runs/{run}")).await
+    }
+
+    /// The settings of a run's stages, and why each was computed.
+    pub(crate) async fn settings(&self, run: &RunId) -> Result<RunSettings> {
+        self.get(&format!("/v1/runs/{run}/settings")).await
     }
 
     /// Sends `pause`, `resume` or `cancel`.

@@ -1,7 +1,7 @@
 //! Source of commands that only read: the named server, the coordinator that holds the store, or a store without a
 //! coordinator. They start nothing and leave the store unchanged.
 
-use coordinator::shell::CurveSeries;
+use coordinator::shell::{CurveSeries, RunSettings};
 use coordinator::{Records, WorkerView};
 use protocol::message::{Listing, RunSummary, RunView};
 use protocol::{Digest, RunId, StageName, limits};
@@ -81,6 +81,14 @@ impl Reader {
         match self {
             Self::Server(client) => client.run(run).await,
             Self::Store(records) => Ok(records.run_view(run).await?),
+        }
+    }
+
+    /// The settings of a run's stages, and why each was computed.
+    pub(crate) async fn settings(&self, run: &RunId) -> Result<RunSettings> {
+        match self {
+            Self::Server(client) => client.settings(run).await,
+            Self::Store(records) => Ok(records.settings(run).await?),
         }
     }
 

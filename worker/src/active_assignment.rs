@@ -34,6 +34,8 @@ struct State {
     /// Steps applied to the training state in memory.
     holds: Option<u64>,
     committed: Option<Digest>,
+    /// Highest memory of the process during this assignment, in bytes.
+    peak_memory: Option<u64>,
     /// Connections of the newest generation, until the stage takes them.
     offered: Option<Arc<Mesh>>,
     newest: Option<Arc<Mesh>>,
@@ -94,6 +96,7 @@ impl ActiveAssignment {
             progress: Progress::default(),
             holds: None,
             committed: None,
+            peak_memory: None,
             offered: None,
             newest: None,
         };
@@ -303,12 +306,24 @@ impl ActiveAssignment {
         lock(&self.state).progress = progress;
     }
 
+    /// Notes that the process uses `bytes` of memory.
+    pub(crate) fn saw_memory(&self, bytes: u64) {
+        let mut state = lock(&self.state);
+        state.peak_memory = state.peak_memory.max(Some(bytes));
+    }
+
+    /// The highest memory of the process during this assignment, in bytes.
+    pub(crate) fn peak_memory(&self) -> Option<u64> {
+        lock(&self.state).peak_memory
+    }
+
     /// The report of this assignment for the poll.
     pub(crate) fn doing(&self) -> Doing {
         let state = lock(&self.state);
         let (lost, waits_for) = state.newest.as_ref().map(|mesh| (mesh.lost(), mesh.waits_for())).unwrap_or_default();
-        let holds = state.holds;
-        Doing { holds, waits_for, lost, ..Doing::new(state.assignment.grant.clone(), state.progress.clone()) }
+        let (holds, peak_memory) = (state.holds, state.peak_memory);
+        let doing = Doing::new(state.assignment.grant.clone(), state.progress.clone());
+        Doing { holds, waits_for, lost, peak_memory, ..doing }
     }
 
     /// Records the number of steps applied to the state in memory; `None` if the state is of no use to peers.

@@ -131,7 +131,7 @@ impl HttpContext {
 
     /// Logs the end of the attempt.
     pub(crate) fn log_end(&mut self, outcome: &TaskOutcome) {
-        let line = stage_log::end(outcome, self.begun.elapsed());
+        let line = stage_log::end(outcome, self.begun.elapsed(), self.held.peak_memory());
         self.log(&line);
     }
 
@@ -213,7 +213,7 @@ impl HttpContext {
             adopts = adopted.is_some(),
             bytes = adopted.map(|(bytes, _)| bytes),
             seconds = adopted.map(|(_, seconds)| seconds),
-            peak_mib = process::peak_memory().map(|bytes| bytes >> 20),
+            peak_mib = process::memory().map(|memory| memory.peak >> 20),
             "met the gang"
         );
     }

@@ -64,11 +64,24 @@ pub(crate) fn belong_to_parent() {
     }
 }
 
-/// Resident memory of this process in bytes, without mapped files. `None` if the system does not report it.
-pub(crate) fn memory() -> Option<u64> {
+/// Resident memory of this process, in bytes.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Memory {
+    /// Without mapped files.
+    pub(crate) anonymous: u64,
+    pub(crate) resident: u64,
+    /// The highest `resident` since the process started.
+    pub(crate) peak: u64,
+}
+
+/// Memory of this process. `None` if the system does not report it.
+pub(crate) fn memory() -> Option<Memory> {
     let status = std::fs::read_to_string("/proc/self/status").ok()?;
-    let resident = status.lines().find_map(|line| line.strip_prefix("RssAnon:"))?;
-    Some(resident.trim().strip_suffix(" kB")?.parse::<u64>().ok()? << 10)
+    let field = |name: &str| {
+        let value = status.lines().find_map(|line| line.strip_prefix(name))?;
+        Some(value.trim().strip_suffix(" kB")?.parse::<u64>().ok()? << 10)
+    };
+    Some(Memory { anonymous: field("RssAnon:")?, resident: field("VmRSS:")?, peak: field("VmHWM:")? })
 }
 
 /// Memory of this machine or of this process's container in bytes. `None` if the system does not report it.
@@ -78,13 +91,6 @@ pub(crate) fn machine_memory() -> Option<u64> {
     let machine = machine.trim().strip_suffix(" kB")?.parse::<u64>().ok()? << 10;
     let container = std::fs::read_to_string("/sys/fs/cgroup/memory.max").ok().and_then(|text| text.trim().parse().ok());
     Some(container.map_or(machine, |container: u64| container.min(machine)))
-}
-
-/// Peak resident memory of this process in bytes. `None` if the system does not report it.
-pub(crate) fn peak_memory() -> Option<u64> {
-    let status = std::fs::read_to_string("/proc/self/status").ok()?;
-    let peak = status.lines().find_map(|line| line.strip_prefix("VmHWM:"))?;
-    Some(peak.trim().strip_suffix(" kB")?.parse::<u64>().ok()? << 10)
 }
 
 /// The name of this machine; empty if the system does not report it.

@@ -1,6 +1,6 @@
 //! Limits of a stage: memory and time.
 //!
-//! A thread checks both while a stage computes. Exceeding a limit is reported as a final failure. The coordinator then
+//! A thread checks both while a stage computes, and notes the highest memory. Exceeding a limit is reported as a final failure. The coordinator then
 //! ends the grant, and the stage stops at its next check. If it does not stop, the process exits, which frees its
 //! memory.
 
@@ -14,7 +14,7 @@ use protocol::proof::Vouched;
 
 use crate::active_assignment::ActiveAssignment;
 use crate::client::Client;
-use crate::process;
+use crate::process::{self, Memory};
 
 /// Interval between two checks.
 const PERIOD: Duration = Duration::from_millis(100);
@@ -72,22 +72,35 @@ impl StageLimits {
 pub(crate) fn within<T>(limits: &StageLimits, held: &ActiveAssignment, client: &Client, work: impl FnOnce() -> T) -> T {
     thread::scope(|scope| {
         let (working, ended) = mpsc::channel::<()>();
-        scope.spawn(move || watch(limits, held, client, &ended));
+        let peak_before = process::memory().map_or(u64::MAX, |memory| memory.peak);
+        measured(held, peak_before);
+        scope.spawn(move || watch(limits, held, client, peak_before, &ended));
         let done = work();
+        measured(held, peak_before);
         drop(working);
         done
     })
 }
 
+/// Reads the memory of the process, and notes it for the assignment. The system's own peak is exact, but is of the
+/// whole life of the process. It is therefore noted only if it has risen since the assignment began.
+fn measured(held: &ActiveAssignment, peak_before: u64) -> Option<Memory> {
+    let memory = process::memory()?;
+    held.saw_memory(if memory.peak > peak_before { memory.peak } else { memory.resident });
+    Some(memory)
+}
+
 /// Watches a stage until it has ended.
-fn watch(limits: &StageLimits, held: &ActiveAssignment, client: &Client, ended: &mpsc::Receiver<()>) {
+fn watch(limits: &StageLimits, held: &ActiveAssignment, client: &Client, peak_before: u64, ended: &mpsc::Receiver<()>) {
     let begun = Instant::now();
     let is_running = |period| ended.recv_timeout(period) == Err(RecvTimeoutError::Timeout);
     let (class, message) = loop {
         if !is_running(PERIOD) {
             return;
         }
-        if let Some(exceeded) = limits.exceeded(held, begun.elapsed(), process::memory()) {
+        if let Some(exceeded) =
+            limits.exceeded(held, begun.elapsed(), measured(held, peak_before).map(|memory| memory.anonymous))
+        {
             break exceeded;
         }
     };
@@ -95,7 +108,8 @@ fn watch(limits: &StageLimits, held: &ActiveAssignment, client: &Client, ended: 
     for _ in 0..TRIES {
         let outcome = TaskOutcome::Failed { class, message: message.clone() };
         let credential = held.credential();
-        let what = ReportOutcome { grant: credential.grant.clone(), outcome };
+        let peak_memory = held.peak_memory();
+        let what = ReportOutcome { peak_memory, ..ReportOutcome::new(credential.grant.clone(), outcome) };
         let report = Vouched { what, receipts: BTreeMap::new() };
         let reported = client.wait(client.tell("/v1/outcomes", &credential, &report));
         match reported {

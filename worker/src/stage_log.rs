@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
 use protocol::message::{Assignment, Progress, Role, TaskOutcome};
-use protocol::units::grouped;
+use protocol::units::{grouped, size};
 use protocol::{Digest, Manifest};
 
 /// Time between two lines on the progress of a stage.
@@ -59,13 +59,14 @@ pub(crate) fn regrouped(generation: impl std::fmt::Display, members: usize, step
     format!("regrouped{from}: generation {generation} of {}", counted(members as u64, "member"))
 }
 
-/// The last line of an attempt.
-pub(crate) fn end(outcome: &TaskOutcome, took: Duration) -> String {
+/// The last line of an attempt. `peak` is the highest memory of the process, in bytes.
+pub(crate) fn end(outcome: &TaskOutcome, took: Duration, peak: Option<u64>) -> String {
     let seconds = took.as_secs_f64();
     match outcome {
         TaskOutcome::Finished { output, metrics } => {
             let values = values(metrics);
-            format!("finished in {seconds:.1} s: {}{values}", output.short())
+            let memory = peak.map(|bytes| format!(" with at most {} of memory", size(bytes))).unwrap_or_default();
+            format!("finished in {seconds:.1} s{memory}: {}{values}", output.short())
         }
         TaskOutcome::Resolved { digests } => {
             format!("digested {} in {seconds:.1} s", counted(digests.len() as u64, "input"))

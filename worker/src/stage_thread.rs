@@ -139,8 +139,10 @@ fn report(
     outcome: &TaskOutcome,
     receipts: &BTreeMap<Digest, String>,
 ) -> Result<(), GaveUp> {
+    // A repeated report is recognised by being equal.
+    let peak_memory = held.peak_memory();
     retry::until_ended(held, "reporting the outcome", |credential| {
-        let report = ReportOutcome { grant: credential.grant.clone(), outcome: outcome.clone() };
+        let report = ReportOutcome { peak_memory, ..ReportOutcome::new(credential.grant.clone(), outcome.clone()) };
         let vouched = Vouched { what: report, receipts: receipts.clone() };
         bench.client.wait(bench.client.tell("/v1/outcomes", credential, &vouched))
     })

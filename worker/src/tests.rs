@@ -184,7 +184,7 @@ fn assignment(member: &Member, attempt: u64, fence: u64) -> Assignment {
 fn a_stage_beyond_its_memory_fails_for_good_and_stops() {
     let more = 64 << 20;
     let limits = StageLimits {
-        memory: process::memory().map(|bytes| bytes + more),
+        memory: process::memory().map(|memory| memory.anonymous + more),
         grace: Duration::from_secs(60),
         ..StageLimits::default()
     };
@@ -263,6 +263,8 @@ fn p9_everything_arrives_once_though_answers_are_lost() {
     assert_eq!(logs[1..21], (1..=10).flat_map(saved).collect::<Vec<_>>());
     assert!(logs[0].starts_with("attempt 1: ") && logs[0].contains("generation 1 of 1 member, seed "), "{logs:#?}");
     assert!(logs[21].starts_with("finished in ") && logs[21].ends_with(", loss 0.500000"), "{logs:#?}");
+    let memory = coordinator.outcomes[0].peak_memory.unwrap();
+    assert!(memory > 1 << 20 && logs[21].contains("iB of memory: "), "{memory} {logs:#?}");
     assert_eq!(logs.len(), 22);
     assert!(matches!(coordinator.outcomes[..], [ReportOutcome { outcome: TaskOutcome::Finished { .. }, .. }]));
     assert_eq!(coordinator.joins, 1);

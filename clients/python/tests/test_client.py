@@ -69,6 +69,14 @@ def test_logs_are_read(finished: stride.Run) -> None:
     assert any(line.text for line in finished.logs(stage="dataset"))
 
 
+def test_stages_say_why_they_ran_and_what_memory_they_took(finished: stride.Run) -> None:
+    assert finished.why() == {"dataset": "new", "vae": "new"}
+    settings = finished.settings()
+    assert settings.previous is None and settings.stages[1].settings["steps"] == 6
+    memory = finished.view().stages[1].peak_memory
+    assert memory is not None and memory > 1 << 20
+
+
 def test_errors_have_code_and_hint(server: stride.Server) -> None:
     with pytest.raises(stride.StrideError) as error:
         server.run("none").view()
@@ -94,9 +102,10 @@ def test_errors_have_code_and_hint(server: stride.Server) -> None:
     assert not server.models()
 
 
-def test_a_run_is_cancelled(server: stride.Server, pipeline: Path) -> None:
+def test_a_run_is_cancelled(server: stride.Server, finished: stride.Run, pipeline: Path) -> None:
     run = server.submit(pipeline, until="dataset", key="another")
     run.wait()
+    assert run.why()["dataset"] == f"cached from {finished.name}"
     with pytest.raises(stride.StrideError) as error:
         run.resume()
     assert error.value.code == "conflict"

@@ -7,6 +7,7 @@ use checkpoint::model::{Model, Parts};
 use comfy_table::{ContentArrangement, Table, presets};
 use protocol::artifact::Role;
 use protocol::message::ApiError;
+use protocol::units::size;
 use protocol::{Digest, Manifest, RunId, printable};
 use serde_json::json;
 
@@ -317,16 +318,4 @@ fn beside(bases: &[String]) -> Option<(&'static str, String)> {
 fn source(version: &Version) -> String {
     let part = |name: &str| version.source[name].as_str().map(str::to_owned);
     list(part("run").into_iter().chain(part("stage")).chain(crate::bundle::origin(&version.source)))
-}
-
-#[expect(clippy::cast_precision_loss, reason = "for people")]
-fn size(bytes: u64) -> String {
-    let mut value = bytes as f64;
-    for unit in ["B", "KiB", "MiB", "GiB"] {
-        if value < 1024.0 {
-            return if unit == "B" { format!("{bytes} B") } else { format!("{value:.1} {unit}") };
-        }
-        value /= 1024.0;
-    }
-    format!("{value:.1} TiB")
 }

@@ -85,7 +85,7 @@ pub(super) async fn points(
                 "SELECT step, value FROM metrics WHERE series = ? AND step > ? AND step <= ? ORDER BY step LIMIT ?";
             let find = query(find).bind(segment.series).bind(after.max(segment.low - 1)).bind(segment.high);
             for row in find.bind(limit).fetch_all(&mut *conn).await? {
-                let value = row.try_get::<Option<f64>, _>(1)?.unwrap_or(f64::NAN);
+                let value = finite(row.try_get::<Option<f64>, _>(1)?.unwrap_or(f64::NAN));
                 points.push(Point { step: row.try_get::<i64, _>(0)?.unsigned_abs(), value });
             }
         }
@@ -263,6 +263,11 @@ async fn whole(
     Ok(Some((begin, last)))
 }
 
+/// The value, or NaN in the place of an infinite one: JSON has neither, and all forms of a curve say the same.
+fn finite(value: f64) -> f64 {
+    if value.is_finite() { value } else { f64::NAN }
+}
+
 async fn columns(
     conn: &mut Conn<'_>,
     segments: &[Segment],
@@ -285,14 +290,13 @@ async fn columns(
             places.sort_by(|(a, _), (b, _)| a.total_cmp(b));
         }
     }
-    let finite = |value: f64| if value.is_finite() { value } else { f64::NAN };
     let mut columns = Buckets::default();
     for (x, bucket) in places {
         columns.x.push(x);
         columns.min.push(finite(bucket.low));
         columns.max.push(finite(bucket.high));
-        columns.mean.push(bucket.mean());
-        columns.last.push(bucket.last.unwrap_or(f64::NAN));
+        columns.mean.push(finite(bucket.mean()));
+        columns.last.push(finite(bucket.last.unwrap_or(f64::NAN)));
         columns.count.push(bucket.count);
         columns.nan.push(bucket.odd);
     }

@@ -78,10 +78,15 @@ fn heard(state: &mut State, now: Millis, worker: WorkerId, poll: Poll) -> Result
         let Ok((execution, task)) = state.task(&said.grant.task) else { continue };
         let Ok(rank) = task.check(&said.grant) else { continue };
         let is_gang = task.part == Part::Gang;
+        let known_peak = state.heard.memory.get(&said.grant.task).copied();
+        let new_peak = said.peak_memory.filter(|peak| known_peak.is_none_or(|known| *peak > known));
         // Progress of shards is only counted, not shown one by one.
         if rank == 0 && execution.tasks.len() == 1 {
             let progress = Arc::new(std::mem::take(&mut said.progress));
             state.heard.progress.insert_mut(said.grant.task.clone(), progress);
+        }
+        if let Some(peak) = new_peak {
+            state.heard.memory.insert_mut(said.grant.task.clone(), peak);
         }
         if is_gang {
             let word = Word::after(state.heard.words.get(&worker), &said, now);

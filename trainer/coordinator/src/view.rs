@@ -175,6 +175,7 @@ impl State {
             metrics: Default::default(),
             progress: Progress::default(),
             wall_s: execution.map_or(0.0, |execution| execution.wall_s(now)),
+            peak_memory: execution.and_then(|execution| self.peak_memory(execution)),
             attempt: execution.map(StageExecution::attempt).unwrap_or_default(),
             workers: Vec::new(),
             instruction_set: execution.and_then(|execution| execution.instruction_set.clone()),
@@ -210,11 +211,11 @@ impl State {
                     }
                 }
             }
-            Status::Done { how, known, wall_s, attempt, .. } => {
+            Status::Done { how, known, wall_s, attempt, peak_memory, .. } => {
                 view.state = *how;
                 view.outputs = known.outputs.clone();
                 view.metrics = known.metrics.clone();
-                (view.wall_s, view.attempt) = (*wall_s, *attempt);
+                (view.wall_s, view.attempt, view.peak_memory) = (*wall_s, *attempt, *peak_memory);
                 view.progress = whole(stage, execution.map(|execution| self.progress(execution)).unwrap_or_default());
             }
             Status::Failed { message, .. } => {
@@ -267,6 +268,16 @@ impl State {
             && run.state == RunState::Running
             && !execution.is_busy()
             && !self.draining
+    }
+
+    /// The highest memory that a worker's process reported for an execution, in bytes.
+    pub fn peak_memory(&self, execution: &StageExecution) -> Option<u64> {
+        let mut peak = None;
+        for task in &execution.tasks {
+            let reported = task.reported.as_ref().and_then(|report| report.peak_memory);
+            peak = peak.max(reported).max(self.heard.memory.get(&task.id).copied());
+        }
+        peak
     }
 
     /// The progress of an execution. A single task has its newest report, or else its newest checkpoint. Several tasks

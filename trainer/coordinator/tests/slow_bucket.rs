@@ -176,7 +176,7 @@ impl Worker {
 
     async fn report(&self, assignment: &Assignment, output: Output) -> TestResult<reqwest::Response> {
         let outcome = TaskOutcome::Finished { output: output.digest, metrics: BTreeMap::new() };
-        let report = ReportOutcome { grant: assignment.grant.clone(), outcome };
+        let report = ReportOutcome::new(assignment.grant.clone(), outcome);
         let vouched = Vouched { what: report, receipts: output.receipts };
         let request = self.server.request(Method::POST, "/v1/outcomes").header(SECRET_HEADER, &assignment.secret);
         Ok(request.json(&vouched).send().await?)

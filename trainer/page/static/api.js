@@ -49,9 +49,9 @@ export async function get(path, signal) {
   return (await send("GET", path, { signal })).json();
 }
 
-/** @param {string} path @param {unknown} [body] @returns {Promise<any>} */
-export async function post(path, body) {
-  return (await send("POST", path, { body })).json();
+/** @param {string} path @param {unknown} [body] @param {Record<string, string>} [headers] @returns {Promise<any>} */
+export async function post(path, body, headers) {
+  return (await send("POST", path, { body, headers })).json();
 }
 
 /** A command of the registry; its own refusals are thrown like those of calls. @param {Record<string, unknown>} command @param {AbortSignal} [signal] @returns {Promise<any>} */

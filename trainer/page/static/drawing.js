@@ -11,9 +11,9 @@ const ASK_MS = 350;
 /** @param {string} digest @returns {Promise<any>} */
 const json = async (digest) => JSON.parse(new TextDecoder().decode(await blob(digest)));
 
-/** Draws, and calls `follow` with the run as it goes until that returns false. Reports are in the order of the models; a run that did not finish has none. @param {Record<string, unknown>} asked @param {(run: Run) => boolean} follow @returns {Promise<Report[]>} */
-export async function drawing(asked, follow) {
-  const { run, stages } = /** @type {{run: string, stages: string[]}} */ (await post("/v1/draws", asked));
+/** Draws, and calls `follow` with the run as it goes until that returns false. Reports are in the order of the models; a run that did not finish has none. Draws with the same key are one run. @param {Record<string, unknown>} asked @param {(run: Run) => boolean} follow @param {string} [key] @returns {Promise<Report[]>} */
+export async function drawing(asked, follow, key) {
+  const { run, stages } = /** @type {{run: string, stages: string[]}} */ (await post("/v1/draws", asked, key ? { "idempotency-key": key } : {}));
   for (;;) {
     const now = /** @type {Run} */ (await get(runPath(run)));
     if (!follow(now)) return [];

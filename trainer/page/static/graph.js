@@ -1,9 +1,8 @@
 //! The stages of a run as a graph: what is read stands left of what reads it.
 
-import { duration } from "./format.js";
+import { duration, plain } from "./format.js";
 import { isDone, pace, share, sign, tone } from "./parts.js";
 import { address } from "./router.js";
-import { inWords } from "./settings.js";
 import { svg, html } from "./vendor/lit-html.js";
 
 const [WIDTH, HEIGHT, GAP_X, GAP_Y, EDGE] = [152, 58, 34, 14, 4];
@@ -58,8 +57,8 @@ export function edgesOf(stages) {
 /** @param {string} text @param {number} most */
 const cut = (text, most) => (text.length > most ? `${text.slice(0, most - 1)}…` : text);
 
-/** @param {Run} run @param {Stage[]} stages @param {Map<string, import("./settings.js").Why>} why */
-export function graph(run, stages, why) {
+/** @param {Run} run @param {Stage[]} stages @param {Map<string, SettingsOfStage>} settings */
+export function graph(run, stages, settings) {
   const all = columns(stages);
   const tallest = Math.max(1, ...all.map((column) => column.length));
   const [width, height] = [all.length * (WIDTH + GAP_X) - GAP_X + 2 * EDGE, tallest * (HEIGHT + GAP_Y) - GAP_Y + 2 * EDGE];
@@ -81,8 +80,9 @@ export function graph(run, stages, why) {
   );
   const node = (/** @type {Stage} */ stage) => {
     const [x, y] = places.get(stage.name) ?? [0, 0];
-    const reason = inWords(why.get(stage.name), stage);
-    const below = stage.state === "cached" && reason ? reason : stage.state === "running" && stage.progress.total > 0 ? pace(stage, undefined) : isDone(stage) && stage.wall_s > 0 ? `${stage.state} · ${duration(stage.wall_s)}` : stage.state;
+    const { from, why } = settings.get(stage.name) ?? {};
+    const reason = plain(why?.text ?? "");
+    const below = stage.state === "cached" && from ? `from ${from}` : stage.state === "running" && stage.progress.total > 0 ? pace(stage, undefined) : isDone(stage) && stage.wall_s > 0 ? `${stage.state} · ${duration(stage.wall_s)}` : stage.state;
     return svg`<a href=${address("runs", run.run, stage.name)} class=${`node ${tone(stage.state)}`}>
       <rect class="box" x=${x} y=${y} width=${WIDTH} height=${HEIGHT} rx="8"></rect>
       <rect class="edge-mark" x=${x} y=${y + 8} width="3" height=${HEIGHT - 16}></rect>

@@ -12,6 +12,10 @@ import { decode } from "./viewer.js";
 const [SENTENCE, SEED] = ["a person walks in a circle", 1];
 /** Checkpoints of one draw. */
 const MOST = 4;
+/** Checkpoints that are drawn without being asked for: the newest. */
+const UNASKED = 6;
+/** Milliseconds between two looks for an idle worker, and pixels below the screen at which the thumbnails are wanted. */
+const [LOOK_MS, NEAR] = [3000, 400];
 /** Poses of a thumbnail, and metres between them and above them. */
 const [POSES, WIDE, HIGH] = [4, 1.2, 2];
 /** Direction of the view: the figure is seen from its left front. */
@@ -56,6 +60,7 @@ export class Thumbnails {
     this.busy = false;
     this.wrong = "";
     this.closed = false;
+    this.looked = 0;
   }
 
   /** @param {AbortSignal} signal */
@@ -64,18 +69,31 @@ export class Thumbnails {
     this.kept = all.filter((kept) => kept.stage === this.stage && kept.draws);
   }
 
-  /** Draws with all checkpoints that have no thumbnail yet. */
-  async drawAll() {
+  /** Draws with the newest checkpoints once their thumbnails are near the screen and a worker is idle. */
+  async appear() {
+    const now = Date.now();
+    if (this.busy || this.wrong || this.closed || !may("submit") || now - this.looked < LOOK_MS || this.undrawn(UNASKED).length === 0) return;
+    const top = document.querySelector("section[aria-labelledby=kept]")?.getBoundingClientRect().top ?? Infinity;
+    if (top > innerHeight + NEAR) return;
+    this.looked = now;
+    const workers = /** @type {WorkerRow[]} */ (await get("/v1/workers"));
+    if (!this.busy && workers.some((worker) => worker.state === "idle")) await this.drawAll(UNASKED);
+  }
+
+  /** Draws with the newest `most` checkpoints, as far as they have no thumbnail yet. Everyone who opens the view asks for the same draws, which are one run. @param {number} [most] */
+  async drawAll(most) {
+    const retries = this.wrong !== "";
     [this.busy, this.wrong] = [true, ""];
     this.draw();
     try {
-      for (let left = this.undrawn(); left.length > 0 && !this.closed; left = this.undrawn()) {
+      for (let left = this.undrawn(most); left.length > 0 && !this.closed; left = this.undrawn(most)) {
         const some = left.slice(0, MOST);
         const checkpoints = some.map(({ step }) => ({ run: this.run, stage: this.stage, step }));
+        const key = `thumbnails ${some.map(({ digest }) => digest.slice(-12)).join(" ")}`;
         const reports = await drawing({ checkpoints, sentences: [SENTENCE], seed: SEED }, (run) => {
           if (run.state === "failed") this.wrong = firstLine(failed(run)?.message) || "It could not be drawn.";
           return !this.closed;
-        });
+        }, retries ? undefined : key);
         if (reports.length === 0) {
           this.wrong ||= "The draw was ended.";
           break;
@@ -94,8 +112,9 @@ export class Thumbnails {
     this.draw();
   }
 
-  undrawn() {
-    return this.kept.filter(({ digest }) => !this.drawn.has(digest));
+  /** @param {number} [most] */
+  undrawn(most) {
+    return this.kept.slice(most ? -most : 0).filter(({ digest }) => !this.drawn.has(digest));
   }
 
   close() {

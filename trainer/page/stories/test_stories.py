@@ -247,7 +247,7 @@ def test_a_run_is_watched_from_its_submission_to_a_promotion(live: World, hand: 
 
 
 def test_a_run_fails_while_it_is_watched(live: World, hand: Hand) -> None:
-    run = live.submit(f"fails-{hand.way}", pipeline("fails", lr=f"{1001 + WAYS.index(hand.way)}", steps=500))
+    run = live.submit(f"fails-{hand.way}", pipeline("fails", lr=f"{999 - WAYS.index(hand.way)}", steps=500))
     hand.open(f"/runs/{run.name}")
     expect(hand.page.locator(".cause .why")).to_contain_text("diverged")
     assert hand.in_sight(hand.page.locator(".cause").get_by_role("button", name="Resume"))
@@ -279,12 +279,17 @@ def test_a_server_that_restarts_is_waited_for(live: World, hand: Hand) -> None:
     hand.within(presses=0)
 
 
-HOSTILE = "<img src=x onerror=\"window.hostile=1\"></script><script>window.hostile=1</script>\u202e\u001b[31m'&amp;"
+HOSTILE = "<img src=x onerror=\"window.hostile=1\"></script><script>window.hostile=1</script>\u202e'&amp;"
+ESCAPE = "\u001b[31m"
 
 
 def test_hostile_words_stay_words(hand: Hand) -> None:
     hand.open("/draw")
     sentence = hand.page.locator("#sentence")
+    # An escape of terminals is refused, and the refusal is words, too.
+    sentence.fill(HOSTILE + ESCAPE)
+    hand.press(hand.page.get_by_role("button", name="Draw", exact=True))
+    expect(hand.page.locator("main .wrong").first).to_contain_text("control character")
     sentence.fill(HOSTILE)
     hand.press(hand.page.get_by_role("button", name="Draw", exact=True))
     hand.page.wait_for_selector("canvas.figure")

@@ -5,13 +5,15 @@ interface Progress { done: number; total: number; unit: string; metrics: Record<
 interface Stage {
   name: string; kind: string; state: string; key: string | null;
   outputs: Record<string, string>; metrics: Record<string, number>; progress: Progress;
-  wall_s: number; attempt: number; workers: string[]; instruction_set?: string; message: string | null;
+  wall_s: number; peak_memory?: number; attempt: number; workers: string[]; instruction_set?: string; message: string | null;
   wants_workers?: number; of?: string; needs?: string[]; times?: Times;
 }
 interface Times { created_ms?: number; started_ms?: number; ended_ms?: number }
-interface SettingsOfStage { stage: string; settings: Record<string, unknown>; code: number; key?: string; from?: string }
-interface RunSettings { run: string; previous: string | null; seed: number; source: string; stages: SettingsOfStage[] }
 interface Change { path: string; from: unknown; to: unknown }
+/** Why a stage was computed, in the server's words. */
+interface Why { kind: string; changes?: Change[]; inputs?: string[]; text: string }
+interface SettingsOfStage { stage: string; settings: Record<string, unknown>; code: number; key?: string; from?: string; why?: Why }
+interface RunSettings { run: string; previous: string | null; missing?: string[]; seed: number; source: string; stages: SettingsOfStage[] }
 interface HistoryRow {
   id: number; at_ms: number; kind: string; run?: string; stage?: string; task?: string; attempt?: number; step?: number;
   worker?: string; model?: string; actor?: string; why?: string;

@@ -80,12 +80,15 @@ pub struct Doing {
     pub waits_for: Option<WorkerId>,
     /// Gang members that this one cannot go on with in this generation. The coordinator decides who of them leaves the gang.
     pub lost: Vec<LostPeer>,
+    /// Peak resident memory of the worker's process during this assignment, in bytes.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub peak_memory: Option<u64>,
 }
 
 impl Doing {
     /// Work on `grant` that has come so far, with no state in memory and nothing to complain of.
     pub fn new(grant: Grant, progress: Progress) -> Self {
-        Self { grant, progress, holds: None, waits_for: None, lost: Vec::new() }
+        Self { grant, progress, holds: None, waits_for: None, lost: Vec::new(), peak_memory: None }
     }
 }
 
@@ -297,6 +300,16 @@ pub struct ReportOutcome {
     /// Grant of the write.
     pub grant: Grant,
     pub outcome: TaskOutcome,
+    /// Peak resident memory of the worker's process during the assignment, in bytes.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub peak_memory: Option<u64>,
+}
+
+impl ReportOutcome {
+    /// An outcome of `grant`, with no measured memory.
+    pub fn new(grant: Grant, outcome: TaskOutcome) -> Self {
+        Self { grant, outcome, peak_memory: None }
+    }
 }
 
 /// End of an assignment.
@@ -590,6 +603,9 @@ pub struct StageView {
     pub progress: Progress,
     /// Seconds of work so far, over all attempts of this run; not part of any key.
     pub wall_s: f64,
+    /// Peak resident memory of one of its workers' processes during its newest attempt, in bytes; not part of any key.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub peak_memory: Option<u64>,
     /// Number of the current attempt.
     pub attempt: Attempt,
     /// Workers with an assignment of it now.

@@ -21,6 +21,19 @@ pub fn grouped(count: u64) -> String {
     text
 }
 
+/// A number of bytes for people: `412.0 MiB`.
+#[expect(clippy::cast_precision_loss, reason = "for people")]
+pub fn size(bytes: u64) -> String {
+    let mut value = bytes as f64;
+    for unit in ["B", "KiB", "MiB", "GiB"] {
+        if value < 1024.0 {
+            return if unit == "B" { format!("{bytes} B") } else { format!("{value:.1} {unit}") };
+        }
+        value /= 1024.0;
+    }
+    format!("{value:.1} TiB")
+}
+
 /// A number of optimizer updates. Written `300000`, `300k`, `1.2M` or `2000 steps`.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize)]
 #[serde(transparent)]

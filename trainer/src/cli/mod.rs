@@ -45,6 +45,7 @@ use crate::local::{cost, pipeline_file, plan, run, verify};
 use crate::reader::Reader;
 use crate::report::print::{self, Output};
 use crate::report::problem::{Problem, Result, exit};
+use crate::report::summary;
 
 /// Trains text-to-motion models across workers and stores the results
 #[derive(Debug, Parser)]
@@ -469,7 +470,8 @@ async fn resume(args: ResumeArgs) -> Result<u8> {
         }
     };
     let view = client.control(&found.run, "resume").await?;
-    remote::show(&view, args.output);
+    let whys = summary::whys(client.settings(&view.run).await?);
+    remote::show(&view, &whys, args.output);
     Ok(0)
 }
 

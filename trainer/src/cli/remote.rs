@@ -16,7 +16,7 @@ use crate::reader::Reader;
 use crate::report::print::{self, Output};
 use crate::report::problem::{Problem, Result, exit};
 use crate::report::progress::Progress;
-use crate::report::summary::{self, Summary};
+use crate::report::summary::{self, Summary, Whys};
 
 #[derive(Debug, Args)]
 pub(crate) struct SubmitArgs {
@@ -100,12 +100,12 @@ pub(crate) struct WorkersArgs {
 }
 
 /// Prints a run as a table or an object.
-pub(crate) fn show(view: &RunView, output: Output) {
+pub(crate) fn show(view: &RunView, whys: &Whys, output: Output) {
     match output {
-        Output::Json => print::json(&Summary::of(view, false)),
+        Output::Json => print::json(&Summary::of(view, whys, false)),
         Output::Table => {
             print::out(&format!("run {}: {}\n", view.run, summary::run_state(view)));
-            print::out(&format!("{}{}", summary::table(view), summary::evaluations(view)));
+            print::out(&format!("{}{}", summary::table(view, whys), summary::evaluations(view)));
         }
     }
 }
@@ -143,7 +143,7 @@ pub(crate) async fn submit(args: SubmitArgs) -> Result<u8> {
         tokio::time::sleep(Duration::from_millis(500)).await;
     };
     progress.finish();
-    show(&view, args.output);
+    show(&view, &summary::whys(client.settings(&run).await?), args.output);
     Ok(exit_code(view.state))
 }
 
@@ -181,7 +181,7 @@ pub(crate) async fn status(args: StatusArgs) -> Result<u8> {
             check_parent(path)?;
             spectrum::draw(&reader, &view, args.stage.as_deref(), path).await?;
         }
-        show(&view, args.output);
+        show(&view, &summary::whys(reader.settings(&view.run).await?), args.output);
     }
     reader.close().await;
     Ok(0)
@@ -224,7 +224,7 @@ pub(crate) async fn control(args: ControlArgs, action: &str) -> Result<u8> {
     reader.close().await;
     let client = Client::connect(&args.target).await?;
     let view = client.control(&run, action).await?;
-    show(&view, args.output);
+    show(&view, &summary::whys(client.settings(&run).await?), args.output);
     client.close().await;
     Ok(0)
 }

@@ -20,7 +20,7 @@ use crate::local::{pictures, pipeline_file};
 use crate::report::print::{self, Output};
 use crate::report::problem::{Problem, Result, exit};
 use crate::report::progress::Progress;
-use crate::report::summary::{self, Summary};
+use crate::report::summary::{self, Summary, Whys};
 
 /// Interval at which workers and progress are checked.
 const BEAT: Duration = Duration::from_millis(200);
@@ -114,13 +114,15 @@ pub(crate) async fn run(request: Request, options: Options) -> Result<u8> {
     let watched = watch(&handle, &run, &pipeline, &options, &mut progress, &mut fleet, &mut stop).await;
     progress.finish();
     let view = handle.run_view(&run).await;
+    // A store in trouble may not tell; the report of the run does without.
+    let whys = handle.settings(&run).await.map(summary::whys).unwrap_or_default();
     if let Some(fleet) = &mut fleet {
         fleet.kill().await;
     }
     handle.shutdown().await;
     let end = watched?;
     let view = view.map_err(|error| Problem::new(exit::FAULT, error))?;
-    let exit = report(&view, &pipeline, &end, &options);
+    let exit = report(&view, &whys, &pipeline, &end, &options);
     if view.state == RunState::Finished {
         match pictures::save(&store, &view).await {
             Ok(copies) if options.output == Output::Table => copies.iter().for_each(|(stage, path)| {
@@ -258,11 +260,11 @@ async fn drain(
     }
 }
 
-fn report(view: &RunView, pipeline: &Pipeline, end: &End, options: &Options) -> u8 {
+fn report(view: &RunView, whys: &Whys, pipeline: &Pipeline, end: &End, options: &Options) -> u8 {
     let interrupted = matches!(end, End::Interrupted { .. });
     match options.output {
-        Output::Json => print::json(&Summary::of(view, interrupted)),
-        Output::Table => print::out(&format!("{}{}", summary::table(view), summary::evaluations(view))),
+        Output::Json => print::json(&Summary::of(view, whys, interrupted)),
+        Output::Table => print::out(&format!("{}{}", summary::table(view, whys), summary::evaluations(view))),
     }
     match end {
         End::Trouble(trouble) => {

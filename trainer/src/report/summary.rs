@@ -3,10 +3,11 @@
 use std::collections::BTreeMap;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
+use coordinator::shell::RunSettings;
 use pipeline::Pipeline;
 use protocol::message::{RunState, RunView, StageState, StageView, StorageProblem, SweepView};
 use protocol::stage::Register;
-use protocol::units::grouped;
+use protocol::units::{grouped, size};
 use protocol::{Digest, StageName};
 use serde::Serialize;
 
@@ -38,6 +39,12 @@ struct StageSummary {
     outputs: BTreeMap<String, Digest>,
     metrics: BTreeMap<String, f64>,
     wall_s: f64,
+    /// Peak memory of a worker's process, in bytes.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    peak_memory: Option<u64>,
+    /// Why it was computed, beside the previous run.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    why: Option<String>,
     #[serde(skip_serializing_if = "Option::is_none")]
     message: Option<String>,
     /// The swept stage, if this stage is one of its trials.
@@ -45,9 +52,23 @@ struct StageSummary {
     of: Option<StageName>,
 }
 
+/// Why stages were computed, in the server's words.
+pub(crate) type Whys = BTreeMap<StageName, String>;
+
+/// The reasons in a run's settings, without empty ones.
+pub(crate) fn whys(settings: RunSettings) -> Whys {
+    let mut whys = Whys::new();
+    for stage in settings.stages {
+        if let Some(why) = stage.why.filter(|why| !why.text.is_empty()) {
+            whys.insert(stage.stage, why.text);
+        }
+    }
+    whys
+}
+
 impl Summary {
     /// Creates the object; `interrupted` distinguishes a run that was drained from a running one.
-    pub(crate) fn of(run: &RunView, interrupted: bool) -> Self {
+    pub(crate) fn of(run: &RunView, whys: &Whys, interrupted: bool) -> Self {
         let stage = |stage: &StageView| StageSummary {
             name: stage.name.to_string(),
             kind: stage.kind.clone(),
@@ -56,6 +77,8 @@ impl Summary {
             outputs: stage.outputs.clone(),
             metrics: stage.metrics.clone(),
             wall_s: stage.wall_s,
+            peak_memory: stage.peak_memory,
+            why: whys.get(&stage.name).cloned(),
             message: stage.message.clone(),
             of: stage.of.clone(),
         };
@@ -100,7 +123,7 @@ pub(crate) fn run_state(run: &RunView) -> &'static str {
 }
 
 /// The requested stages, one per line, and one line per sweep. `trainer sweep status` shows the trials.
-pub(crate) fn table(run: &RunView) -> String {
+pub(crate) fn table(run: &RunView, whys: &Whys) -> String {
     let asked_for = run.stages.iter().filter(|stage| stage.of.is_none() && stage.is_asked_for());
     let rows = asked_for.map(|stage| {
         let progress = &stage.progress;
@@ -112,11 +135,14 @@ pub(crate) fn table(run: &RunView) -> String {
             state(stage.state).to_owned(),
             steps,
             if stage.wall_s > 0.0 { print::duration(stage.wall_s) } else { String::new() },
+            stage.peak_memory.map(size).unwrap_or_default(),
             stage.key.map(|key| key.short()).unwrap_or_default(),
             headline(stage),
+            whys.get(&stage.name).cloned().unwrap_or_default(),
         ]
     });
-    let table = print::table(&["STAGE", "KIND", "STATE", "DONE", "TIME", "KEY", "RESULT"], rows.collect());
+    let table =
+        print::table(&["STAGE", "KIND", "STATE", "DONE", "TIME", "MEMORY", "KEY", "RESULT", "WHY"], rows.collect());
     let table = run.sweeps.iter().fold(table, |text, sweep| format!("{text}\n\nsweep of {}", sweep_line(sweep)));
     match &run.storage {
         Some(problem) => format!("{table}\n\nstorage: {}", storage_line(problem)),
@@ -212,6 +238,7 @@ mod tests {
             metrics: BTreeMap::from([("latent_fid".to_owned(), 0.25), ("a".to_owned(), 1.0)]),
             progress: Progress::default(),
             wall_s: 2.0,
+            peak_memory: Some(412 << 20),
             attempt: protocol::Attempt(1),
             workers: vec![],
             instruction_set: None,
@@ -238,7 +265,7 @@ mod tests {
     #[test]
     fn programs_get_what_was_promised() {
         let view = view(&[("vae", "train.vae", StageState::Ran), ("mld", "train.mld", StageState::Cached)]);
-        let json = serde_json::to_value(Summary::of(&view, false)).unwrap();
+        let json = serde_json::to_value(Summary::of(&view, &Whys::new(), false)).unwrap();
         assert_eq!((&json["run"], &json["state"]), (&"p-1".into(), &"finished".into()));
         let stage = &json["stages"][0];
         assert_eq!(
@@ -252,10 +279,12 @@ mod tests {
 
     #[test]
     fn people_get_a_line_a_stage() {
-        let table = table(&view(&[("fid", "evaluate.latent_fid", StageState::Resumed)]));
+        let whys = Whys::from([("fid".into(), "repeats 1 -> 20".to_owned())]);
+        let table = table(&view(&[("fid", "evaluate.latent_fid", StageState::Resumed)]), &whys);
         let lines: Vec<&str> = table.lines().collect();
         assert!(lines[0].starts_with("STAGE") && lines[1].starts_with("fid"), "{table}");
         assert!(lines[1].contains("resumed") && lines[1].contains("latent_fid 0.2500"), "{table}");
+        assert!(lines[1].contains("412.0 MiB") && lines[1].ends_with("repeats 1 -> 20"), "{table}");
     }
 
     #[test]
@@ -265,11 +294,11 @@ mod tests {
         assert_eq!(run_state(&run), "paused");
         run.interrupted = true;
         assert_eq!(run_state(&run), "interrupted");
-        assert_eq!(serde_json::to_value(Summary::of(&run, false)).unwrap()["state"], "interrupted");
+        assert_eq!(serde_json::to_value(Summary::of(&run, &Whys::new(), false)).unwrap()["state"], "interrupted");
         run.stages[0].message = Some("interrupted at 1,204 of 6,000 steps".to_owned());
         run.stages[0].progress = Progress { done: 1204, total: 6000, ..Progress::default() };
         run.stages[1].message = Some(StageView::NOT_ASKED_FOR.to_owned());
-        let table = table(&run);
+        let table = table(&run, &Whys::new());
         assert!(table.contains("1,204/6,000") && table.contains("interrupted at 1,204 of 6,000 steps"), "{table}");
         assert!(!table.contains("mld"), "{table}");
     }

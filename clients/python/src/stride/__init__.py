@@ -10,7 +10,7 @@
 
 from ._client import Metrics, Model, Run, Server, connect
 from ._errors import StrideError
-from ._models import HistoryRow, LogRow, Promotion, RunSummary, RunView, StageView, Version
+from ._models import HistoryRow, LogRow, Promotion, RunSettings, RunSummary, RunView, StageView, Version
 
 __all__ = [
     "HistoryRow",
@@ -19,6 +19,7 @@ __all__ = [
     "Model",
     "Promotion",
     "Run",
+    "RunSettings",
     "RunSummary",
     "RunView",
     "Server",

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, cast
 import httpx
 
 from ._errors import StrideError
-from ._models import Drawing, HistoryRow, LogRow, Promotion, RunSummary, RunView, Version
+from ._models import Drawing, HistoryRow, LogRow, Promotion, RunSettings, RunSummary, RunView, Version
 
 if TYPE_CHECKING:
     import pandas
@@ -252,6 +252,15 @@ class Run:
     def view(self) -> RunView:
         """How the run stands now, with all its stages."""
         return RunView.model_validate(self._server._json("GET", self._path))
+
+    def settings(self) -> RunSettings:
+        """The settings of the run's stages, beside those of the pipeline's previous run."""
+        return RunSettings.model_validate(self._server._json("GET", f"{self._path}/settings"))
+
+    def why(self) -> dict[str, str]:
+        """Why each stage was computed, such as ``lr 2e-4 -> 1e-4`` or ``cached from walks-1``."""
+        stages = self.settings().stages
+        return {stage.stage: stage.why.text for stage in stages if stage.why is not None and stage.why.text}
 
     @property
     def state(self) -> str:

@@ -156,7 +156,7 @@ impl Worker {
         let Assignment { grant, secret, .. } = assignment;
         let receipt = self.uploaded.get(&(grant.task.clone(), output)).map(|receipt| (output, receipt.clone()));
         let outcome = TaskOutcome::Finished { output, metrics: BTreeMap::new() };
-        let report = Vouched { what: ReportOutcome { grant, outcome }, receipts: receipt.into_iter().collect() };
+        let report = Vouched { what: ReportOutcome::new(grant, outcome), receipts: receipt.into_iter().collect() };
         self.connection.post("/v1/outcomes", &secret, &report).await
     }
 }

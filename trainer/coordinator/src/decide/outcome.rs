@@ -233,7 +233,7 @@ pub fn refused_for_good(event: &Event, error: &WriteError) -> Option<Event> {
         // not repair.
         let class = if is_missing { FailureClass::Fault } else { FailureClass::Storage };
         let outcome = TaskOutcome::Failed { class, message: message.clone() };
-        Some(Event::Outcome { report: ReportOutcome { grant: grant.clone(), outcome } })
+        Some(Event::Outcome { report: ReportOutcome::new(grant.clone(), outcome) })
     };
     match event {
         Event::Bundled { key, .. } => Some(Event::RegisterRefused { key: *key, message }),

@@ -64,7 +64,9 @@ impl Deciding<'_> {
                         (false, false) => StageState::Ran,
                     };
                     let wall_s = if *cached { 0.0 } else { execution.wall_s(now) };
-                    Status::Done { key, how, known: Arc::clone(known), wall_s, attempt: execution.attempt() }
+                    let peak_memory = self.state.peak_memory(execution).filter(|_| !cached);
+                    let (known, attempt) = (Arc::clone(known), execution.attempt());
+                    Status::Done { key, how, known, wall_s, attempt, peak_memory }
                 }
             };
             stages.push((j, status));

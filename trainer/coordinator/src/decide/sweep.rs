@@ -183,10 +183,11 @@ fn concluded(run: &Run, sweep: &Sweeping) -> Status {
     metrics.insert("sweep.trial".into(), trial as f64);
     let numbers = sweep.search.trials()[trial].iter().filter_map(|(path, value)| Some((path, value.as_f64()?)));
     metrics.extend(numbers.map(|(path, value)| (format!("sweep.{path}"), value)));
-    let (mut how, mut seconds) = (StageState::Cached, 0.0);
+    let (mut how, mut seconds, mut peak_memory) = (StageState::Cached, 0.0, None);
     for status in made() {
-        if let Status::Done { how: this, wall_s, .. } = status {
+        if let Status::Done { how: this, wall_s, peak_memory: peak, .. } = status {
             seconds += wall_s;
+            peak_memory = peak_memory.max(*peak);
             how = match (how, this) {
                 (StageState::Resumed, _) | (_, StageState::Resumed) => StageState::Resumed,
                 (StageState::Cached, this) => *this,
@@ -195,7 +196,7 @@ fn concluded(run: &Run, sweep: &Sweeping) -> Status {
         }
     }
     let known = Arc::new(Known { outputs, metrics });
-    Status::Done { key: *key, how, known, wall_s: seconds, attempt: *attempt }
+    Status::Done { key: *key, how, known, wall_s: seconds, attempt: *attempt, peak_memory }
 }
 
 impl State {

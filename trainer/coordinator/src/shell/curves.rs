@@ -3,7 +3,7 @@
 //! `GET /v1/metrics?run=A&run=B&key=loss&stage=S&x=step|time|hours&from=&to=&buckets=800`, as JSON or, by
 //! `Accept: application/octet-stream`, packed: the length of a head as `u32`, the head as JSON padded with blanks to a multiple of four
 //! bytes, then for each series of the head its columns one after the other as `f32`. All numbers are little-endian; `x` counts from the
-//! series' `x0`. The column `nan` is missing where all of it is zero.
+//! series' `x0`. The column `nan` is missing where all of it is zero. A finite value that `f32` cannot hold is its largest number.
 
 use std::sync::Arc;
 
@@ -182,6 +182,11 @@ struct Head<'a> {
     columns: Vec<&'static str>,
 }
 
+/// The nearest finite number; NaN stays NaN.
+fn single(value: f64) -> f32 {
+    (value as f32).clamp(f32::MIN, f32::MAX)
+}
+
 fn pack(curves: &Curves) -> Vec<u8> {
     let mut heads = Vec::new();
     let mut numbers: Vec<u8> = Vec::new();
@@ -190,7 +195,7 @@ fn pack(curves: &Curves) -> Vec<u8> {
         let mut names = Vec::new();
         let mut column = |name, values: &mut dyn Iterator<Item = f64>| {
             names.push(name);
-            numbers.extend(values.flat_map(|value| (value as f32).to_le_bytes()));
+            numbers.extend(values.flat_map(|value| single(value).to_le_bytes()));
         };
         column("x", &mut columns.x.iter().map(|x| x - x0));
         column("min", &mut columns.min.iter().copied());
@@ -242,7 +247,7 @@ mod tests {
             x: vec![1e12, 1e12 + 5.0],
             min: vec![1.0, f64::NAN],
             max: vec![2.0, f64::NAN],
-            mean: vec![1.5, f64::NAN],
+            mean: vec![1e300, f64::NAN],
             last: vec![2.0, f64::NAN],
             count: vec![2, 1],
             nan: vec![0, 1],
@@ -270,5 +275,6 @@ mod tests {
         assert_eq!(numbers.len(), 2 * 13);
         assert_eq!((numbers[1], numbers[2], numbers[13]), (5.0, 1.0, 1.0));
         assert!(numbers[3].is_nan());
+        assert_eq!((numbers[6], single(-1e300)), (f32::MAX, f32::MIN), "finite, as in JSON");
     }
 }

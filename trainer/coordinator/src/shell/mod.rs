@@ -34,6 +34,7 @@ mod polls;
 mod progress;
 mod queries;
 mod rate;
+mod reasons;
 mod records;
 mod revocable;
 mod route;
@@ -86,6 +87,7 @@ pub use self::draws::{Draw, Drawing};
 use self::listener::Listener;
 pub use self::listener::{Connections, raise_descriptor_limit};
 pub use self::queries::Submitted;
+pub use self::reasons::{ReasonKind, SettingChange, StageReason};
 pub use self::records::{Records, RecordsError, StageCurves, StageMetrics};
 pub use self::route::Route;
 pub use self::route_server::RouteServer;
@@ -335,6 +337,11 @@ impl Handle {
         self.actor_handle.run_view(run).await
     }
 
+    /// The settings of a run's stages, and why each was computed.
+    pub async fn settings(&self, run: &RunId) -> Result<RunSettings, Refused> {
+        self.actor_handle.records_for(None).settings(run).await
+    }
+
     /// Views of all workers.
     pub fn workers(&self) -> Vec<WorkerView> {
         self.actor_handle.state().worker_views()
@@ -350,7 +357,7 @@ impl Handle {
         let state = self.actor_handle.state();
         let (Some(known), Some((_, task))) = (state.workers.get(worker), state.held_by(worker)) else { return Ok(()) };
         let grant = task.grant_of(worker, known.incarnation);
-        let report = ReportOutcome { grant, outcome: TaskOutcome::Failed { class, message } };
+        let report = ReportOutcome::new(grant, TaskOutcome::Failed { class, message });
         self.actor_handle.decide(Event::Outcome { report }).await.map(drop)
     }
 

@@ -1,4 +1,4 @@
-//! Settings of a run, by stage, and the runs that they can be compared with.
+//! Settings of a run, by stage, and the previous run that they are compared with.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -7,6 +7,7 @@ use access::Caller;
 use axum::extract::State;
 use axum::{Extension, Json};
 use pipeline::Pipeline;
+use protocol::message::RunView;
 use protocol::{Digest, RunId, Seed, StageName};
 use registry::{RunListQuery, RunOrder, WriteError};
 use schemars::JsonSchema;
@@ -16,6 +17,7 @@ use serde_json::Value;
 use super::actor_handle::ActorHandle;
 use super::extract::Path;
 use super::failure::Failure;
+use super::reasons::{StageReason, explain};
 use super::records::{Records, read};
 use super::turn::turn;
 use crate::batch::Refused;
@@ -31,6 +33,9 @@ pub struct RunSettings {
     pub run: RunId,
     /// The newest earlier run of a pipeline with the same name.
     pub previous: Option<RunId>,
+    /// Stages of the previous run that this one does not have.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub missing: Vec<StageName>,
     pub seed: Seed,
     /// The pipeline's file as the user wrote it.
     pub source: String,
@@ -52,6 +57,9 @@ pub struct SettingsOfStage {
     /// Earlier run that computed the result, unless the caller may not see it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub from: Option<RunId>,
+    /// Why it was computed, beside the previous run.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub why: Option<StageReason>,
 }
 
 pub(crate) async fn settings(
@@ -60,33 +68,65 @@ pub(crate) async fn settings(
     Path(run): Path<RunId>,
 ) -> Result<Json<RunSettings>, Failure> {
     let _turn = turn(&actor_handle).await?;
-    Ok(Json(of_run(&actor_handle.records_for(caller.sees()), &run).await?))
+    Ok(Json(actor_handle.records_for(caller.sees()).settings(&run).await?))
 }
 
-async fn of_run(records: &Records, run: &RunId) -> Result<RunSettings, Refused> {
-    let view = records.run_view(run).await?;
+impl Records {
+    /// The settings of a run's stages, and why each was computed.
+    ///
+    /// # Errors
+    /// If there is no such run, or its row cannot be read.
+    pub async fn settings(&self, run: &RunId) -> Result<RunSettings, Refused> {
+        let view = self.run_view(run).await?;
+        let mut now = as_submitted(self, run, &view).await?;
+        let mut from: BTreeMap<_, _> = self.sources(run, None).await?.into_iter().collect();
+        from.retain(|_, (source, _)| source != run);
+        let mut hidden = BTreeSet::new();
+        for (source, _) in from.values() {
+            if !hidden.contains(source) && self.run_view(source).await.is_err() {
+                hidden.insert(source.clone());
+            }
+        }
+        for stage in &mut now.stages {
+            let source = from.get(&stage.stage).map(|(source, _)| source.clone());
+            stage.from = source.filter(|source| !hidden.contains(source));
+        }
+        now.previous = previous(self, run, &view.pipeline).await?;
+        let before = match &now.previous {
+            // A run that was forgotten meanwhile, or that only another build can read, is not compared with.
+            Some(previous) => earlier(self, previous).await.ok(),
+            None => None,
+        };
+        if let Some(before) = &before {
+            let is_here = |name: &StageName| now.stages.iter().any(|stage| stage.stage == *name);
+            now.missing = before.stages.iter().map(|stage| stage.stage.clone()).filter(|name| !is_here(name)).collect();
+        }
+        explain(&mut now, &view, before.as_ref());
+        Ok(now)
+    }
+}
+
+async fn earlier(records: &Records, run: &RunId) -> Result<RunSettings, Refused> {
+    as_submitted(records, run, &records.run_view(run).await?).await
+}
+
+/// The settings of a run's stages by themselves.
+async fn as_submitted(records: &Records, run: &RunId, view: &RunView) -> Result<RunSettings, Refused> {
     let row = records.store().run(run).await.map_err(WriteError::from)?.ok_or_else(|| Rejected::unknown_run(run))?;
     let pipeline: Pipeline = read(run, &row.pipeline.to_string())?;
     let keys: BTreeMap<&StageName, Digest> =
         view.stages.iter().filter_map(|stage| Some((&stage.name, stage.key?))).collect();
-    let mut from: BTreeMap<_, _> = records.sources(run, None).await?.into_iter().collect();
-    from.retain(|_, (source, _)| source != run);
-    let mut hidden = BTreeSet::new();
-    for (source, _) in from.values() {
-        if !hidden.contains(source) && records.run_view(source).await.is_err() {
-            hidden.insert(source.clone());
-        }
-    }
     let stages = pipeline.stages.iter().map(|stage| SettingsOfStage {
         stage: stage.name.clone(),
         settings: serde_json::to_value(&stage.settings).unwrap_or_default(),
         code: pipeline.code_versions.get(stage.settings.kind()).copied().unwrap_or(1),
         key: keys.get(&stage.name).copied(),
-        from: from.get(&stage.name).map(|(source, _)| source.clone()).filter(|source| !hidden.contains(source)),
+        from: None,
+        why: None,
     });
     let stages = stages.collect();
-    let previous = previous(records, run, &view.pipeline).await?;
-    Ok(RunSettings { run: run.clone(), previous, seed: pipeline.seed, source: row.source, stages })
+    let (previous, missing) = (None, Vec::new());
+    Ok(RunSettings { run: run.clone(), previous, missing, seed: pipeline.seed, source: row.source, stages })
 }
 
 /// The newest run of the pipeline before `run`.

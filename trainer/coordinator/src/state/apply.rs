@@ -239,6 +239,7 @@ impl State {
                 for task in &known.tasks {
                     self.tasks.remove_mut(&task.id);
                     self.heard.progress.remove_mut(&task.id);
+                    self.heard.memory.remove_mut(&task.id);
                 }
                 self.note_mending(*key, &known.state, false);
                 self.executions.remove_mut(key);

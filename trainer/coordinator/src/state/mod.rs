@@ -54,6 +54,8 @@ pub struct Heard {
     pub workers: Map<WorkerId, Millis>,
     /// The last reported progress of each task that is its execution's only task.
     pub progress: Map<TaskId, Arc<Progress>>,
+    /// The highest reported memory of a worker's process by task, in bytes.
+    pub memory: Map<TaskId, u64>,
     /// Reports of gang members about their state and about each other. A worker that loses its task also loses its
     /// report.
     pub words: Arc<Words>,

@@ -55,6 +55,9 @@ pub enum Status {
         wall_s: f64,
         /// The number of the attempt that computed it.
         attempt: Attempt,
+        /// Peak memory of a worker's process, in bytes.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        peak_memory: Option<u64>,
     },
     /// It failed for good.
     Failed {
@@ -473,7 +476,8 @@ mod tests {
         let key = Digest::of(b"");
         let failed = Status::Failed { key, message: String::new() };
         let known = Arc::new(Known { outputs: BTreeMap::new(), metrics: BTreeMap::new() });
-        let done = Status::Done { key, how: StageState::Ran, known, wall_s: 0.0, attempt: Attempt(1) };
+        let attempt = Attempt(1);
+        let done = Status::Done { key, how: StageState::Ran, known, wall_s: 0.0, attempt, peak_memory: None };
         for state in [RunState::Running, RunState::Paused, RunState::Finished, RunState::Failed, RunState::Cancelled] {
             let asked = |action| Run { state, ..run() }.after(action).map_or("-".to_owned(), |s| format!("{s:?}"));
             let becomes = |status: &Status| {

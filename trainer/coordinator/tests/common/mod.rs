@@ -145,7 +145,7 @@ impl PureCoordinator {
     }
 
     pub(crate) fn report(&mut self, assignment: &Assignment, outcome: TaskOutcome) {
-        let report = ReportOutcome { grant: assignment.grant.clone(), outcome };
+        let report = ReportOutcome::new(assignment.grant.clone(), outcome);
         self.happen(Event::Outcome { report }).expect("taken");
     }
 

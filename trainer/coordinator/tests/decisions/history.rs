@@ -78,7 +78,7 @@ fn a_worker_that_falls_silent_is_lost_and_its_task_is_tried_again() {
     coordinator.happen(Event::WorkerBack { worker: "a".into() }).expect("taken");
     assert_eq!(news(&mut coordinator)[0], told(Returned, "a", ""));
     let late = TaskOutcome::Finished { output: Digest::of(b"clips"), metrics: Default::default() };
-    let report = protocol::message::ReportOutcome { grant: dataset.grant, outcome: late };
+    let report = protocol::message::ReportOutcome::new(dataset.grant, late);
     assert!(coordinator.happen(Event::Outcome { report }).is_err());
     assert_eq!(news(&mut coordinator), []);
 }

@@ -133,7 +133,7 @@ fn an_ended_stage_keeps_no_training_state() {
     let grant = assignment.grant.clone();
     let (task, outcome) =
         (grant.task.clone(), TaskOutcome::Finished { output: Digest::of(b"vae"), metrics: Default::default() });
-    let effects = coordinator.happen(Event::Outcome { report: ReportOutcome { grant, outcome } }).expect("taken");
+    let effects = coordinator.happen(Event::Outcome { report: ReportOutcome::new(grant, outcome) }).expect("taken");
     let prunes = |effect: &Effect| matches!(effect, Effect::Prune { task: of, at_end: true, .. } if *of == task);
     assert_eq!(coordinator.run_state(&run), RunState::Finished);
     assert_eq!(effects.iter().filter(|effect| prunes(effect)).count(), 1, "{effects:?}");
@@ -261,7 +261,7 @@ fn what_names_a_missing_blob_is_a_failed_try_and_is_tried_again() {
                 }
                 _ => {
                     let outcome = TaskOutcome::Finished { output, metrics };
-                    Event::Outcome { report: ReportOutcome { grant, outcome } }
+                    Event::Outcome { report: ReportOutcome::new(grant, outcome) }
                 }
             };
             let error = WriteError::NotFound("blob is not in the store".into());

@@ -47,7 +47,7 @@ fn p3_the_task_of_a_dead_worker_is_another_s_within_16_seconds() {
         let backoff = policy.backoff(1).next_multiple_of(policy.tick_ms);
         assert!(after <= bound + backoff, "offset {offset}: taken after {after} ms");
         assert!(taken.fence > lost.fence && taken.attempt > lost.attempt);
-        let refused = ReportOutcome { grant: lost, outcome: failed(FailureClass::Fault) };
+        let refused = ReportOutcome::new(lost, failed(FailureClass::Fault));
         let refused = coordinator.happen(Event::Outcome { report: refused });
         assert!(matches!(refused, Err(Rejected::StaleFence { .. })), "{refused:?}");
     }
@@ -74,7 +74,7 @@ fn a_report_of_the_end_counts_whoever_leads_the_gang_meanwhile() {
         let mut coordinator = PureCoordinator::new(Policy::default());
         let (run, _) = gang_of_three(&mut coordinator);
         let grant = coordinator.assignment(name).expect("it trains").grant;
-        let report = |outcome| Event::Outcome { report: ReportOutcome { grant: grant.clone(), outcome } };
+        let report = |outcome| Event::Outcome { report: ReportOutcome::new(grant.clone(), outcome) };
         let attempt = grant.attempt;
         coordinator.happen(report(TaskOutcome::Yielded { at: 1 })).expect("heard");
         let (_, task) = coordinator.state.task(&grant.task).expect("known");
@@ -85,7 +85,7 @@ fn a_report_of_the_end_counts_whoever_leads_the_gang_meanwhile() {
         assert_eq!(again, run);
         let grant = coordinator.assignment(name).expect("it trains").grant;
         let outcome = TaskOutcome::Finished { output: Digest::of(b"vae"), metrics: Default::default() };
-        coordinator.happen(Event::Outcome { report: ReportOutcome { grant, outcome } }).expect("done");
+        coordinator.happen(Event::Outcome { report: ReportOutcome::new(grant, outcome) }).expect("done");
         assert_eq!(coordinator.run_state(&run), RunState::Finished, "{name}");
     }
 }

@@ -47,7 +47,7 @@ fn finished(output: &[u8]) -> TaskOutcome {
 }
 
 fn refused(coordinator: &mut PureCoordinator, assignment: &Assignment, outcome: TaskOutcome) -> String {
-    let report = ReportOutcome { grant: assignment.grant.clone(), outcome };
+    let report = ReportOutcome::new(assignment.grant.clone(), outcome);
     coordinator.happen(Event::Outcome { report }).expect_err("refused").to_string()
 }
 

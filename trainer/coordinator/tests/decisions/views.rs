@@ -1,7 +1,9 @@
 //! Views of runs and stages: points of interruption, missing workers, and the progress of finished stages.
 
 use coordinator::{Control, Event, Observation, Policy};
-use protocol::message::{CommitCheckpoint, Doing, Poll, Progress, RunState, StageState, StageView, TaskOutcome};
+use protocol::message::{
+    CommitCheckpoint, Doing, Poll, Progress, ReportOutcome, RunState, StageState, StageView, TaskOutcome,
+};
 use protocol::stage::WorkerRange;
 use protocol::{Digest, Incarnation, RunId};
 
@@ -49,6 +51,29 @@ fn a_finished_stage_is_whole_however_old_its_last_report_is() {
     let vae = stage(&coordinator, &run, "vae");
     assert_eq!((vae.state, vae.progress.done, vae.progress.total), (StageState::Ran, 300, 300));
     assert_eq!(vae.metrics["loss"], 0.25);
+}
+
+#[test]
+fn the_highest_memory_of_a_stage_is_shown_while_it_runs_and_afterwards() {
+    let mut coordinator = PureCoordinator::new(Policy::default());
+    let (run, incarnations) = gang_of_three(&mut coordinator);
+    assert_eq!(stage(&coordinator, &run, "vae").peak_memory, None);
+    for (name, incarnation, peak) in
+        [("a", incarnations[0], 300), ("b", incarnations[1], 500), ("a", incarnations[0], 200)]
+    {
+        let grant = coordinator.assignment(name).expect("it trains").grant;
+        let doing = Doing { peak_memory: Some(peak), ..Doing::new(grant, Progress::default()) };
+        let poll = Poll { incarnation, doing: vec![doing], ready: Vec::new(), version: 0 };
+        coordinator.hear(Observation::Poll { worker: name.into(), poll });
+    }
+    assert_eq!(stage(&coordinator, &run, "vae").peak_memory, Some(500));
+    let grant = coordinator.assignment("a").expect("it trains").grant;
+    let outcome = TaskOutcome::Finished { output: Digest::of(b"vae"), metrics: Default::default() };
+    let report = ReportOutcome { peak_memory: Some(400), ..ReportOutcome::new(grant, outcome) };
+    coordinator.happen(Event::Outcome { report }).expect("taken");
+    assert_eq!(stage(&coordinator, &run, "vae").peak_memory, Some(500));
+    coordinator.restart(true);
+    assert_eq!(stage(&coordinator, &run, "vae").peak_memory, Some(500), "it is in the facts");
 }
 
 #[test]

@@ -225,7 +225,7 @@ async fn a_run_goes_through_over_http_and_survives_a_restart() -> TestResult {
     under.call::<()>("POST", "/v1/logs", logs.clone()).await?;
     under.call::<()>("POST", "/v1/logs", logs).await?;
     let finished = TaskOutcome::Finished { output, metrics: BTreeMap::from([("clips".into(), 400.0)]) };
-    let report = vouched(ReportOutcome { grant: data.clone(), outcome: finished }, &receipt);
+    let report = vouched(ReportOutcome::new(data.clone(), finished), &receipt);
     under.call::<()>("POST", "/v1/outcomes", report.clone()).await?;
     // The first answer may have been lost.
     under.call::<()>("POST", "/v1/outcomes", report).await?;
@@ -265,11 +265,11 @@ async fn a_run_goes_through_over_http_and_survives_a_restart() -> TestResult {
     let under = client.under(&vae);
     let receipt = under.put_manifest(&vae.grant, ArtifactKind::Vae, "vae").await?;
     let finished = TaskOutcome::Finished { output: receipt.0, metrics: BTreeMap::from([("mpjpe".into(), 40.0)]) };
-    let report = ReportOutcome { grant: vae.grant.clone(), outcome: finished };
+    let report = ReportOutcome { peak_memory: Some(7 << 20), ..ReportOutcome::new(vae.grant.clone(), finished) };
     under.call::<()>("POST", "/v1/outcomes", vouched(report, &receipt)).await?;
     let view = until_over(&handle, &run).await?;
     assert_eq!(view.state, RunState::Finished);
-    assert_eq!(view.stages[1].metrics["mpjpe"], 40.0);
+    assert_eq!((view.stages[1].metrics["mpjpe"], view.stages[1].peak_memory), (40.0, Some(7 << 20)));
     let view: protocol::message::RunView = client.call("GET", &format!("/v1/runs/{run}"), ()).await?;
     let (whole, vae) = (view.times, view.stages[1].times);
     assert!(whole.created_ms <= whole.started_ms && whole.started_ms <= vae.started_ms, "{view:?}");
@@ -307,7 +307,32 @@ async fn a_run_goes_through_over_http_and_survives_a_restart() -> TestResult {
     let view = until_over(&handle, &second).await?;
     assert!(view.stages.iter().all(|stage| stage.state == StageState::Cached), "{view:#?}");
     assert!(handle.control(&second, Control::Pause).await.is_err());
+    reasons_are_said(&handle, &client, [&run, &second]).await?;
     handle.shutdown().await;
+    Ok(())
+}
+
+/// Checks why the stages of two equal runs were computed, and those of a third with another setting.
+async fn reasons_are_said(handle: &Handle, client: &Client, [first, second]: [&RunId; 2]) -> TestResult {
+    async fn settings(client: &Client, run: &RunId) -> TestResult<coordinator::shell::RunSettings> {
+        client.call("GET", &format!("/v1/runs/{run}/settings"), ()).await
+    }
+    fn texts(settings: &coordinator::shell::RunSettings) -> Vec<&str> {
+        settings.stages.iter().filter_map(|stage| Some(stage.why.as_ref()?.text.as_str())).collect()
+    }
+    let found = settings(client, first).await?;
+    assert_eq!((found.previous.as_ref(), texts(&found)), (None, vec!["new", "new"]));
+    let found = settings(client, second).await?;
+    let cached = format!("cached from {first}");
+    assert_eq!((found.previous.as_ref(), texts(&found)), (Some(first), vec![&*cached; 2]));
+    let mut changed = pipeline();
+    changed.stages[1].settings = StageSettings::TrainVae(TrainVae { ema: 2e-4, ..TrainVae::default() });
+    let ema = TrainVae::default().ema;
+    let third = handle.submit(Submit { pipeline: serde_json::to_value(changed)?, ..submission(None)? }).await?;
+    let found = settings(client, &third).await?;
+    assert_eq!((found.previous.as_ref(), found.missing.as_slice()), (Some(second), &[][..]));
+    assert_eq!(texts(&found)[1], format!("ema {ema} -> 2e-4"));
+    assert_eq!(found.stages[1].why.as_ref().map(|why| why.changes.len()), Some(1));
     Ok(())
 }
 
@@ -375,7 +400,7 @@ async fn p2_a_silent_worker_loses_its_task_and_its_writes_are_refused() -> TestR
     let waited = begun.elapsed();
     assert!(waited > Duration::from_millis(500) && waited < Duration::from_secs(10), "{waited:?}");
     assert!(taken.fence > lost.fence && taken.attempt > lost.attempt);
-    let report = ReportOutcome { grant: lost.clone(), outcome: TaskOutcome::Yielded { at: 0 } };
+    let report = ReportOutcome::new(lost.clone(), TaskOutcome::Yielded { at: 0 });
     let (status, error) = under.refused("/v1/outcomes", report).await?;
     assert_eq!((status, error.code.as_str()), (409, "stale-fence"));
     let request = Request::builder().method("PUT").uri(format!("/v1/blobs/{}", Digest::of(b"late")));

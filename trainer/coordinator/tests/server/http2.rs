@@ -1,6 +1,5 @@
 //! HTTP/2 where TLS is on: the same answers, and limits for each call where HTTP/1.1 has them for each connection.
 
-use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use access::{Scope, Scopes, Token};
@@ -8,16 +7,9 @@ use axum::body::Body;
 use axum::http::{Request, StatusCode, Version, header};
 use coordinator::Handle;
 use hyper::body::Incoming;
-use hyper::client::conn::http2::{SendRequest, handshake};
-use hyper_util::rt::{TokioExecutor, TokioIo};
-use rustls::RootCertStore;
-use rustls::pki_types::pem::PemObject as _;
-use rustls::pki_types::{CertificateDer, ServerName};
 use tempfile::TempDir;
-use tokio::net::TcpStream;
-use tokio::task::JoinHandle;
-use tokio_rustls::TlsConnector;
 
+use super::front::{Connection, connect};
 use super::tls::{Files, authority, start_with};
 
 struct Site {
@@ -25,12 +17,6 @@ struct Site {
     files: Files,
     token: Token,
     handle: Handle,
-}
-
-/// A connection, and the task that ends with it.
-struct Connection {
-    send: SendRequest<Body>,
-    alive: JoinHandle<()>,
 }
 
 impl Site {
@@ -50,17 +36,7 @@ impl Site {
     }
 
     async fn connect(&self) -> Connection {
-        let mut roots = RootCertStore::empty();
-        roots.add(CertificateDer::from_pem_file(&self.files.ca).unwrap()).unwrap();
-        let provider = Arc::new(rustls::crypto::ring::default_provider());
-        let config = rustls::ClientConfig::builder_with_provider(provider).with_safe_default_protocol_versions();
-        let mut config = config.unwrap().with_root_certificates(roots).with_no_client_auth();
-        config.alpn_protocols = vec![b"h2".to_vec()];
-        let stream = TcpStream::connect(self.handle.address()).await.unwrap();
-        let name = ServerName::try_from("localhost").unwrap();
-        let stream = TlsConnector::from(Arc::new(config)).connect(name, stream).await.unwrap();
-        let (send, connection) = handshake(TokioExecutor::new(), TokioIo::new(stream)).await.unwrap();
-        Connection { send, alive: tokio::spawn(async move { drop(connection.await) }) }
+        connect(self.handle.address(), &self.files.ca).await
     }
 
     fn request(&self, host: &str, path: &str) -> Request<Body> {

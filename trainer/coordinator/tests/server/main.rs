@@ -13,6 +13,7 @@ mod demand;
 mod errors;
 mod events;
 mod exposition;
+mod front;
 mod http;
 mod http2;
 mod limits;

@@ -17,6 +17,12 @@ pub(crate) struct Files {
     key: PathBuf,
 }
 
+impl Files {
+    pub(crate) fn server(&self) -> tls::ServerTls {
+        tls::ServerTls::read(&self.certificate, &self.key).unwrap()
+    }
+}
+
 /// Creates an authority and its certificate for `localhost`.
 pub(crate) fn authority(dir: &Path, name: &str) -> Files {
     let files = Files {
@@ -46,7 +52,7 @@ pub(crate) async fn start_with(dir: &Path, files: &Files, token: &Token, change:
     let store = Store::open(dir, Holder::this_process("a test")).await.unwrap();
     let mut tokens = Tokens::default();
     tokens.add("me", Scopes::all(), token);
-    let tls = Some(tls::ServerTls::read(&files.certificate, &files.key).unwrap());
+    let tls = Some(files.server());
     let mut config = Config { tls, ..Config::server(SocketAddr::from((Ipv4Addr::LOCALHOST, 0)), tokens) };
     change(&mut config);
     Coordinator::start(store, config).await.unwrap()

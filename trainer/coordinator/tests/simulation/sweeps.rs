@@ -43,7 +43,8 @@ fn decisions(world: &World) -> Decisions {
     let search = &sweep.search;
     let scores = (0..search.tickets().len()).map(|ticket| search.score(ticket)).collect();
     let Status::Done { key, known, .. } = run.stages[sweep.stage].clone() else { panic!("the sweep is not done") };
-    let status = Status::Done { key, how: StageState::Ran, known, wall_s: 0.0, attempt: Default::default() };
+    let (attempt, peak_memory) = Default::default();
+    let status = Status::Done { key, how: StageState::Ran, known, wall_s: 0.0, attempt, peak_memory };
     (search.tickets().to_vec(), scores, search.best(), status)
 }
 

@@ -104,7 +104,7 @@ pub(crate) fn events(state: &State, ended: &[Run]) -> Vec<Event> {
                 failed(FailureClass::Fault),
                 failed(FailureClass::Infrastructure),
             ] {
-                events.push(Event::Outcome { report: ReportOutcome { grant: grant.clone(), outcome } });
+                events.push(Event::Outcome { report: ReportOutcome::new(grant.clone(), outcome) });
             }
         }
     }

@@ -286,7 +286,7 @@ impl FakeWorker {
     }
 
     fn report(&mut self, grant: Grant, outcome: TaskOutcome) {
-        self.saving = Saving::Report(ReportOutcome { grant, outcome });
+        self.saving = Saving::Report(ReportOutcome::new(grant, outcome));
     }
 
     /// Reports the first input for which `can_be` holds as damaged, and returns it.

@@ -12,7 +12,7 @@ import { badge, bar, command, fact, failed, firstLine, headline, isDone, isOver,
 import { Rates } from "../rates.js";
 import { address } from "../router.js";
 import { controls, serverNow } from "../session.js";
-import { inText, inWords as whyInWords, reasons, settingsOf } from "../settings.js";
+import { inText, settingsOf } from "../settings.js";
 import { sweepView } from "../sweep.js";
 import { html, nothing } from "../vendor/lit-html.js";
 
@@ -33,12 +33,10 @@ export function run(context, name) {
   const history = new History({ run: name });
   /** @type {RunSettings | null} */
   let settings = null;
-  /** @type {RunSettings | null} Of the last run of the pipeline before it. */
-  let earlier = null;
-  /** Stages whose key was known when the settings were asked for. */
-  let keyed = -1;
-  /** @type {Map<string, import("../settings.js").Why>} */
-  let why = new Map();
+  /** @type {Map<string, SettingsOfStage>} Settings by stage. */
+  let byStage = new Map();
+  /** Keys and states of the stages when the settings were asked for: why a stage ran hangs on them. */
+  let asOf = "";
   /** @type {Map<string, {chart: Chart, key: string, curve: Curve}>} By stage. */
   const charts = new Map();
   /** @type {LogLine[]} */
@@ -68,24 +66,21 @@ export function run(context, name) {
     beats += 1;
   }
 
-  /** Fetches the settings, and again once more stages have a key. @param {Run} run @param {AbortSignal} signal */
+  /** Fetches the settings, and again once stages have gone on. @param {Run} run @param {AbortSignal} signal */
   async function compare(run, signal) {
-    const known = run.stages.filter((stage) => stage.key).length;
-    if (known !== keyed) {
-      keyed = known;
-      try {
-        const now = await settingsOf(name, signal);
-        if (now.previous && earlier?.run !== now.previous) earlier = await settingsOf(now.previous, signal);
-        settings = now;
-      } catch (error) {
-        // What else the view shows does not wait for it.
-        keyed = -1;
-        if (!signal.aborted && !(error instanceof CallError)) throw error;
-        return;
-      }
-      queueMicrotask(context.draw);
+    const now = mainStages(run).map((stage) => `${stage.key ?? ""} ${stage.state}`).join();
+    if (now === asOf) return;
+    asOf = now;
+    try {
+      settings = await settingsOf(name, signal);
+    } catch (error) {
+      // What else the view shows does not wait for it.
+      asOf = "";
+      if (!signal.aborted && !(error instanceof CallError)) throw error;
+      return;
     }
-    if (settings) why = reasons(run, settings, earlier);
+    byStage = new Map(settings.stages.map((stage) => [stage.stage, stage]));
+    queueMicrotask(context.draw);
   }
 
   /** @param {AbortSignal} signal */
@@ -174,7 +169,7 @@ export function run(context, name) {
       ${rest ? html`<pre class="rest" tabindex="0">${plain(rest)}</pre>` : nothing}
       <p>${prose(whatToDo(message) ?? OTHERWISE)} <a href=${CAUSES}>Causes of failed stages</a></p>
       <p class="dim small">${stage.kind}${(last?.attempt ?? stage.attempt) > 0 ? ` · attempt ${last?.attempt ?? stage.attempt}` : ""}${worker ? html` · worker ${worker}` : nothing}${stage.wall_s > 0 ? ` · after ${duration(stage.wall_s)}` : ""}</p>
-      ${around.length > 0 ? html`<div class="lines few" tabindex="0" role="group" aria-label="The last lines of its log">${around.map((line) => logLine(line, false, line === marked))}</div>` : nothing}
+      ${around.length > 0 ? html`<div class="lines few" tabindex="0" role="group" aria-label="The last lines of its log"><div>${around.map((line) => logLine(line, false, line === marked))}</div></div>` : nothing}
       ${controls(run.owner) ? nothing : command(`trainer resume ${run.run}`, context)}
     </section>`;
   }
@@ -213,8 +208,10 @@ export function run(context, name) {
 
   /** Why a stage was computed, beside the run before. @param {Stage} stage */
   function because(stage) {
-    const words = plain(whyInWords(why.get(stage.name), stage));
-    return words === "" || !earlier ? nothing : html`<span class="because" dir="auto">${words}</span>`;
+    const known = byStage.get(stage.name);
+    const words = plain(known?.why?.text ?? "");
+    // In the first run of a pipeline all is new.
+    return words === "" || !(settings?.previous || known?.from) ? nothing : html`<span class="because" dir="auto">${words}</span>`;
   }
 
   function curvesOf() {
@@ -258,18 +255,18 @@ export function run(context, name) {
   /** Settings as a difference to the run before. @param {Run} run */
   function settingsSection(run) {
     if (!settings) return nothing;
-    const rows = settings.stages.flatMap((stage) => (why.get(stage.stage)?.kind === "changed" ? why.get(stage.stage)?.changes ?? [] : []).map((change) => ({ stage: stage.stage, ...change })));
-    const fresh = settings.stages.filter((stage) => why.get(stage.stage)?.kind === "new").map((stage) => stage.stage);
-    const missing = (earlier?.stages ?? []).filter((stage) => !settings?.stages.some((other) => other.stage === stage.stage)).map((stage) => stage.stage);
-    const previous = earlier;
-    return html`<section aria-labelledby="settings"><div class="row"><h2 id="settings">Settings</h2><span class="grow"></span>${previous ? html`<a class="button" href=${`/compare?run=${encodeURIComponent(run.run)}&run=${encodeURIComponent(previous.run)}`}>Compare with ${previous.run}</a>` : nothing}</div>
+    const { previous, seed, missing = [] } = settings;
+    const rows = settings.stages.flatMap((stage) => (stage.why?.changes ?? []).map((change) => ({ stage: stage.stage, ...change })));
+    const fresh = settings.stages.filter((stage) => stage.why?.kind === "new").map((stage) => stage.stage);
+    const isOtherSeed = settings.stages.some((stage) => stage.why?.kind === "seed");
+    return html`<section aria-labelledby="settings"><div class="row"><h2 id="settings">Settings</h2><span class="grow"></span>${previous ? html`<a class="button" href=${`/compare?run=${encodeURIComponent(run.run)}&run=${encodeURIComponent(previous)}`}>Compare with ${previous}</a>` : nothing}</div>
       ${!previous
         ? html`<p class="card dim">This is the first run of ${run.pipeline} here.</p>`
         : rows.length === 0 && fresh.length === 0 && missing.length === 0
-          ? html`<p class="card dim">The same settings as <a href=${address("runs", previous.run)}>${previous.run}</a>${previous.seed === settings.seed ? "" : `, with the seed ${settings.seed} instead of ${previous.seed}`}.</p>`
-          : html`${rows.length > 0 ? html`<div class="card table" tabindex="0" role="group" aria-label="Settings that differ"><table><caption>Since <a href=${address("runs", previous.run)}>${previous.run}</a></caption><thead><tr><th scope="col">Stage</th><th scope="col">Setting</th><th scope="col">Before</th><th scope="col">Now</th></tr></thead>
+          ? html`<p class="card dim">The same settings as <a href=${address("runs", previous)}>${previous}</a>${isOtherSeed ? `, with another seed: ${seed}` : ""}.</p>`
+          : html`${rows.length > 0 ? html`<div class="card table" tabindex="0" role="group" aria-label="Settings that differ"><table><caption>Since <a href=${address("runs", previous)}>${previous}</a></caption><thead><tr><th scope="col">Stage</th><th scope="col">Setting</th><th scope="col">Before</th><th scope="col">Now</th></tr></thead>
               <tbody>${rows.map((row) => html`<tr><th scope="row">${row.stage}</th><td><code>${plain(row.path)}</code></td><td class="old">${plain(inText(row.from))}</td><td class="fresh">${plain(inText(row.to))}</td></tr>`)}</tbody></table></div>` : nothing}
-            ${fresh.length > 0 ? html`<p class="dim">New since ${previous.run}: ${fresh.join(", ")}.</p>` : nothing}${missing.length > 0 ? html`<p class="dim">No more here: ${missing.join(", ")}.</p>` : nothing}`}
+            ${fresh.length > 0 ? html`<p class="dim">New since ${previous}: ${fresh.join(", ")}.</p>` : nothing}${missing.length > 0 ? html`<p class="dim">No more here: ${missing.join(", ")}.</p>` : nothing}`}
       ${settings.source ? html`<details class="values"><summary>The pipeline as it was written</summary><pre class="source" tabindex="0">${plain(settings.source)}</pre></details>` : nothing}</section>`;
   }
 
@@ -318,7 +315,7 @@ export function run(context, name) {
         <dl class="facts">${fact("Stages", `${done} of ${all}`)}${fact("Submitted", run.times?.created_ms ? html`<span title=${date(run.times.created_ms)}>${ago(run.times.created_ms, serverNow())}</span>` : "")}${fact("Took", took(run))}${fact("Work", seconds > 0 ? duration(seconds) : "")}${fact("Pipeline", run.pipeline)}${fact("Owner", run.owner?.project ? `${run.owner.name} (${run.owner.project})` : (run.owner?.name ?? ""))}${fact("Made", registered(run))}${fact("Now", isOver(run) || !reason(run) ? "" : prose(reason(run)))}</dl></div>
       ${sweeps(run)}
       <section aria-labelledby="stages"><h2 id="stages">Stages</h2>
-        ${stages.length > 1 && stages.length <= MOST && stages.some((stage) => stage.needs?.length) ? graph(run, stages, why) : nothing}
+        ${stages.length > 1 && stages.length <= MOST && stages.some((stage) => stage.needs?.length) ? graph(run, stages, byStage) : nothing}
         <div class="card table"><table class="stages"><caption class="unseen">${count(stages.length, "stage")} of ${run.run}</caption>
           <thead><tr><th scope="col">State</th><th scope="col">Stage</th><th scope="col">Work</th><th scope="col" class="num wide">Left</th><th scope="col" class="num">Time</th><th scope="col" class="num wide">Result</th></tr></thead>
           <tbody>${stages.map((stage) => row(run, stage))}</tbody></table></div></section>

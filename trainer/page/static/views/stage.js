@@ -1,16 +1,16 @@
 //! One stage: its curves, numbers and log.
 
-import { get, runPath } from "../api.js";
+import { CallError, get, runPath } from "../api.js";
 import { CAUSES, OTHERWISE, whatToDo } from "../advice.js";
 import { Chart, curves, inOrder, inWords, series } from "../chart.js";
-import { count, date, duration, grouped, number, plain, rate, short, time } from "../format.js";
+import { count, date, duration, grouped, number, plain, rate, short, size, time } from "../format.js";
 import { attemptsOf, History } from "../history.js";
 import { Log } from "../log.js";
 import { badge, bar, command, fact, firstLine, isOver, joinCommand, left, pace, prose, share } from "../parts.js";
 import { Rates } from "../rates.js";
 import { address } from "../router.js";
 import { serverNow } from "../session.js";
-import { inWords as whyInWords, reasons, settingsOf } from "../settings.js";
+import { settingsOf } from "../settings.js";
 import { Thumbnails } from "../thumbnails.js";
 import { html, nothing } from "../vendor/lit-html.js";
 
@@ -37,6 +37,7 @@ export function stage(context, name, stageName) {
   /** @type {History | null} */
   let history = null;
   let because = "";
+  let asOf = "";
 
   const find = () => run?.stages.find((stage) => stage.name === stageName);
 
@@ -51,21 +52,27 @@ export function stage(context, name, stageName) {
       finalSeen = !live;
     }
     if (live) finalSeen = false;
-    if (it && !history) await explain(run, it, signal);
+    if (it && asOf !== `${it.key} ${it.state}`) await explain(it, signal);
     else if (live && beats % CURVES_EVERY === 0) await history?.load(signal);
     if (it && (live || beats === 0 || !isOver(run))) await log.load(signal);
     if (it?.key && beats % CURVES_EVERY === 0 && (live || beats === 0)) await thumbnails.load(signal);
+    void thumbnails.appear().catch((error) => {
+      // A server that is away is said by the next beat.
+      if (!(error instanceof CallError)) throw error;
+    });
     beats += 1;
   }
 
-  /** Fetches why it was computed, and what happened to it: in an earlier run if the result is from there. @param {Run} run @param {Stage} it @param {AbortSignal} signal */
-  async function explain(run, it, signal) {
+  /** Fetches why it was computed, and what happened to it: in an earlier run if the result is from there. @param {Stage} it @param {AbortSignal} signal */
+  async function explain(it, signal) {
     const settings = await settingsOf(name, signal);
-    const earlier = settings.previous ? await settingsOf(settings.previous, signal) : null;
-    const why = reasons(run, settings, earlier).get(stageName);
-    because = earlier || why?.from ? plain(whyInWords(why, it)) : "";
-    history = new History({ run: why?.from ?? name });
+    const known = settings.stages.find((stage) => stage.stage === stageName);
+    // In the first run of a pipeline all is new.
+    because = settings.previous || known?.from ? plain(known?.why?.text ?? "") : "";
+    const source = known?.from ?? name;
+    if (history?.asked.run !== source) history = new History({ run: source });
     await history.load(signal);
+    asOf = `${it.key} ${it.state}`;
   }
 
   /** @param {string} key @param {Curve} curve */
@@ -138,6 +145,7 @@ export function stage(context, name, stageName) {
           ${fact("Left", it.state === "running" ? left(it, perSecond) : "")}
           ${fact("Speed", it.state === "ran" && it.wall_s > 0 && it.progress.total > 1 ? rate(it.progress.total / it.wall_s, it.progress.unit) : "")}
           ${fact("Time", it.wall_s > 0 ? duration(it.wall_s) : "")}
+          ${fact("Memory", it.peak_memory ? html`<span title="The most that one worker's process had at once">${size(it.peak_memory)}</span>` : "")}
           ${fact("Why", because)}
           ${fact("Attempt", it.attempt > 0 ? String(it.attempt) : "")}
           ${fact("Workers", it.workers.join(", "))}

@@ -246,6 +246,7 @@ mod tests {
             metrics: BTreeMap::from([("grad_norm".to_owned(), 0.5), ("loss".to_owned(), 0.25)]),
             progress: Done { done, total: 100, unit: "steps".into(), metrics: BTreeMap::new() },
             wall_s: 12.0,
+            peak_memory: None,
             attempt: protocol::Attempt(1),
             workers: vec!["w1".into(), "w2".into()],
             instruction_set: None,

@@ -1,13 +1,18 @@
 //! Random requests with each kind of valid token. None changes another owner's data or reveals its text.
 //!
-//! Sends 10,000 requests per token (20 s), or `STRIDE_FUZZ_REQUESTS`; `STRIDE_FUZZ_SEED` varies them. Some requests
+//! Sends 10,000 requests per token (20 s), or `STRIDE_FUZZ_REQUESTS`, and a tenth of them over HTTP/2; `STRIDE_FUZZ_SEED` varies them. Some requests
 //! guess the name of a run, which the answer may repeat. Only answers to requests without the text are therefore
 //! searched for it.
 
 use coordinator::shell::routes;
 use serde_json::{Value, json};
 
+use crate::front::Protocol;
+
 use super::lab::{CANARY, KINDS, Kind, Lab, Project, TestResult, pipeline, submission};
+
+/// Over HTTP/2, one request for so many over HTTP/1.1: the routes behind both are the same.
+const OVER_HTTP2: u64 = 10;
 
 /// Source: the SplitMix64 algorithm.
 struct Random(u64);
@@ -119,8 +124,17 @@ fn others(kind: &Kind) -> Vec<Project> {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn no_request_changes_or_shows_what_is_anothers() -> TestResult {
-    let lab = Lab::new().await?;
-    let (requests, seed) = (number("STRIDE_FUZZ_REQUESTS", 10_000), number("STRIDE_FUZZ_SEED", 1));
+    try_requests(Protocol::Http1, number("STRIDE_FUZZ_REQUESTS", 10_000)).await
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn no_request_over_http2_changes_or_shows_what_is_anothers() -> TestResult {
+    try_requests(Protocol::Http2, number("STRIDE_FUZZ_REQUESTS", 10_000) / OVER_HTTP2).await
+}
+
+async fn try_requests(protocol: Protocol, requests: u64) -> TestResult {
+    let lab = Lab::over(protocol).await?;
+    let seed = number("STRIDE_FUZZ_SEED", 1);
     // Other tests vary the bodies of worker calls. Here a worker's token tries all calls, and only it may use these.
     let routes = routes();
     let (mut answers, mut searched, begun) = (0, 0, std::time::Instant::now());

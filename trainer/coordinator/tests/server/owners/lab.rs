@@ -12,7 +12,9 @@ use registry::{Holder, Store, Write};
 use reqwest::{Method, StatusCode};
 use serde_json::{Value, json};
 
+use crate::front::{self, Protocol};
 use crate::shell::{SECRET, offer};
+use crate::tls::{Files, authority};
 use crate::workers::bystanders::PATIENCE;
 
 pub(crate) type TestResult<T = ()> = Result<T, Box<dyn std::error::Error + Send + Sync>>;
@@ -134,11 +136,20 @@ pub(crate) fn pipeline(project: Project) -> String {
 
 impl Lab {
     pub(crate) async fn new() -> TestResult<Self> {
-        Self::waiting(50).await
+        Self::over(Protocol::Http1).await
+    }
+
+    /// Like [`Lab::new`], with calls over `protocol`.
+    pub(crate) async fn over(protocol: Protocol) -> TestResult<Self> {
+        Self::start(50, protocol).await
     }
 
     /// Like [`Lab::new`], with polls that wait `poll_ms` for work.
     pub(crate) async fn waiting(poll_ms: u64) -> TestResult<Self> {
+        Self::start(poll_ms, Protocol::Http1).await
+    }
+
+    async fn start(poll_ms: u64, protocol: Protocol) -> TestResult<Self> {
         let dir = tempfile::tempdir()?;
         let store = Store::open(dir.path(), Holder::this_process("a test")).await?;
         let mut config = Config { alone: false, park: false, ..Config::embedded() };
@@ -149,10 +160,16 @@ impl Lab {
         // another run of equal inputs, which even a paused run shows as running.
         config.policy.lease_ms = 3_600_000;
         config.policy.grace_ms = 3_600_000;
+        let files = (protocol == Protocol::Http2).then(|| authority(dir.path(), "ours"));
+        config.tls = files.as_ref().map(Files::server);
         let handle = Coordinator::start(store.clone(), config).await?;
+        let url = match &files {
+            Some(files) => front::open(handle.address(), &files.ca).await,
+            None => handle.url(),
+        };
         let client = |kind: &Kind| -> TestResult<(String, Server)> {
             let token = secret(kind.name).parse()?;
-            Ok((kind.name.to_owned(), Server::new(&handle.url(), Some(token), None)?))
+            Ok((kind.name.to_owned(), Server::new(&url, Some(token), None)?))
         };
         let clients = KINDS.iter().map(client).collect::<TestResult<_>>()?;
         let (runs, artifacts) = (BTreeMap::new(), BTreeMap::new());

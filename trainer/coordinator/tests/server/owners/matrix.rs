@@ -6,6 +6,8 @@ use coordinator::shell::routes;
 use reqwest::StatusCode;
 use serde_json::{Value, json};
 
+use crate::front::Protocol;
+
 use super::lab::{CANARY, KINDS, Kind, Lab, Project, TestResult, promote, rollback};
 
 /// The expected result of a call.
@@ -181,7 +183,16 @@ fn came_of(status: StatusCode, answer: &Value) -> Expected {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn every_call_shows_and_changes_what_is_its_callers_own() -> TestResult {
-    let lab = Lab::new().await?;
+    every_call(Protocol::Http1).await
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn every_call_over_http2_shows_and_changes_what_is_its_callers_own() -> TestResult {
+    every_call(Protocol::Http2).await
+}
+
+async fn every_call(protocol: Protocol) -> TestResult {
+    let lab = Lab::over(protocol).await?;
     let mut tried = [0; 4];
     for kind in &KINDS {
         for route in routes() {

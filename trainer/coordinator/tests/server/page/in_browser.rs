@@ -81,7 +81,7 @@ pub(super) async fn fill(handle: &Handle, store: &Store) -> TestResult<[RunId; 2
     call(&server, &secret, Method::POST, "/v1/metrics", &MetricBatch { grant: grant.clone(), rows }).await?;
     let outcome =
         TaskOutcome::Failed { class: FailureClass::Input, message: format!("the data says {HOSTILE}\nand {HOSTILE}") };
-    call(&server, &secret, Method::POST, "/v1/outcomes", &ReportOutcome { grant, outcome }).await?;
+    call(&server, &secret, Method::POST, "/v1/outcomes", &ReportOutcome::new(grant, outcome)).await?;
     let gone = json!({"incarnation": joined.incarnation});
     call(&server, SECRET, Method::POST, "/v1/workers/a/gone", &gone).await?;
 

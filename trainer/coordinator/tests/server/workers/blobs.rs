@@ -8,7 +8,7 @@ use protocol::proof::{BlobStored, GRANT_HEADER, PROCESS_HEADER, Process, RECEIPT
 use protocol::{ArtifactKind, Digest, FileEntry, Incarnation, Manifest};
 use reqwest::Method;
 
-use super::bystanders::{Site, Worker, answer, code, open, post, token};
+use super::bystanders::{Site, Worker, answer, code, post, token};
 
 const CLIPS: &[u8] = b"clips of another run: a canary";
 
@@ -84,7 +84,7 @@ async fn a_manifest_names_no_blob_of_another_run() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_manifest_may_name_blobs_of_inputs_and_digests_of_other_things() {
     let dir = tempfile::tempdir().unwrap();
-    let site = Site { handle: open(dir.path(), 60_000).await, dir: None };
+    let site = Site::of(dir.path(), 60_000).await;
     site.submit(1).await;
     let worker = Worker::join(&site, "nodes", "nodes-1").await;
     let data = worker.given("dataset").await;
@@ -109,7 +109,7 @@ async fn a_manifest_may_name_blobs_of_inputs_and_digests_of_other_things() {
 
     // Receipts stay valid after a restart of the server.
     site.handle.shutdown().await;
-    let site = Site { handle: open(dir.path(), 60_000).await, dir: None };
+    let site = Site::of(dir.path(), 60_000).await;
     let worker = Worker { server: site.server("nodes"), ..worker };
     let vouched = Vouched { what: commit, receipts };
     let committed = post(&worker.server, &vae.secret, "/v1/checkpoints", &vouched).await;

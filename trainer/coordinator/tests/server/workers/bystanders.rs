@@ -5,6 +5,7 @@ use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
+use access::tls::ServerTls;
 use access::{Server, Tokens};
 use coordinator::{Config, Coordinator, Handle, Policy};
 use protocol::message::{
@@ -18,6 +19,9 @@ use registry::{Holder, Store};
 use reqwest::{Method, RequestBuilder};
 use serde::Serialize;
 use serde_json::Value;
+
+use crate::front::{self, Protocol};
+use crate::tls::{Files, authority};
 
 /// Long enough for a slow machine, short enough to wait for.
 pub(crate) const LEASE_MS: u64 = 1500;
@@ -41,19 +45,37 @@ pub(crate) fn token(name: &str) -> String {
 
 pub(crate) struct Site {
     pub(crate) handle: Handle,
+    /// The address of calls.
+    url: String,
     #[expect(dead_code, reason = "held so that the folder stays")]
-    pub(crate) dir: Option<tempfile::TempDir>,
+    dir: Option<tempfile::TempDir>,
 }
 
 impl Site {
     pub(crate) async fn start(lease_ms: u64) -> Self {
+        Self::over(Protocol::Http1, lease_ms).await
+    }
+
+    /// Like [`Site::start`], on the store in `dir`.
+    pub(crate) async fn of(dir: &Path, lease_ms: u64) -> Self {
+        let handle = open(dir, lease_ms, None).await;
+        Self { url: handle.url(), handle, dir: None }
+    }
+
+    /// Like [`Site::start`], with calls over `protocol`.
+    pub(crate) async fn over(protocol: Protocol, lease_ms: u64) -> Self {
         let dir = tempfile::tempdir().unwrap();
-        let handle = open(dir.path(), lease_ms).await;
-        Self { handle, dir: Some(dir) }
+        let files = (protocol == Protocol::Http2).then(|| authority(dir.path(), "ours"));
+        let handle = open(dir.path(), lease_ms, files.as_ref().map(Files::server)).await;
+        let url = match &files {
+            Some(files) => front::open(handle.address(), &files.ca).await,
+            None => handle.url(),
+        };
+        Self { handle, url, dir: Some(dir) }
     }
 
     pub(crate) fn server(&self, token_of: &str) -> Server {
-        Server::new(&self.handle.url(), Some(token(token_of).parse().unwrap()), None).unwrap()
+        Server::new(&self.url, Some(token(token_of).parse().unwrap()), None).unwrap()
     }
 
     /// Submits a pipeline with a dataset and a VAE. The seed makes its values new to the store.
@@ -76,7 +98,7 @@ impl Site {
     }
 }
 
-pub(crate) async fn open(dir: &Path, lease_ms: u64) -> Handle {
+async fn open(dir: &Path, lease_ms: u64, tls: Option<ServerTls>) -> Handle {
     let store = Store::open(dir, Holder::this_process("a test")).await.unwrap();
     let path = dir.join("tokens");
     let lines: Vec<String> =
@@ -85,7 +107,8 @@ pub(crate) async fn open(dir: &Path, lease_ms: u64) -> Handle {
     std::fs::set_permissions(&path, std::fs::Permissions::from_mode(0o600)).unwrap();
     let policy = Policy { poll_ms: 50, tick_ms: 50, lease_ms, ..Policy::default() };
     let tokens = Tokens::read(&path).unwrap();
-    Coordinator::start(store, Config { policy, tokens, alone: false, park: false, ..Config::embedded() }).await.unwrap()
+    let config = Config { policy, tokens, tls, alone: false, park: false, ..Config::embedded() };
+    Coordinator::start(store, config).await.unwrap()
 }
 
 /// A worker process that does not compute.
@@ -207,7 +230,7 @@ impl Worker {
         receipts: BTreeMap<Digest, String>,
     ) -> (u16, Value) {
         let outcome = TaskOutcome::Finished { output, metrics: BTreeMap::new() };
-        let report = ReportOutcome { grant: assignment.grant.clone(), outcome };
+        let report = ReportOutcome::new(assignment.grant.clone(), outcome);
         post(&self.server, &assignment.secret, "/v1/outcomes", &Vouched { what: report, receipts }).await
     }
 

@@ -11,6 +11,8 @@ use protocol::{ArtifactKind, Attempt, Digest, Fence, Incarnation, RunId};
 use reqwest::{Method, RequestBuilder};
 use serde_json::Value;
 
+use crate::front::Protocol;
+
 use super::bystanders::{Site, Worker, answer, join_of};
 
 const CALLS: u64 = 4000;
@@ -106,7 +108,7 @@ impl Known {
             }
             6 => {
                 let outcome = self.outcome(random);
-                let report = ReportOutcome { grant, outcome };
+                let report = ReportOutcome::new(grant, outcome);
                 post("/v1/outcomes").json(&Vouched { what: report, receipts: self.receipts.clone() })
             }
             7 => {
@@ -138,7 +140,16 @@ async fn all_of(site: &Site, run: &RunId) -> Value {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn random_calls_of_workers_change_nothing_of_anothers_task() {
-    let site = Site::start(600_000).await;
+    try_calls(Protocol::Http1).await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn random_calls_of_workers_over_http2_change_nothing_of_anothers_task() {
+    try_calls(Protocol::Http2).await;
+}
+
+async fn try_calls(protocol: Protocol) {
+    let site = Site::over(protocol, 600_000).await;
     let run = site.submit(1).await;
     let victim = Worker::join(&site, "nodes", "nodes-1").await;
     let data = victim.given("dataset").await;

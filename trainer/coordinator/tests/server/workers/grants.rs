@@ -38,7 +38,7 @@ async fn no_worker_writes_in_anothers_name_and_no_refusal_helps_it() {
             let failed = TaskOutcome::Failed { class: FailureClass::Input, message: "forged".into() };
             for secret in [&own.secret, &thief.secret, &"0".repeat(64), &String::new()] {
                 for outcome in [finished.clone(), TaskOutcome::Yielded { at: 1 }, failed.clone()] {
-                    let report = ReportOutcome { grant: grant.clone(), outcome };
+                    let report = ReportOutcome::new(grant.clone(), outcome);
                     let report = protocol::proof::Vouched { what: report, receipts: receipts.clone() };
                     said.insert(post(&thief.server, secret, "/v1/outcomes", &report).await.1.to_string());
                 }
@@ -78,7 +78,7 @@ async fn a_refusal_does_not_tell_whether_there_is_such_a_task() {
     let stale = Grant { attempt: Attempt(0), fence: Fence(0), ..held.grant.clone() };
     let mut said = BTreeSet::new();
     for grant in [held.grant, none, stale] {
-        let report = ReportOutcome { grant, outcome: TaskOutcome::Yielded { at: 0 } };
+        let report = ReportOutcome::new(grant, TaskOutcome::Yielded { at: 0 });
         said.insert(format!("{:?}", post(&thief.server, &thief.secret, "/v1/outcomes", &report).await));
     }
     assert_eq!(said.len(), 1, "{said:?}");

@@ -13,6 +13,8 @@ use protocol::message::{
 use protocol::proof::{GRANT_HEADER, PROCESS_HEADER, SECRET_HEADER};
 use reqwest::{Method, RequestBuilder};
 
+use crate::front::Protocol;
+
 use super::bystanders::{Site, TOKENS, Worker, answer, join_of};
 
 /// A task with its current or former holder.
@@ -60,7 +62,7 @@ fn request(server: &Server, method: &str, path: &str, object: &Object, actor: &A
             ask(Method::POST).header(SECRET_HEADER, own).json(&commit)
         }
         ("POST", "/v1/outcomes") => {
-            let report = ReportOutcome { grant, outcome: TaskOutcome::Finished { output: manifest, metrics } };
+            let report = ReportOutcome::new(grant, TaskOutcome::Finished { output: manifest, metrics });
             ask(Method::POST).header(SECRET_HEADER, own).json(&report)
         }
         ("PUT", _) => {
@@ -81,7 +83,16 @@ fn request(server: &Server, method: &str, path: &str, object: &Object, actor: &A
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn every_call_of_workers_is_open_to_the_tasks_own_process_alone() {
-    let site = Site::start(600_000).await;
+    every_call(Protocol::Http1).await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn every_call_of_workers_over_http2_is_open_to_the_tasks_own_process_alone() {
+    every_call(Protocol::Http2).await;
+}
+
+async fn every_call(protocol: Protocol) {
+    let site = Site::over(protocol, 600_000).await;
     let run = site.submit(1).await;
     let worker = Worker::join(&site, "nodes", "nodes-1").await;
     let data = worker.given("dataset").await;
