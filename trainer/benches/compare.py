@@ -101,7 +101,8 @@ def trained(size: Size, base: Path, training: Training, workers: int, seconds: f
             settings = [*training.settings, f"stages.vae.steps={steps}", "stages.vae.warmup=5"]
         else:
             shutil.copytree(base, store)
-            settings = [*size.short, f"stages.{training.stage}.steps={steps}"]
+            key = f"stages.{training.stage}.steps="
+            settings = [*(setting for setting in size.short if not setting.startswith(key)), f"{key}{steps}"]
         stage = stride(size, store, workers, training.stage, settings)
     if stage["state"] != "ran":
         sys.exit(f"{training.name}: the stage is {stage['state']}; expected it to run")
