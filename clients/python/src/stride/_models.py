@@ -123,6 +123,21 @@ class Promotion(Answer):
     """Version after the move."""
 
 
+class RunSettings(Answer):
+    """The answer to `GET /v1/runs/{run}/settings`."""
+
+    missing: list[str] | None = None
+    """Stages of the previous run that this one does not have."""
+    previous: str | None = None
+    """The newest earlier run of a pipeline with the same name."""
+    run: str
+    seed: int
+    source: str
+    """The pipeline's file as the user wrote it."""
+    stages: list[SettingsOfStage]
+    """Stages of the pipeline in topological order, without a sweep's trials."""
+
+
 class RunSummary(Answer):
     """A run in a list: `GET /v1/runs`."""
 
@@ -174,6 +189,45 @@ class RunView(Answer):
     times: Times | None = None
 
 
+class SettingChange(Answer):
+    """A setting that differs."""
+
+    from_: Any = Field(alias="from")
+    """The value in the previous run; `null` if it has none."""
+    path: str
+    """Path in the stage's settings, such as `network.width`."""
+    to: Any
+    """The value now; `null` if there is none."""
+
+
+class SettingsOfStage(Answer):
+    """Settings of one stage."""
+
+    code: int
+    """Code version of the kind."""
+    from_: str | None = Field(default=None, alias="from")
+    """Earlier run that computed the result, unless the caller may not see it."""
+    key: str | None = None
+    """Key of the stage, once its inputs are known."""
+    settings: Any
+    """Kind and settings, with all defaults."""
+    stage: str
+    why: StageReason | None = None
+    """Why it was computed, beside the previous run."""
+
+
+class StageReason(Answer):
+    """The reason why a stage was computed."""
+
+    changes: list[SettingChange] | None = None
+    """Settings that differ from those of the previous run."""
+    inputs: list[str] | None = None
+    """Stages that it reads and that differ from those of the previous run."""
+    kind: Literal['new', 'changed', 'code', 'seed', 'input', 'same', 'unknown']
+    text: str
+    """The reason in a few words, such as `lr 2e-4 -> 1e-4`; empty if there is none yet."""
+
+
 class StageView(Answer):
     """A stage as clients see it."""
 
@@ -196,6 +250,8 @@ class StageView(Answer):
     """Swept stage that it belongs to, if a sweep made it."""
     outputs: dict[str, str]
     """Outputs by name."""
+    peak_memory: int | None = None
+    """Peak resident memory of one of its workers' processes during its newest attempt, in bytes; not part of any key."""
     progress: Progress
     state: Literal['waiting', 'ready', 'running', 'ran', 'cached', 'resumed', 'failed', 'skipped']
     times: Times | None = None

@@ -51,12 +51,14 @@ pub enum ReasonKind {
     Unknown,
 }
 
-/// A setting that differs; a missing value is `null`.
+/// A setting that differs.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct SettingChange {
     /// Path in the stage's settings, such as `network.width`.
     pub path: String,
+    /// The value in the previous run; `null` if it has none.
     pub from: Value,
+    /// The value now; `null` if there is none.
     pub to: Value,
 }
 

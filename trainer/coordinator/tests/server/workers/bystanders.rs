@@ -66,7 +66,9 @@ impl Site {
     pub(crate) async fn over(protocol: Protocol, lease_ms: u64) -> Self {
         let dir = tempfile::tempdir().unwrap();
         let files = (protocol == Protocol::Http2).then(|| authority(dir.path(), "ours"));
-        let handle = open(dir.path(), lease_ms, files.as_ref().map(Files::server)).await;
+        // A store's folder holds nothing else at first.
+        let store = dir.path().join("store");
+        let handle = open(&store, lease_ms, files.as_ref().map(Files::server)).await;
         let url = match &files {
             Some(files) => front::open(handle.address(), &files.ca).await,
             None => handle.url(),
