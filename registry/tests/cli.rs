@@ -115,7 +115,7 @@ async fn a_promotion_from_the_first_gate_to_the_rollback() {
 async fn what_is_wrong_has_a_code_and_a_hint() {
     let dir = tempfile::tempdir().unwrap();
     let missing = registry(&dir.path().join("nothing"), &["list"]);
-    assert_eq!(code(&missing), 7);
+    assert_eq!(code(&missing), 2, "as `trainer`");
     assert!(stderr(&missing).contains("there is no store") && stderr(&missing).contains("\n\nhint: "));
     assert!(!dir.path().join("nothing").exists());
 

@@ -123,7 +123,7 @@ fn the_recipe_trains_on_what_was_fetched() {
     let states = states(&report);
     assert!(states.values().all(|state| state == "ran"), "{states:?}");
     let shown = bench.run(&["registry", "show", "bandai@staging"]).expect_code(0).stdout;
-    assert!(shown.contains("fid_val ") && shown.contains("fid_test ") && shown.contains(" 1 step(s)"), "{shown}");
+    assert!(shown.contains("fid_val ") && shown.contains("fid_test ") && shown.contains(" 1 step,"), "{shown}");
 
     // Words that its captions lack are named, with captions that it knows.
     let generate = ["generate", "quantum flapdoodle", "--model", "bandai@staging", "-o", "u.npy", "-o", "json"];

@@ -17,7 +17,7 @@ fn a_demo_draws_from_an_empty_folder() {
     assert!(size <= LARGEST, "the models have {size} bytes");
     let bench = Bench::new(TRAINER);
     let said = bench.run(&["demo"]).expect_code(0);
-    for part in ["stride-demo/demo.html", "stride-demo/demo.png", "trainer demo --train"] {
+    for part in ["stride-demo/demo.html", "stride-demo/demo.png", "stride-demo/demo.gif", "trainer demo --train"] {
         assert!(said.stdout.contains(part), "{}", said.stdout);
     }
     let page = fs::read_to_string(bench.path().join("stride-demo/demo.html")).expect("the page");
@@ -26,6 +26,9 @@ fn a_demo_draws_from_an_empty_folder() {
     }
     let sheet = fs::read(bench.path().join("stride-demo/demo.png")).expect("the sheet");
     assert!(sheet.starts_with(b"\x89PNG") && sheet.len() > 20_000, "{} bytes", sheet.len());
+
+    let film = fs::read(bench.path().join("stride-demo/demo.gif")).expect("the moving picture");
+    assert!(film.starts_with(b"GIF89a") && (50_000..600_000).contains(&film.len()), "{} bytes", film.len());
 
     // A second call adds no second version, and its sentences are drawn.
     let said = bench.run(&["demo", "a person claps", "-o", "json"]).expect_code(0).json();

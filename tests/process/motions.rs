@@ -87,7 +87,7 @@ pub(crate) fn are_written(bench: &Bench) {
     let gallery = ["gallery", "--prompt", "a person walks", "-n", "2", "-o", "g.html", "--report", "json"];
     let said = bench.run(&gallery).expect_code(0).json();
     let models = said["models"].as_array().expect("models").len();
-    assert!(models >= 3, "teacher and students: {said}");
+    assert_eq!(models, 3, "a teacher and two students, of which one is registered: {said}");
     let page = fs::read_to_string(at("g.html")).expect("the page");
     assert_eq!(page.matches("<figure>").count(), 2 * models + 1, "two seeds of each model and a real clip");
     assert!(page.contains("real clip"), "the nearest clip of the training data is beside them");

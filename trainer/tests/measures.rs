@@ -195,7 +195,7 @@ fn models_are_drawn_as_they_were_measured(bench: &Bench) {
     generate(&["--model", "smoke@staging", "--guidance", "2"]);
     assert_ne!(drawn, features(), "what the papers' rule would give");
     let shown = bench.run(&["registry", "show", "smoke@staging"]).expect_code(0).stdout;
-    for part in ["latent-diffusion, humanml3d", "1 step(s), guidance 2.5", "denoiser=", "text=", "vae="] {
+    for part in ["latent-diffusion, humanml3d", "1 step, guidance 2.5", "denoiser=", "text=", "vae="] {
         assert!(shown.contains(part), "`{part}` is missing in\n{shown}");
     }
 
@@ -218,7 +218,7 @@ fn models_are_drawn_as_they_were_measured(bench: &Bench) {
     // Evaluations that differ, and the one that `register` names.
     let other = ["--set", "stages.t2m_pcm.sampler.guidance=3"];
     let refused = bench.run(&[&["run", &config], &other[..]].concat()).expect_code(2).stderr;
-    assert!(refused.contains("guidance 2.5 in `fid_pcm`; 1 step(s), guidance 3 in `t2m_pcm`"), "{refused}");
+    assert!(refused.contains("guidance 2.5 in `fid_pcm`; 1 step, guidance 3 in `t2m_pcm`"), "{refused}");
     let length = "stages.length={kind: train.length, steps: 4, batch: {global: 8, slices: 2}}";
     let named = "stages.release.sampler={steps: 1, guidance: 3}";
     let sets = ["--set", length, "--set", "stages.release.length=length", "--set", named];

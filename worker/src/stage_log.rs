@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
 use protocol::message::{Assignment, Progress, Role, TaskOutcome};
-use protocol::units::{grouped, size};
+use protocol::units::{counted, grouped, size};
 use protocol::{Digest, Manifest};
 
 /// Time between two lines on the progress of a stage.
@@ -105,10 +105,6 @@ impl Pace {
         let values = values(metrics);
         Some(format!("{} of {} {unit}, {rate:.3} a second{values}", grouped(*done), grouped(*total)))
     }
-}
-
-fn counted(count: u64, noun: &str) -> String {
-    format!("{} {noun}{}", grouped(count), if count == 1 { "" } else { "s" })
 }
 
 fn values(metrics: &BTreeMap<String, f64>) -> String {

@@ -187,11 +187,7 @@ impl From<WriteError> for Answer {
 
 impl From<&OpenError> for Answer {
     fn from(e: &OpenError) -> Self {
-        let code = match e {
-            OpenError::NotAStore(_) => "not-found",
-            _ => "store",
-        };
-        Self::refused(error(code, e, Some(&e.hint())))
+        Self::refused(error("store", e, Some(&e.hint())))
     }
 }
 

@@ -99,7 +99,7 @@ pub fn render(data: &Data) -> String {
         Data::Imported { version, file } => {
             let (model, number) = (&version.model, version.version);
             format!(
-                "`{file}` is {model}:{number}; `trainer generate \"a person walks\" --model {model}@{number}` uses it\n"
+                "`{file}` is {model}:{number}; `trainer generate \"a person walks\" --model {model}:{number}` uses it\n"
             )
         }
     }

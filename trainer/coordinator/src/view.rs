@@ -280,8 +280,8 @@ impl State {
         peak
     }
 
-    /// The progress of an execution. A single task has its newest report, or else its newest checkpoint. Several tasks
-    /// have the number of completed shards.
+    /// The progress of an execution. A single task has its newest report, or without a worker its newest checkpoint.
+    /// Several tasks have the number of completed shards.
     pub fn progress(&self, execution: &StageExecution) -> Progress {
         let of = |task: &Task| self.heard.progress.get(&task.id).map(|progress| Progress::clone(progress));
         let shards = execution.tasks.iter().filter(|task| matches!(task.part, Part::Shard { .. })).count();
@@ -289,7 +289,16 @@ impl State {
             execution.tasks.iter().filter(|task| matches!(task.part, Part::Shard { .. }) && task.output().is_some());
         match (execution.tasks.len(), execution.tasks.first()) {
             (_, None) => Progress::default(),
-            (1, Some(task)) => of(task).unwrap_or_else(|| saved(task, execution)),
+            (1, Some(task)) => {
+                let saved = saved(task, execution);
+                let idle = execution.state == ExecutionState::Open && !execution.is_busy();
+                match of(task) {
+                    // Work continues at its checkpoint, which can be before or after the last report.
+                    Some(heard) if idle && saved.total > 0 => Progress { metrics: heard.metrics, ..saved },
+                    Some(heard) => heard,
+                    None => saved,
+                }
+            }
             _ => Progress {
                 done: done.count() as u64,
                 total: shards as u64,

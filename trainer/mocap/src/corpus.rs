@@ -16,6 +16,7 @@ use motion::text::Caption;
 use motion::{DataPath, Dataset, Skeleton};
 use protocol::Seed;
 use protocol::stage::DataFormat;
+use protocol::units::counted;
 use serde::{Deserialize, Serialize};
 
 use crate::arrays;
@@ -287,10 +288,10 @@ pub struct Report {
 impl fmt::Display for Report {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         for (said, (files, one)) in &self.read {
-            writeln!(f, "{files} file(s) such as {one}: {said}")?;
+            writeln!(f, "{} such as {one}: {said}", counted(*files, "file"))?;
         }
         for (split, (sources, clips)) in &self.splits {
-            writeln!(f, "{split}: {clips} clips of {sources} recordings")?;
+            writeln!(f, "{split}: {} of {}", counted(*clips, "clip"), counted(*sources, "recording"))?;
         }
         for note in &self.notes {
             writeln!(f, "note: {note}")?;
@@ -328,7 +329,7 @@ impl Report {
         let most = self.axes.iter().max_by_key(|(_, (files, _))| *files).map(|(axis, _)| axis.clone());
         let Some(most) = most else { return };
         for (axis, (files, one)) in self.axes.iter().filter(|(axis, _)| **axis != most) {
-            let few = format!("{files} file(s) such as {one} were read with {axis} up, most with {most}");
+            let few = format!("{} such as {one} read with {axis} up, most with {most}", counted(*files, "file"));
             self.notes.push(format!("{few}; set `up` if that is wrong"));
         }
     }

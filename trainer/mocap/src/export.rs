@@ -1,11 +1,11 @@
 //! Writes motions to files, in the form of the file's extension, and reads motions from arrays.
 //!
-//! `.html` and `.png` hold several motions, all others one. `.bvh` (centimetres) and `.glb` (metres) have constant bone
+//! `.html` and `.png` hold several motions, all others one; [`gif_of_all`] draws several beside each other. `.bvh` (centimetres) and `.glb` (metres) have constant bone
 //! lengths. If a figure's bones change, its joints are placed by directions and mean lengths; [`Written`] reports the
 //! error. `.npy` has features if there are some, else positions. `.mp4` needs an `ffmpeg` on the machine.
 
 use std::fs::{self, File};
-use std::io::{self, BufWriter};
+use std::io::{self, BufWriter, Write as _};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -379,6 +379,25 @@ pub fn write_all(title: &str, sections: &[(String, Vec<&Motion>)], path: &Path) 
         }
     }
     Ok(Written { path: path.into(), off_metres: None })
+}
+
+/// Writes all motions beside each other in one animated GIF, with their captions and notes.
+///
+/// # Errors
+/// If there is no motion, or the file cannot be written.
+pub fn gif_of_all(motions: &[Motion], path: &Path) -> Result<(), ExportError> {
+    let io = |source| ExportError::Io { file: path.into(), source };
+    let Some(first) = motions.first() else {
+        return Err(ExportError::Count { file: path.into(), count: 0, expected: "at least one" });
+    };
+    let row = |motion: &Motion| draw::Row {
+        title: motion.caption.clone(),
+        note: motion.note.clone(),
+        joints: motion.joints.clone(),
+    };
+    let rows: Vec<draw::Row> = motions.iter().map(row).collect();
+    let mut file = BufWriter::new(File::create(path).map_err(io)?);
+    draw::gif_of_all_to(&rows, first.skeleton, &mut file).and_then(|()| file.flush()).map_err(io)
 }
 
 /// Output files for a known number of motions: one per motion, or one for all, depending on their forms.

@@ -13,6 +13,7 @@ use std::path::{Path, PathBuf};
 use motion::DataPath;
 use motion::dataset::{Split, is_clip_id};
 use motion::text::Caption;
+use protocol::units::counted;
 use protocol::{excerpt, excerpts, limits};
 
 use crate::captions;
@@ -56,7 +57,12 @@ pub struct ListError {
 
 impl fmt::Display for ListError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{}: {} problem(s) in the folder of recordings", self.folder.display(), self.problems.len())?;
+        write!(
+            f,
+            "{}: {} in the folder of recordings",
+            self.folder.display(),
+            counted(self.problems.len(), "problem")
+        )?;
         for problem in self.problems.iter().take(SHOWN) {
             write!(f, "\n  {problem}")?;
         }

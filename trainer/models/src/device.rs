@@ -13,7 +13,7 @@ pub enum DeviceError {
     #[error("this program has no backend `{}`; build it with `--features {}`", .0.name(), .0.name())]
     NotBuilt(Backend),
     /// The machine has fewer devices.
-    #[error("backend `{}` has {found} device(s), but device {index} was requested; see `trainer devices`", .backend.name())]
+    #[error("device {index} was requested, but the number of devices of backend `{}` is {found}; see `trainer devices`", .backend.name())]
     NotFound {
         backend: Backend,
         /// The requested index.

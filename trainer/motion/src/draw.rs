@@ -5,6 +5,7 @@
 
 mod colours;
 mod font;
+mod panels;
 mod plan;
 mod raster;
 
@@ -15,6 +16,7 @@ use std::path::Path;
 
 use colours::{BODY, FAINT, GRID, INK, LEFT, PAPER, RIGHT, SHADOW, TOLD, TRAIL};
 use font::{NOTE, SMALL, TITLE};
+pub use panels::gif_of_all_to;
 use raster::{Canvas, Colour};
 
 use crate::skeleton::Skeleton;

@@ -35,7 +35,7 @@ pub enum FeatureError {
         joints: usize,
     },
     /// Velocities need a second frame.
-    #[error("has {frames} frame(s); expected at least 2, because the last frame only supplies velocities")]
+    #[error("has too few frames: {frames}; expected at least 2, because the last frame only supplies velocities")]
     TooFewFrames {
         /// Number of frames T.
         frames: usize,

@@ -7,6 +7,7 @@
 
 use std::path::{Path, PathBuf};
 
+use protocol::units::counted;
 use protocol::{excerpt, limits};
 use serde::{Deserialize, Serialize};
 
@@ -70,8 +71,8 @@ impl Caption {
             (fields.next(), fields.next(), fields.next(), fields.next())
         else {
             return Err(format!(
-                "the line has {} field(s) separated by `#`; expected 4",
-                line.trim().split('#').count()
+                "the line has {} separated by `#`; expected 4",
+                counted(line.trim().split('#').count(), "field")
             ));
         };
         if text.trim().is_empty() {
@@ -330,7 +331,7 @@ mod tests {
             assert!(error.contains(part), "{line}: {error}");
         }
         let errors = parse_file(Path::new("texts/1.txt"), "a#a/DET#0#0\n\nb#b\n").unwrap_err();
-        assert!(errors[0].to_string().starts_with("texts/1.txt:3: the line has 2 field(s)"), "{}", errors[0]);
+        assert!(errors[0].to_string().starts_with("texts/1.txt:3: the line has 2 fields"), "{}", errors[0]);
     }
 
     #[test]

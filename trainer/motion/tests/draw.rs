@@ -43,6 +43,35 @@ fn a_gif_plays_as_long_as_the_motion() {
     assert!(left > 100, "{left} pixels of the left side");
 }
 
+/// Unchanged pixels are left out, so the picture is smaller than its motions' own, and as long as the longest.
+#[test]
+fn several_motions_play_beside_each_other() {
+    let skeleton = Skeleton::of(DataFormat::Humanml3d);
+    let (title, joints) = motion();
+    let short = Row { title: title.clone(), note: "short".into(), joints: joints[..20 * 66].to_vec() };
+    let rows = [Row { title, note: "whole".into(), joints: joints.clone() }, short.clone(), short.clone(), short];
+    let mut bytes = vec![];
+    draw::gif_of_all_to(&rows, skeleton, &mut bytes).unwrap();
+    let mut decoder = gif::DecodeOptions::new();
+    decoder.set_color_output(gif::ColorOutput::RGBA);
+    let mut decoder = decoder.read_info(&bytes[..]).unwrap();
+    assert_eq!((decoder.width(), decoder.height()), (582, 364));
+    let mut frames = 0;
+    // Pixels of each panel that change after the first frame.
+    let mut changed = [0; 4];
+    while let Some(frame) = decoder.read_next_frame().unwrap() {
+        let opaque = frame.buffer.chunks(4).enumerate().filter(|(_, pixel)| pixel[3] > 0);
+        for (i, _) in opaque.filter(|_| frames > 10) {
+            let (x, y) = (i % 582, i / 582);
+            changed[x / 194 + 3 * (y / 182)] += 1;
+        }
+        frames += 1;
+    }
+    assert_eq!(frames, (joints.len() / 66).div_ceil(2));
+    assert!(changed[0] > 1000 && changed[1..] == [0; 3], "a short motion waits in its last pose: {changed:?}");
+    assert!(draw::gif_of_all_to(&[], skeleton, vec![]).is_err());
+}
+
 #[test]
 fn what_was_told_is_drawn() {
     let skeleton = Skeleton::of(DataFormat::Humanml3d);

@@ -91,12 +91,7 @@ const CASES: &[(&str, &str, &str, &[&str])] = &[
     ("teacher: mld", "model: mld", "20:52", &["a sweep evaluates its own trials", "remove it"]),
     ("teacher: mld", "teacher: mdl", "20:54", &["the stage `mdl`, which does not exist; did you mean `mld`?"]),
     ("teacher: mld", "repeats: 0", "20:54", &["`repeats` is 0"]),
-    (
-        "{steps: 1, guidance: 2}",
-        "{steps: 2, guidance: 2}",
-        "20:76",
-        &["`sampler.steps` is 2, but `pcm` has 1 phase(s)"],
-    ),
+    ("{steps: 1, guidance: 2}", "{steps: 2, guidance: 2}", "20:76", &["`sampler.steps` is 2, but `pcm` has 1 phase"]),
     (
         "        skip: {choice: [50, 100]}",
         "        phases: {choice: [1, 2]}",
@@ -246,7 +241,7 @@ fn what_evaluates_can_be_searched() {
         ("samples: {choice: [1, 2]}", "samples: {choice: [0]}", "with `evaluate.samples` at 0"),
         ("samples: {choice: [1, 2]}", "model: {choice: [mld]}", "names a stage"),
         ("samples: {choice: [1, 2]}", "kind: {choice: [x]}", "unknown key `kind`"),
-        ("guidance: {choice: [1, 2.5]}", "steps: {choice: [1, 2]}", "has 1 phase(s)"),
+        ("guidance: {choice: [1, 2.5]}", "steps: {choice: [1, 2]}", "has 1 phase"),
         ("guidance: {choice: [1, 2.5]}", "guidance: {choice: [1, high]}", "expected a number"),
         ("evaluate: {samples: {choice: [1, 2]}, sampler: {guidance: {choice: [1, 2.5]}}}", "evaluate: {}", "is empty"),
     ] {

@@ -34,6 +34,12 @@ pub fn size(bytes: u64) -> String {
     format!("{value:.1} TiB")
 }
 
+/// A count with its noun: `1 step`, `1,204 steps`.
+pub fn counted(count: impl TryInto<u64>, noun: &str) -> String {
+    let count = count.try_into().unwrap_or(u64::MAX);
+    format!("{} {noun}{}", grouped(count), if count == 1 { "" } else { "s" })
+}
+
 /// A number of optimizer updates. Written `300000`, `300k`, `1.2M` or `2000 steps`.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize)]
 #[serde(transparent)]
@@ -104,6 +110,11 @@ impl JsonSchema for Steps {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn one_is_no_plural() {
+        assert_eq!([0_usize, 1, 1204].map(|count| counted(count, "step")), ["0 steps", "1 step", "1,204 steps"]);
+    }
 
     #[test]
     fn steps_are_read_as_people_write_them() {

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use checkpoint::model::extend;
 use clap::Args;
 use coordinator::{Config, Coordinator};
-use mocap::export::{Motion, write_all};
+use mocap::export::{Motion, gif_of_all, write_all};
 use protocol::stage::Backend;
 use protocol::{Manifest, Seed};
 use registry::bundle::{FORMAT, Head};
@@ -102,23 +102,14 @@ pub(crate) async fn demo(args: DemoArgs, command: String) -> Result<u8> {
     let written = |error| Problem::usage(format!("cannot write to `{}`: {error}", args.dir.display()));
     std::fs::create_dir_all(&args.dir).map_err(written)?;
     install(&store).await?;
-    let files = draw(&args, &store).await?;
-    let seconds = start.elapsed().as_secs_f64();
-    let shown = |path: &Path| client::shown(path);
-    match args.output {
-        Output::Json => print::json(&json!({
-            "schema_version": 1,
-            "models": NAMES.map(|name| format!("{name}:1")),
-            "files": files.iter().map(|file| shown(file)).collect::<Vec<_>>(),
-            "seconds": seconds,
-        })),
-        Output::Table => print::out(&format!(
-            "{} shows the motions from all sides; open it in a browser\n{} is a sheet of them\n\
-             teacher (50 steps) above, one-step student below; drawn in {seconds:.1} s",
-            shown(&files[0]),
-            shown(&files[1])
-        )),
+    let files = ["demo.html", "demo.png", "demo.gif"].map(|name| args.dir.join(name));
+    // A training that continues leaves its pictures as they are.
+    let drawn = args.train && args.prompts.is_empty() && files.iter().all(|file| file.exists());
+    if !drawn {
+        draw(&args, &store, &files).await?;
+        report(args.output, &files, start.elapsed());
     }
+    let shown = |path: &Path| client::shown(path);
     if args.train {
         return train(&args, store, command).await;
     }
@@ -139,6 +130,27 @@ pub(crate) async fn demo(args: DemoArgs, command: String) -> Result<u8> {
     Ok(0)
 }
 
+/// Prints which files were drawn.
+fn report(output: Output, files: &[PathBuf; 3], took: Duration) {
+    let seconds = took.as_secs_f64();
+    let shown = |path: &Path| client::shown(path);
+    match output {
+        Output::Json => print::json(&json!({
+            "schema_version": 1,
+            "models": NAMES.map(|name| format!("{name}:1")),
+            "files": files.iter().map(|file| shown(file)).collect::<Vec<_>>(),
+            "seconds": seconds,
+        })),
+        Output::Table => print::out(&format!(
+            "{} shows the motions from all sides; open it in a browser\n{} is a sheet of them\n{} is a moving picture\n\
+             teacher (50 steps) above, one-step student below; drawn in {seconds:.1} s",
+            shown(&files[0]),
+            shown(&files[1]),
+            shown(&files[2])
+        )),
+    }
+}
+
 /// Adds the models to the demo's store, once.
 async fn install(store: &Path) -> Result<()> {
     let pack = Pack::read(MODELS).map_err(|error| Problem::new(exit::FAULT, error.context("the demo's models")))?;
@@ -155,34 +167,40 @@ async fn install(store: &Path) -> Result<()> {
     Ok(())
 }
 
-/// Draws the sentences and returns the files: the page, then the sheet.
-async fn draw(args: &DemoArgs, store: &Path) -> Result<[PathBuf; 2]> {
+/// Draws the sentences into the files: a page and a sheet of both models, and a moving picture of the student's motions.
+async fn draw(args: &DemoArgs, store: &Path, [page, sheet, film]: &[PathBuf; 3]) -> Result<()> {
     let target = Target { store: store.to_owned(), server: Default::default() };
     let reader = Reader::open(&target).await?;
     let (device, _) = model::device(None)?;
     let given: Vec<&str> = args.prompts.iter().map(String::as_str).collect();
     let sentences = if given.is_empty() { SENTENCES.to_vec() } else { given };
     let mut rows: Vec<Vec<Motion>> = vec![Vec::new(); sentences.len()];
+    // Of the model that draws last, the student.
+    let mut sampler = String::new();
     for (name, role) in NAMES.into_iter().zip(["teacher", "student"]) {
         let Found { manifest, blobs, .. } = model::version(&reader, &format!("{name}:1")).await?;
         let generator = Generator::load(&manifest, &blobs, &device).map_err(Problem::failed)?;
+        sampler = generator.sampler().to_string();
         for (sentence, row) in sentences.iter().zip(&mut rows) {
             super::generate::is_known(&generator, role, sentence)?;
             // The student's motion is as long as the teacher's.
             let frames = row.first().map(Motion::frames);
             let motion = generator.generate(sentence, frames, None, Seed(3)).map_err(model::refused)?;
-            let note = format!("{}, {:.0} ms", generator.sampler(), motion.timing.total().as_secs_f64() * 1e3);
+            let note = format!("{sampler}, {:.0} ms", motion.timing.total().as_secs_f64() * 1e3);
             row.push(exported(&format!("{role}: {sentence}"), note, motion, Vec::new()));
         }
     }
     reader.close().await;
     let sections: Vec<(String, Vec<&Motion>)> =
         sentences.iter().zip(&rows).map(|(sentence, row)| ((*sentence).to_owned(), row.iter().collect())).collect();
-    let files = ["demo.html", "demo.png"].map(|name| args.dir.join(name));
-    for file in &files {
+    for file in [page, sheet] {
         write_all("Teacher beside its one-step student", &sections, file).map_err(out::refused)?;
     }
-    Ok(files)
+    let students = sentences.iter().zip(&rows).filter_map(|(sentence, row)| {
+        let motion = row.last()?.clone();
+        Some(Motion { caption: (*sentence).to_owned(), note: sampler.clone(), ..motion })
+    });
+    gif_of_all(&students.collect::<Vec<_>>(), film).map_err(out::refused)
 }
 
 /// Trains the quickstart in the demo's store.

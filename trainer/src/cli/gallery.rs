@@ -14,6 +14,7 @@ use motion::{Dataset, Skeleton};
 use protocol::Seed;
 use protocol::message::RunView;
 use protocol::stage::Sampler;
+use protocol::units::counted;
 use serde_json::{Value, json};
 use stages::generate::Generator;
 
@@ -78,7 +79,13 @@ pub(crate) async fn gallery(args: GalleryArgs) -> Result<u8> {
     check_parent(&args.out)?;
     let reader = Reader::open(&args.target).await?;
     let run = reader.find(&args.run).await?;
-    let all = model::stages(&run);
+    let mut all = model::stages(&run);
+    // A registered version is the model of another stage.
+    let registered =
+        |name: &str| run.stages.iter().any(|stage| stage.name.as_str() == name && stage.kind == "register");
+    if all.iter().any(|name| !registered(name)) {
+        all.retain(|name| !registered(name));
+    }
     let names = if args.stage.is_empty() { all } else { args.stage.iter().map(String::as_str).collect() };
     let real = match args.no_real {
         true => None,
@@ -111,11 +118,11 @@ pub(crate) async fn gallery(args: GalleryArgs) -> Result<u8> {
             "files": [args.out.display().to_string()],
         })),
         Output::Table => print::out(&format!(
-            "{}: {count} motions, {} for {} sentence(s) and {} seed(s), of {}",
+            "{}: {count} motions, {} for {} and {}, of {}",
             args.out.display(),
             names.join(", "),
-            requests.len(),
-            seeds.len(),
+            counted(requests.len(), "sentence"),
+            counted(seeds.len(), "seed"),
             run.run
         )),
     }

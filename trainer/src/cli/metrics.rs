@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use clap::{Args, ValueEnum};
 use coordinator::shell::CurveSeries;
 use protocol::RunId;
+use protocol::units::counted;
 use registry::{Axis, Page, Window};
 
 use crate::client::Target;
@@ -83,6 +84,7 @@ pub(crate) async fn metrics(args: MetricsArgs) -> Result<u8> {
         write_csv(&reader, &run, &curves).await?;
     } else if let Some(path) = &args.plot {
         draw(path, &run, axis, &curves)?;
+        print::out(&format!("{}: {} of {run}", path.display(), counted(curves.len(), "curve")));
     } else {
         match args.output {
             Output::Json => print::json(&serde_json::json!({"schema_version": 1, "run": run, "series": curves})),

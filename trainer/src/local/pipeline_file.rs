@@ -8,6 +8,7 @@ use motion::folder_digest::{files_digest, folder_digest};
 use motion::{DataPath, Dataset};
 use pipeline::{Pipeline, PipelineStage};
 use protocol::stage::{DataFormat, ExternalFolder};
+use protocol::units::counted;
 use protocol::{Digest, StageName, limits, spelling};
 use registry::ReadStore;
 
@@ -75,8 +76,8 @@ fn inside(folder: &Path) -> String {
 /// Validates the text of a file called `name`.
 pub(crate) fn of_text(name: &str, source: String, sets: &[String]) -> Result<PipelineFile> {
     let pipeline = pipeline::read(name, &source, sets).map_err(|mistakes| {
-        let count = mistakes.0.len();
-        let problem = Problem::usage(format!("{count} mistake(s) in the pipeline\n\n{mistakes}"));
+        let count = counted(mistakes.0.len(), "mistake");
+        let problem = Problem::usage(format!("{count} in the pipeline\n\n{mistakes}"));
         problem.hint("nothing was run or stored")
     })?;
     Ok(PipelineFile { pipeline, source })

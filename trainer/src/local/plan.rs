@@ -8,6 +8,7 @@ use pipeline::{Pipeline, PipelineStage, StageInput};
 use protocol::message::RunState;
 use protocol::stage::{TextEmbed, TextEncoder};
 use protocol::sweep::{STATE_OUTPUT, rung_name};
+use protocol::units::{counted, grouped};
 use protocol::{ArtifactKind, Digest, RunId, StageName, Steps, TaskId};
 use registry::{ReadStore, RunRow, StageResultRow};
 use serde::Serialize;
@@ -62,7 +63,7 @@ impl Plan {
     /// The plan as text, in lines of at most [`COLUMNS`].
     pub(crate) fn screen(&self, pipeline: &Pipeline) -> String {
         let Self { pipeline: name, device, workers, .. } = self;
-        let mut text = format!("{name}, seed {}, on {device}, {workers} worker(s)\n", pipeline.seed);
+        let mut text = format!("{name}, seed {}, on {device}, {}\n", pipeline.seed, counted(*workers, "worker"));
         if !self.missing.is_empty() {
             text.push_str("\nMISSING on this machine:\n");
             for one in &self.missing {
@@ -79,7 +80,7 @@ impl Plan {
             vec![
                 step.stage.to_string(),
                 step.action.to_owned(),
-                known(step.steps.map(|steps| steps.to_string())),
+                known(step.steps.map(grouped)),
                 known(step.parameters.map(short)),
                 known(step.seconds.filter(|_| runs).map(long)),
                 step.why.clone(),
@@ -116,7 +117,8 @@ impl Plan {
         );
         if untried > 0 {
             text.push_str(&format!(
-                "without {untried} stage(s) that could not be estimated within the time limit of a plan\n"
+                "without {} that could not be estimated within the time limit of a plan\n",
+                counted(untried, "stage")
             ));
         }
         text

@@ -124,7 +124,8 @@ impl From<access::ConnectError> for Problem {
 impl From<registry::OpenError> for Problem {
     fn from(error: registry::OpenError) -> Self {
         let hint = error.hint();
-        Self::new(exit::USAGE, error).hint(hint)
+        // The same code and exit code as `registry`'s.
+        Self { code: Some("store".to_owned()), ..Self::new(exit::USAGE, error).hint(hint) }
     }
 }
 

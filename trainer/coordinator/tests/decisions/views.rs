@@ -100,6 +100,7 @@ fn an_interrupted_run_says_where_it_stopped() {
     assert_eq!((vae.state, vae.wants_workers), (StageState::Ready, None), "nobody is looked for");
     let steps = assignment.stage.settings.steps().expect("it trains").0;
     assert_eq!(vae.message, Some(format!("interrupted at 240 of {} steps", protocol::units::grouped(steps))));
+    assert_eq!(vae.progress.done, 240, "not the 253 of the last report");
 
     stops(&mut coordinator);
     let view = coordinator.view(&run);

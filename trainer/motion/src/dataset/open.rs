@@ -21,6 +21,7 @@ use std::fmt;
 use std::path::{Path, PathBuf};
 
 use protocol::stage::DataFormat;
+use protocol::units::counted;
 use protocol::{excerpt, limits};
 
 use super::entries::Unusable;
@@ -48,7 +49,7 @@ pub(crate) const MANY_PROBLEMS: usize = 1_000;
 
 impl fmt::Display for OpenError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{}: {} problem(s) in the dataset folder", self.folder.display(), self.problems.len())?;
+        write!(f, "{}: {} in the dataset folder", self.folder.display(), counted(self.problems.len(), "problem"))?;
         for problem in self.problems.iter().take(PRINTED) {
             write!(f, "\n  {problem}")?;
         }

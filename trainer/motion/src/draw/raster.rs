@@ -1,6 +1,6 @@
 //! Anti-aliased lines, discs and outlines on an RGB canvas, and the palette of a GIF.
 
-use tiny_skia::{FillRule, LineCap, LineJoin, Paint, Path, PathBuilder, Pixmap, Stroke, Transform};
+use tiny_skia::{FillRule, LineCap, LineJoin, Paint, Path, PathBuilder, Pixmap, PixmapPaint, Stroke, Transform};
 
 /// Red, green and blue, 0 to 255.
 pub(super) type Colour = [u8; 3];
@@ -31,6 +31,13 @@ impl Canvas {
         let mut pixels = Pixmap::new(width.max(1) as u32, height.max(1) as u32).expect("a canvas of this size");
         pixels.fill(tiny_skia::Color::from_rgba8(paper[0], paper[1], paper[2], 255));
         Self { width, pixels }
+    }
+
+    /// Copies a smaller canvas with its upper left corner to `at`.
+    pub(super) fn place(&mut self, other: &Self, at: [usize; 2]) {
+        let [x, y] = at.map(|pixels| pixels as i32);
+        let paint = PixmapPaint::default();
+        self.pixels.draw_pixmap(x, y, other.pixels.as_ref(), &paint, Transform::identity(), None);
     }
 
     fn colours(&self) -> impl Iterator<Item = Colour> + '_ {
@@ -108,6 +115,11 @@ pub(super) fn palette(colours: &[Colour]) -> Palette {
 }
 
 impl Palette {
+    /// An index that no pixel has, for pixels that stay as they were. The palette must be smaller than 256 colours.
+    pub(super) fn unused(&self) -> u8 {
+        (self.bytes.len() / 3).min(255) as u8
+    }
+
     pub(super) fn indices(&self, canvas: &Canvas) -> Vec<u8> {
         let key = |c: Colour| usize::from(c[0] >> 3) << 10 | usize::from(c[1] >> 3) << 5 | usize::from(c[2] >> 3);
         canvas.colours().map(|c| self.nearest[key(c)]).collect()

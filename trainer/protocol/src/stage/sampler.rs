@@ -4,6 +4,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::Problems;
+use crate::units::counted;
 
 /// Number of timesteps of every published noise schedule.
 const TIMESTEPS: usize = 1000;
@@ -81,7 +82,7 @@ impl Default for Sampler {
 
 impl std::fmt::Display for Sampler {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(f, "{} step(s), guidance {}", self.steps, self.guidance)?;
+        write!(f, "{}, guidance {}", counted(self.steps, "step"), self.guidance)?;
         if self.solver != Solver::Own {
             write!(f, ", {}", self.solver.name())?;
         }
@@ -242,8 +243,8 @@ impl Family {
             Self::Pcm { phases, .. } if *phases == steps => {}
             Self::Pcm { phases, .. } => {
                 let message = format!(
-                    "`sampler.steps` is {steps}, but {model} has {phases} phase(s); a PCM student takes one step per \
-                     phase"
+                    "`sampler.steps` is {steps}, but {model} has {}; a PCM student takes one step per phase",
+                    counted(*phases, "phase")
                 );
                 p.add("sampler.steps", message, &format!("write `steps: {phases}`"));
             }
@@ -375,6 +376,6 @@ mod tests {
         assert_eq!(measured_with([]), Ok(None));
         assert_eq!(measured_with([("fid", &one), ("t2m", &one.clone())]), Ok(Some(&one)));
         let refused = measured_with([("fid", &one), ("t2m_1", &one), ("t2m_4", &four)]).unwrap_err();
-        assert_eq!(refused, "1 step(s), guidance 2 in `fid`, `t2m_1`; 4 step(s), guidance 2 in `t2m_4`");
+        assert_eq!(refused, "1 step, guidance 2 in `fid`, `t2m_1`; 4 steps, guidance 2 in `t2m_4`");
     }
 }

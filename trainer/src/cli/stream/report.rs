@@ -2,6 +2,7 @@
 
 use std::time::{Duration, Instant};
 
+use protocol::units::counted;
 use serde_json::{Value, json};
 use stages::generate::stream::{Joining, Segment};
 use stages::metrics::junction::{Jump, JunctionMeter, usual};
@@ -178,9 +179,10 @@ impl Meter {
         let Self { frames, segments, latency, .. } = self;
         let (sustained, rate) = (self.sustained(), self.rate());
         let mut text = format!(
-            "{frames} frames in {segments} segment(s); {sustained:.0} frames per second, {:.1} times real time \
+            "{frames} frames in {}; {sustained:.0} frames per second, {:.1} times real time \
              (generation alone {rate:.0}, {:.1} times)\n{:.0} ms from a sentence to its first frame on average over \
              {}, {:.0} ms at most",
+            counted(*segments, "segment"),
             sustained / self.fps,
             rate / self.fps,
             1e3 * latency.mean(),
@@ -189,7 +191,7 @@ impl Meter {
         );
         if self.overlap.count > 0 {
             text += &format!(
-                "\njoined by {} over {:.0} frame(s); joints differed by up to {:.1} cm at the junctions before \
+                "\njoined by {} over {:.0} frames; joints differed by up to {:.1} cm at the junctions before \
                  blending, {:.1} cm on average",
                 self.joining.name(),
                 self.overlap.mean(),

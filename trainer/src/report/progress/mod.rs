@@ -105,7 +105,9 @@ impl Progress {
         let progress = &stage.progress;
         let is_at_work = stage.state == StageState::Running && progress.total > 0;
         let changes = self.changes.get(&stage.name).map(Vec::as_slice).unwrap_or_default();
-        let passed = changes.iter().filter(|change| (shown.done..progress.done).contains(&change.at));
+        // A stage that is taken from an earlier run has no curve to explain.
+        let trains = stage.state != StageState::Cached;
+        let passed = changes.iter().filter(|change| trains && (shown.done..progress.done).contains(&change.at));
         for change in passed {
             lines.push(loss_changes(stage, change));
             shown.curve.forget_losses();
@@ -223,7 +225,9 @@ const FIRST: [&str; 3] = ["loss", "fid", "r_precision_top3"];
 pub(crate) fn values(stage: &StageView, count: usize) -> String {
     let end = |key: &str| key.ends_with(".lower") || key.ends_with(".upper");
     let first = FIRST.iter().filter_map(|key| stage.metrics.get_key_value(*key));
-    let others = stage.metrics.iter().filter(|(key, _)| !FIRST.contains(&key.as_str()) && !end(key));
+    // A key such as `accuracy/backwards` is a part of another value.
+    let others =
+        stage.metrics.iter().filter(|(key, _)| !FIRST.contains(&key.as_str()) && !end(key) && !key.contains('/'));
     let shown = first.chain(others).take(count).map(|(key, value)| format!("{key} {}", print::number(*value)));
     printable(&shown.collect::<Vec<_>>().join("  ")).into_owned()
 }
@@ -335,5 +339,7 @@ mod tests {
         let mut later = self::progress();
         let lines = later.stage(&stage(StageState::Running, 70), start);
         assert_eq!(lines, ["           vae  continues at 70 of 100 steps"], "it joined long ago");
+        let mut cached = self::progress();
+        assert_eq!(cached.stage(&stage(StageState::Cached, 100), start), ["           vae  cached"]);
     }
 }

@@ -25,6 +25,7 @@ use models::tokens::masked::{self, Canvas, Sampling};
 use models::tokens::{mmm, residual};
 use protocol::artifact::Role;
 use protocol::stage::{DataFormat, Family, Sampler, TokenNetwork};
+use protocol::units::counted;
 use protocol::{ArtifactKind, Manifest};
 use serde::{Deserialize, Serialize};
 
@@ -154,8 +155,11 @@ pub(super) fn open(model: &Model, blobs: &dyn Blobs, device: &Device) -> Result<
     let theirs = (tokenizer.meta().codes, tokenizer.meta().quantizers);
     if ours != theirs {
         return Err(StageError::Input(format!(
-            "the generator has {} codebook(s) of {} codes, but the tokenizer has {} of {}",
-            ours.1, ours.0, theirs.1, theirs.0
+            "the generator has {} of {} codes, but the tokenizer has {} of {}",
+            counted(ours.1, "codebook"),
+            ours.0,
+            theirs.1,
+            theirs.0
         )));
     }
     if meta.family == Family::Mmm {

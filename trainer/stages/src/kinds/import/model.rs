@@ -21,6 +21,7 @@ use protocol::stage::{
     DataFormat, Diffusion, Family, FlowBackbone, FlowNetwork, FlowPrediction, FlowProjection, ImportModel,
     ImportedPart, NoiseSchedule, Prediction, StageSpec, TextActivation, TokenNetwork, TokenizerNetwork,
 };
+use protocol::units::counted;
 use protocol::{ArtifactKind, Digest, Manifest};
 use serde::Serialize;
 
@@ -441,10 +442,10 @@ impl Import<'_> {
     fn expect_codes(found: &Found<'_>, codes: usize, tokenizer: &TokenizerMeta, one: bool) -> Result<(), StageError> {
         if codes != tokenizer.codes || (one && tokenizer.quantizers != 1) {
             return Err(found.refuse(format!(
-                "it generates {codes} codes{}, but `tokenizer` has {} codebook(s) of {}; use the tokenizer that it was \
+                "it generates {codes} codes{}, but `tokenizer` has {} of {}; use the tokenizer that it was \
                  trained with",
                 if one { " of one codebook" } else { "" },
-                tokenizer.quantizers,
+                counted(tokenizer.quantizers, "codebook"),
                 tokenizer.codes
             )));
         }
