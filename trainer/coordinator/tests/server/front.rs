@@ -9,6 +9,7 @@ use axum::Router;
 use axum::body::Body;
 use axum::extract::State;
 use axum::http::{Request, Response, StatusCode, Version, header};
+use axum::serve::ListenerExt as _;
 use hyper::client::conn::http2::{SendRequest, handshake};
 use hyper_util::rt::{TokioExecutor, TokioIo};
 use rustls::RootCertStore;
@@ -41,6 +42,7 @@ pub(crate) async fn connect(address: SocketAddr, ca: &Path) -> Connection {
     let mut config = config.unwrap().with_root_certificates(roots).with_no_client_auth();
     config.alpn_protocols = vec![b"h2".to_vec()];
     let stream = TcpStream::connect(address).await.unwrap();
+    stream.set_nodelay(true).unwrap();
     let name = ServerName::try_from("localhost").unwrap();
     let stream = TlsConnector::from(Arc::new(config)).connect(name, stream).await.unwrap();
     let (send, connection) = handshake(TokioExecutor::new(), TokioIo::new(stream)).await.unwrap();
@@ -60,6 +62,7 @@ pub(crate) async fn open(address: SocketAddr, ca: &Path) -> String {
     let calls = Router::new().fallback(pass).with_state(Arc::new(behind));
     let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).await.unwrap();
     let url = format!("http://{}", listener.local_addr().unwrap());
+    let listener = listener.tap_io(|stream| stream.set_nodelay(true).unwrap());
     tokio::spawn(async move { axum::serve(listener, calls).await });
     url
 }
