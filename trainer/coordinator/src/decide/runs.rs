@@ -105,7 +105,8 @@ impl Deciding<'_> {
         };
         let before = run.state;
         let Some(after) = run.after(action) else {
-            return Err(Rejected::Conflict(format!("run `{id}` is {before:?} and cannot be asked to {action:?}")));
+            let action = format!("{action:?}").to_lowercase();
+            return Err(Rejected::Conflict(format!("`{action}` does nothing to run `{id}`, which is {}", before.name())));
         };
         if after == before && !run.parked {
             return Ok(false);
