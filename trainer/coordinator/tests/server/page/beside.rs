@@ -63,7 +63,7 @@ async fn a_browser_compares_runs_sweeps_and_times() -> TestResult {
         browser.until("document.querySelector('td.fresh')");
         assert_eq!(browser.evaluate("document.querySelector('td.old').textContent + ' ' + document.querySelector('td.fresh').textContent"), json!("1e-4 2e-4"));
         assert_eq!(browser.evaluate("document.querySelectorAll('td.fresh').length"), json!(1), "only what differs");
-        browser.until("[...document.querySelectorAll('.because')].some((e) => e.textContent.includes('lr 1e-4 → 2e-4'))");
+        browser.until("[...document.querySelectorAll('.because')].some((e) => e.textContent.includes('lr 1e-4 -> 2e-4'))");
         browser.evaluate("[...document.querySelectorAll('a.button')].find((a) => a.textContent.startsWith('Compare with')).click()");
         browser.until("location.pathname === '/compare' && document.querySelectorAll('.beside-runs li').length === 2");
 
