@@ -106,7 +106,10 @@ impl Deciding<'_> {
         let before = run.state;
         let Some(after) = run.after(action) else {
             let action = format!("{action:?}").to_lowercase();
-            return Err(Rejected::Conflict(format!("`{action}` does nothing to run `{id}`, which is {}", before.name())));
+            return Err(Rejected::Conflict(format!(
+                "`{action}` does nothing to run `{id}`, which is {}",
+                before.name()
+            )));
         };
         if after == before && !run.parked {
             return Ok(false);
