@@ -22,7 +22,7 @@ const AT_PLACE: f64 = 0.45;
 /// Delay after the last frame, hundredths of a second.
 const PAUSE: u16 = 80;
 
-/// Writes an animated GIF of all motions at their own speed, in rows of [`COLUMNS`]. A shorter motion waits in its last
+/// Writes an animated GIF of all motions at their own speed, in rows of three. A shorter motion waits in its last
 /// pose for the longest.
 ///
 /// # Errors
