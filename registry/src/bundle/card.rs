@@ -81,7 +81,7 @@ pub fn card(version: &Version, manifest: &Manifest, model: &Model, parts: &BTree
     text
 }
 
-/// The table of what was measured.
+/// The table of metrics.
 fn metrics(version: &Version) -> String {
     let mut lines = vec!["| evaluation | metric | value, ± half the 95 % interval |\n|---|---|---:|".to_owned()];
     for (stage, measures) in leaderboard::measured(version) {

@@ -27,7 +27,8 @@ use std::time::Duration;
 use protocol::stage::Keep;
 use protocol::{Alias, Digest, Group, ModelName, RunId, TaskId};
 
-use self::opening::{Asked, Purpose};
+use self::opening::{Asked, HeldStore, Leading, Purpose};
+pub use self::parts::PostgresCatalog;
 use self::parts::{Inspection, RequestedPlace, make_folder, refuse_other_files, remembered_catalog, there};
 pub(crate) use self::parts::{forget_catalog, remember_catalog};
 use crate::blob::place::Place;
@@ -42,7 +43,7 @@ use crate::open_error::OpenError;
 use crate::proofs::Proofs;
 use crate::scoped::ScopedRecords;
 use crate::server_key::{self, ServerKey};
-use crate::sql::{self, LeaderTerms, Leadership, SqlRecords};
+use crate::sql::{self, Leadership, SqlRecords};
 use crate::store_id::StoreId;
 use crate::versions::{Expect, Pick, Promotion};
 use crate::{WriteError, clock, folder};
@@ -79,26 +80,6 @@ struct Inner {
     lock: Arc<StoreLock>,
     proofs: Arc<Proofs>,
     leading: Option<Leading>,
-}
-
-/// The state of a process that leads a catalog in PostgreSQL.
-#[derive(Debug)]
-struct Leading {
-    leadership: Leadership,
-    server_key: ServerKey,
-}
-
-/// A catalog in PostgreSQL, and the terms under which a process leads it.
-#[derive(Debug, Clone)]
-pub struct PostgresCatalog {
-    pub address: PostgresAddress,
-    pub terms: LeaderTerms,
-}
-
-impl From<PostgresAddress> for PostgresCatalog {
-    fn from(address: PostgresAddress) -> Self {
-        Self { address, terms: LeaderTerms::default() }
-    }
 }
 
 impl std::ops::Deref for Store {
@@ -270,7 +251,7 @@ impl Store {
     ) -> Result<Self, OpenError> {
         make_folder(dir)?;
         let asked = Asked { place: RequestedPlace::Given(blobs), terms, ..Asked::to(Purpose::Work) };
-        opening::open(dir, asked, holder).await
+        Self::take_by(dir, asked, holder).await
     }
 
     /// Opens or creates a store whose catalog is in PostgreSQL, and leads it. `dir` is this process's own folder.
@@ -283,7 +264,7 @@ impl Store {
         make_folder(dir)?;
         let asked =
             Asked { place: RequestedPlace::named(blobs), catalog: Some(catalog.clone()), ..Asked::to(Purpose::Work) };
-        opening::open(dir, asked, holder).await
+        Self::take_by(dir, asked, holder).await
     }
 
     /// Opens or creates a store whose catalog is in PostgreSQL over a given backend. For tests.
@@ -296,7 +277,7 @@ impl Store {
         make_folder(dir)?;
         let asked =
             Asked { place: RequestedPlace::Given(blobs), catalog: Some(catalog.clone()), ..Asked::to(Purpose::Work) };
-        opening::open(dir, asked, holder).await
+        Self::take_by(dir, asked, holder).await
     }
 
     /// Returns once no other process leads the catalog.
@@ -329,7 +310,15 @@ impl Store {
     }
 
     async fn take(dir: &Path, place: RequestedPlace, holder: Holder, purpose: Purpose) -> Result<Self, OpenError> {
-        opening::open(dir, Asked { place, ..Asked::to(purpose) }, holder).await
+        Self::take_by(dir, Asked { place, ..Asked::to(purpose) }, holder).await
+    }
+
+    async fn take_by(dir: &Path, asked: Asked, holder: Holder) -> Result<Self, OpenError> {
+        let held = opening::open(dir, asked, holder).await?;
+        let HeldStore { dir, id, blobs, catalog, records, address, lease, lock, proofs, leading } = held;
+        let (opened_ms, calls) = (clock::now_ms(), Calls::default());
+        let read = ReadStore(Arc::new(Reading { dir, id, opened_ms, blobs, calls, records, address, _closed: None }));
+        Ok(Self(Arc::new(Inner { read, catalog, _lease: lease, lock, proofs, leading })))
     }
 
     /// Returns the catalog: all data except the blobs.

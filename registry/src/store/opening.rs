@@ -5,11 +5,13 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
 
-use super::parts::{Inspection, RequestedPlace, choose_catalog, close_to_others, remove_files_of_earlier_builds};
-use super::{Inner, Leading, PostgresCatalog, ReadStore, Reading, Store};
+use super::parts::{
+    Inspection, PostgresCatalog, RequestedPlace, choose_catalog, close_to_others, remove_files_of_earlier_builds,
+};
 use crate::blob::BlobStore;
 use crate::blob::disk::free_bytes;
-use crate::calls::Calls;
+use crate::catalog::{Catalog, PostgresAddress, Records};
+use crate::folder;
 use crate::identity::{Held, Marker, Verdict, Witness};
 use crate::lease::{self, Lease, LeaseTerms};
 use crate::lock::{Holder, StoreLock, Taken, network_filesystem};
@@ -18,8 +20,7 @@ use crate::proofs::Proofs;
 use crate::reserve::{self, OPEN_NEEDS_BYTES};
 use crate::server_key::ServerKey;
 use crate::sql::{self, Leadership, Link, Opened, Session, SqlCatalog, SqlRecords, Writer};
-use crate::store_id::Stored;
-use crate::{clock, folder};
+use crate::store_id::{StoreId, Stored};
 
 /// A request to open a store.
 pub(super) struct Asked {
@@ -44,8 +45,30 @@ pub(super) enum Purpose {
     Adopt,
 }
 
+/// The state of a process that leads a catalog in PostgreSQL.
+#[derive(Debug)]
+pub(super) struct Leading {
+    pub(super) leadership: Leadership,
+    pub(super) server_key: ServerKey,
+}
+
+/// A store that this process holds.
+pub(super) struct HeldStore {
+    pub(super) dir: PathBuf,
+    pub(super) id: StoreId,
+    pub(super) blobs: BlobStore,
+    pub(super) catalog: Box<dyn Catalog>,
+    pub(super) records: Arc<dyn Records>,
+    /// Address of the database, unless it is a file of the folder.
+    pub(super) address: Option<PostgresAddress>,
+    pub(super) lease: Option<Lease>,
+    pub(super) lock: Arc<StoreLock>,
+    pub(super) proofs: Arc<Proofs>,
+    pub(super) leading: Option<Leading>,
+}
+
 /// Opens the store that `asked` describes, or creates it. This process holds it from then on.
-pub(super) async fn open(dir: &Path, asked: Asked, holder: Holder) -> Result<Store, OpenError> {
+pub(super) async fn open(dir: &Path, asked: Asked, holder: Holder) -> Result<HeldStore, OpenError> {
     let opening = Opening::lock(dir, asked, holder).await?;
     let mut inspection = opening.inspect().await?;
     let is_leased = opening.is_leased(&inspection);
@@ -172,7 +195,7 @@ impl Opening {
     }
 
     /// Starts the writer and the readers. The leadership counts from `begun`, before the database was opened.
-    async fn start(self, database: Database, marked: MarkedBlobs, begun: Instant) -> Result<Store, OpenError> {
+    async fn start(self, database: Database, marked: MarkedBlobs, begun: Instant) -> Result<HeldStore, OpenError> {
         let Database { opened: Opened { mut link, store: id, .. }, led } = database;
         let MarkedBlobs { blobs, stored, lease } = marked;
         let leading = led.zip(self.catalog.as_ref()).map(|((_, server_key), catalog)| {
@@ -201,9 +224,7 @@ impl Opening {
         let records = Arc::new(SqlRecords::new(readers));
         let catalog = Box::new(SqlCatalog { writer, records: Arc::clone(&records) });
         let Self { dir, lock, .. } = self;
-        let (opened_ms, calls) = (clock::now_ms(), Calls::default());
-        let read = ReadStore(Arc::new(Reading { dir, id, opened_ms, blobs, calls, records, address, _closed: None }));
-        Ok(Store(Arc::new(Inner { read, catalog, _lease: lease, lock, proofs, leading })))
+        Ok(HeldStore { dir, id, blobs, catalog, records, address, lease, lock, proofs, leading })
     }
 }
 

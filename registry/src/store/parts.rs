@@ -8,14 +8,27 @@ use std::sync::Arc;
 
 use checkpoint::BlobError;
 
-use super::PostgresCatalog;
 use crate::blob::Backend;
 use crate::blob::disk::write_whole;
 use crate::blob::place::{Location, Place};
 use crate::catalog::PostgresAddress;
 use crate::identity::{MarkerError, StoreParts};
 use crate::open_error::OpenError;
+use crate::sql::LeaderTerms;
 use crate::{folder, server_key};
+
+/// A catalog in PostgreSQL, and the terms under which a process leads it.
+#[derive(Debug, Clone)]
+pub struct PostgresCatalog {
+    pub address: PostgresAddress,
+    pub terms: LeaderTerms,
+}
+
+impl From<PostgresAddress> for PostgresCatalog {
+    fn from(address: PostgresAddress) -> Self {
+        Self { address, terms: LeaderTerms::default() }
+    }
+}
 
 pub(super) fn make_folder(dir: &Path) -> Result<(), OpenError> {
     DirBuilder::new().recursive(true).mode(0o700).create(dir).map_err(|e| OpenError::io(dir, &e))

@@ -37,8 +37,8 @@ use super::openapi::document;
 use super::queries::{HistoryCall, LogQuery, PointQuery, RunsQuery, Storage, Submitted};
 use super::records::StageMetrics;
 use super::route::Route;
+use super::run_settings::RunSettings;
 use super::session_calls::Who;
-use super::settings::RunSettings;
 use super::tickets::Ticket;
 use super::{
     bundles, checkpoints, curves, draws, events, page_files, polls, queries, scrape, session_calls, settings, spans,

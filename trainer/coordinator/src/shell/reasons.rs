@@ -6,61 +6,14 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use protocol::StageName;
 use protocol::message::{RunView, StageState};
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
-use super::settings::{RunSettings, SettingsOfStage};
+use super::run_settings::{ReasonKind, RunSettings, SettingChange, SettingsOfStage, StageReason};
 
 /// Changed settings that the words name; the others are counted.
 const NAMED: usize = 2;
 /// Below this, a number is written with an exponent.
 const SMALL: f64 = 0.01;
-
-/// The reason why a stage was computed.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
-pub struct StageReason {
-    pub kind: ReasonKind,
-    /// Settings that differ from those of the previous run.
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    pub changes: Vec<SettingChange>,
-    /// Stages that it reads and that differ from those of the previous run.
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    pub inputs: Vec<StageName>,
-    /// The reason in a few words, such as `lr 2e-4 -> 1e-4`; empty if there is none yet.
-    pub text: String,
-}
-
-/// Kind of the difference between a stage and that of the previous run.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
-#[serde(rename_all = "kebab-case")]
-pub enum ReasonKind {
-    /// The previous run has no such stage.
-    New,
-    /// Some settings differ.
-    Changed,
-    /// The code version of its kind differs.
-    Code,
-    /// The pipeline's seed differs.
-    Seed,
-    /// A stage or a file that it reads differs.
-    Input,
-    /// Everything is the same.
-    Same,
-    /// It cannot be said before the stage has a key.
-    Unknown,
-}
-
-/// A setting that differs.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
-pub struct SettingChange {
-    /// Path in the stage's settings, such as `network.width`.
-    pub path: String,
-    /// The value in the previous run; `null` if it has none.
-    pub from: Value,
-    /// The value now; `null` if there is none.
-    pub to: Value,
-}
 
 /// Adds a reason to each stage of `now`, a run whose view is `view`.
 pub(super) fn explain(now: &mut RunSettings, view: &RunView, before: Option<&RunSettings>) {
@@ -191,7 +144,7 @@ mod tests {
         RunSettings { run: run.into(), previous: None, missing, seed: Seed(1), source: String::new(), stages }
     }
 
-    /// A view of the stages in `states`, each of which reads all before it.
+    /// A view of the stages in `states`; each reads all before it.
     fn view(states: &[(&str, StageState)]) -> RunView {
         let mut before: Vec<&str> = Vec::new();
         let mut stages = Vec::new();

@@ -8,17 +8,15 @@ use axum::extract::State;
 use axum::{Extension, Json};
 use pipeline::Pipeline;
 use protocol::message::RunView;
-use protocol::{Digest, RunId, Seed, StageName};
+use protocol::{Digest, RunId, StageName};
 use registry::{RunListQuery, RunOrder, WriteError};
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
-use serde_json::Value;
 
 use super::actor_handle::ActorHandle;
 use super::extract::Path;
 use super::failure::Failure;
-use super::reasons::{StageReason, explain};
+use super::reasons::explain;
 use super::records::{Records, read};
+use super::run_settings::{RunSettings, SettingsOfStage};
 use super::turn::turn;
 use crate::batch::Refused;
 use crate::rejected::Rejected;
@@ -26,41 +24,6 @@ use crate::rejected::Rejected;
 /// Runs of one page of the search for the previous run of a pipeline, and the pages searched. Behind 400 newer runs of the
 /// pipeline no previous run is found.
 const SEARCHED: (u32, usize) = (100, 4);
-
-/// The answer to `GET /v1/runs/{run}/settings`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
-pub struct RunSettings {
-    pub run: RunId,
-    /// The newest earlier run of a pipeline with the same name.
-    pub previous: Option<RunId>,
-    /// Stages of the previous run that this one does not have.
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    pub missing: Vec<StageName>,
-    pub seed: Seed,
-    /// The pipeline's file as the user wrote it.
-    pub source: String,
-    /// Stages of the pipeline in topological order, without a sweep's trials.
-    pub stages: Vec<SettingsOfStage>,
-}
-
-/// Settings of one stage.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
-pub struct SettingsOfStage {
-    pub stage: StageName,
-    /// Kind and settings, with all defaults.
-    pub settings: Value,
-    /// Code version of the kind.
-    pub code: u32,
-    /// Key of the stage, once its inputs are known.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub key: Option<Digest>,
-    /// Earlier run that computed the result, unless the caller may not see it.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub from: Option<RunId>,
-    /// Why it was computed, beside the previous run.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub why: Option<StageReason>,
-}
 
 pub(crate) async fn settings(
     State(actor_handle): State<Arc<ActorHandle>>,
