@@ -454,7 +454,7 @@ mod tests {
             "nowhere/data/sentence-t5-large: no such folder",
             "Sentence-T5, such as huggingface.co/",
             "flex (CPU",
-            "1150000  18.06M      139 days",
+            "1,150,000  18.06M      139 days",
             "about 139 days with one worker",
             "that could not be estimated",
         ] {
