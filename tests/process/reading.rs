@@ -145,7 +145,7 @@ fn a_plan_says_what_is_missing_and_what_a_run_would_take() {
     println!("{plan}");
     assert!(plan.lines().count() <= 40 && plan.lines().all(|line| line.chars().count() <= 100), "{plan}");
     for part in
-        ["data/HumanML3D: no such folder", "deps/t2m/t2m", "deps/glove", "`data/HumanML3D` is missing", "384000"]
+        ["data/HumanML3D: no such folder", "deps/t2m/t2m", "deps/glove", "`data/HumanML3D` is missing", "384,000"]
     {
         assert!(plan.contains(part), "`{part}` is missing from\n{plan}");
     }
