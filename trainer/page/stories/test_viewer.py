@@ -93,8 +93,9 @@ def test_a_character_of_ones_own_is_drawn_and_stays_here(drawn: Hand) -> None:
     file = {"name": "me.glb", "mimeType": "model/gltf-binary", "buffer": characters.glb()}
     page.set_input_files("input.file", files=[file])
     expect(page.locator("select.body")).to_have_value("character")
-    page.evaluate(DRAWN)
-    assert page.evaluate(ORANGE) > before + 0.01
+    # A canvas that is out of sight is drawn once it comes into sight.
+    page.locator("canvas.figure").first.scroll_into_view_if_needed()
+    page.wait_for_function(f"(least) => ({ORANGE})() > least", arg=before + 0.01, timeout=5000)
     drawn.keep("character")
     assert all(one.startswith("GET ") and one.endswith("/character.js") for one in asked), asked
     # A file that cannot be used is refused with a reason, and the character stays.
