@@ -112,7 +112,7 @@ fn a_run_and_the_next_one_are_seen_on_the_page() {
     keep(&mut browser, "checkpoints.png", DESK);
     browser.resize(PHONE);
     keep(&mut browser, "checkpoints-phone.png", PHONE);
-    // Who opens the view again sees the same draw, not a new run.
+    // A second visit to the view shows the same draw, and makes no new run.
     let draws =
         "fetch('/v1/runs?pipeline=draw&limit=200').then((answer) => answer.json()).then(({ items }) => items.length)";
     let before_again = browser.evaluate(draws);

@@ -42,7 +42,7 @@ class Training:
 @dataclass
 class Size:
     config: str
-    """Steps of the stages before, which only have to exist."""
+    """Steps of the stages before, which are inputs here."""
     short: list[str]
     trainings: list[Training]
     samplings: list[tuple[str, str, int, str]]

@@ -13,7 +13,7 @@ use crate::{Files, JoinError, Options, StageLimits};
 /// Offer this machine to a coordinator.
 #[derive(Debug, Clone, clap::Args)]
 pub struct JoinArgs {
-    /// URL of the coordinator, such as `http://127.0.0.1:7700`
+    /// URL of the coordinator, such as `http://127.0.0.1:7700`; those of its stand-bys follow after commas
     #[arg(env = "STRIDE_SERVER")]
     pub url: String,
     #[command(flatten)]

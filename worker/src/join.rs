@@ -237,24 +237,28 @@ fn peer_address(options: &Options) -> Result<(SocketAddr, Option<String>), JoinE
             .ok_or_else(|| JoinError::Usage(format!("`{address}` is not an address for peers; expected HOST:PORT")))?;
         return Ok((SocketAddr::from(([0, 0, 0, 0], port)), Some(address.clone())));
     }
-    let url = options.server.url();
-    let url = reqwest::Url::parse(url).map_err(|e| JoinError::Usage(format!("`{url}`: {e}")))?;
-    let host = url.host_str().unwrap_or_default().trim_matches(['[', ']']).to_owned();
+    let urls = options.server.urls();
+    match urls.split(',').find_map(own_address) {
+        Some(ip) => Ok((SocketAddr::new(ip, 0), None)),
+        None => Err(JoinError::Usage(format!(
+            "there is no route to `{urls}`, so the address for other workers is unknown; check the URL, or pass \
+             --peer-address HOST:PORT"
+        ))),
+    }
+}
+
+/// This machine's address from which the host of `url` is reached; `None` if there is no route to it.
+fn own_address(url: &str) -> Option<IpAddr> {
+    let url = reqwest::Url::parse(url).ok()?;
+    let host = url.host_str()?.trim_matches(['[', ']']);
     let port = url.port_or_known_default().unwrap_or(80);
-    let local = (host.as_str(), port).to_socket_addrs().ok().into_iter().flatten().find_map(|coordinator| {
+    (host, port).to_socket_addrs().ok()?.find_map(|coordinator| {
         let any = if coordinator.is_ipv4() { IpAddr::from([0; 4]) } else { IpAddr::from([0u16; 8]) };
         // Sends nothing: the kernel picks the route, and with it our address.
         let socket = UdpSocket::bind((any, 0)).ok()?;
         socket.connect(coordinator).ok()?;
         Some(socket.local_addr().ok()?.ip())
-    });
-    match local {
-        Some(ip) => Ok((SocketAddr::new(ip, 0), None)),
-        None => Err(JoinError::Usage(format!(
-            "there is no route to `{host}`, so the address for other workers is unknown; check the URL, or pass \
-             --peer-address HOST:PORT"
-        ))),
-    }
+    })
 }
 
 fn watch_signals(shared: Arc<Shared>, owned: bool, leave_within: Duration) -> std::io::Result<()> {
@@ -292,4 +296,18 @@ fn watch_signals(shared: Arc<Shared>, owned: bool, leave_within: Duration) -> st
         }
     });
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_address_without_a_route_leaves_the_next_one() {
+        let loopback = Some(IpAddr::from([127, 0, 0, 1]));
+        assert_eq!(own_address("https://no-such-host.invalid:7700"), None);
+        assert_eq!(own_address("http://127.0.0.1:7700"), loopback);
+        let urls = "https://no-such-host.invalid:7700,http://127.0.0.1:7700";
+        assert_eq!(urls.split(',').find_map(own_address), loopback);
+    }
 }

@@ -1,8 +1,8 @@
 //! Limits of a stage: memory and time.
 //!
-//! A thread checks both while a stage computes, and notes the highest memory. Exceeding a limit is reported as a final failure. The coordinator then
-//! ends the grant, and the stage stops at its next check. If it does not stop, the process exits, which frees its
-//! memory.
+//! A thread checks both while a stage computes, and notes the highest memory. Exceeding a limit is reported as a final
+//! failure. The coordinator then ends the grant, and the stage stops at its next check. If it does not stop, the process
+//! exits, which frees its memory.
 
 use std::collections::BTreeMap;
 use std::sync::mpsc::{self, RecvTimeoutError};

@@ -1,8 +1,9 @@
 //! Writes motions to files, in the form of the file's extension, and reads motions from arrays.
 //!
-//! `.html` and `.png` hold several motions, all others one; [`gif_of_all`] draws several beside each other. `.bvh` (centimetres) and `.glb` (metres) have constant bone
-//! lengths. If a figure's bones change, its joints are placed by directions and mean lengths; [`Written`] reports the
-//! error. `.npy` has features if there are some, else positions. `.mp4` needs an `ffmpeg` on the machine.
+//! `.html` and `.png` hold several motions, all others one; [`gif_of_all`] draws several beside each other. `.bvh`
+//! (centimetres) and `.glb` (metres) have constant bone lengths. If a figure's bones change, its joints are placed by
+//! directions and mean lengths; [`Written`] reports the error. `.npy` has features if there are some, else positions.
+//! `.mp4` needs an `ffmpeg` on the machine.
 
 use std::fs::{self, File};
 use std::io::{self, BufWriter, Write as _};

@@ -175,7 +175,7 @@ async fn draw(args: &DemoArgs, store: &Path, [page, sheet, film]: &[PathBuf; 3])
     let given: Vec<&str> = args.prompts.iter().map(String::as_str).collect();
     let sentences = if given.is_empty() { SENTENCES.to_vec() } else { given };
     let mut rows: Vec<Vec<Motion>> = vec![Vec::new(); sentences.len()];
-    // Of the model that draws last, the student.
+    // The student draws last, so this is its sampler at the end.
     let mut sampler = String::new();
     for (name, role) in NAMES.into_iter().zip(["teacher", "student"]) {
         let Found { manifest, blobs, .. } = model::version(&reader, &format!("{name}:1")).await?;

@@ -114,7 +114,7 @@ pub(crate) async fn run(request: Request, options: Options) -> Result<u8> {
     let watched = watch(&handle, &run, &pipeline, &options, &mut progress, &mut fleet, &mut stop).await;
     progress.finish();
     let view = handle.run_view(&run).await;
-    // A store in trouble may not tell; the report of the run does without.
+    // A store that fails gives no reasons; the report is printed without them.
     let whys = handle.settings(&run).await.map(summary::whys).unwrap_or_default();
     if let Some(fleet) = &mut fleet {
         fleet.kill().await;

@@ -100,7 +100,7 @@ pub(crate) fn svg(title: &str, panels: &[Panel]) -> String {
     out + "</svg>\n"
 }
 
-/// Lines and bands of a panel without what is no number, and its axes.
+/// The finite values of a panel's lines and bands, and its axes.
 struct Plotted<'a> {
     panel: &'a Panel,
     lines: Vec<(&'a String, Vec<(f64, f64)>)>,

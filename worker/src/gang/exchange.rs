@@ -194,8 +194,9 @@ fn receive_part(
         let place = (frame.a, frame.b) == (number(n), number(p));
         if place && p == 0 && frame.kind == Kind::SharedPart {
             numbers = vec![0.0; chunk.len()];
-            let whole = mesh.memory(peer).read(n * chunk.len(), &mut numbers);
-            whole.then_some(()).ok_or_else(unexpected)?;
+            if !mesh.memory(peer).read(n * chunk.len(), &mut numbers) {
+                return Err(unexpected());
+            }
             break;
         }
         let frame = expect(frame, Kind::Part, mesh, peer)?;
@@ -239,8 +240,9 @@ fn gather(
             let unexpected = || disagree(mesh, barrier, peer, &format!("sends an unexpected sum at piece {p}"));
             let place = frame.b == number(p) && frame.step == step;
             if place && p == 0 && frame.kind == Kind::SharedSum {
-                let whole = mesh.memory(peer).read(begin(peer, own), &mut sum[chunk.clone()]);
-                whole.then_some(()).ok_or_else(unexpected)?;
+                if !mesh.memory(peer).read(begin(peer, own), &mut sum[chunk.clone()]) {
+                    return Err(unexpected());
+                }
                 break;
             }
             let frame = expect(frame, Kind::Sum, mesh, peer)?;

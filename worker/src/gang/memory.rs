@@ -2,11 +2,13 @@
 //!
 //! A member makes memory of a fixed size for a peer and announces it in its greeting: process, file descriptor, size and
 //! a random mark. A peer that opens it by `/proc` and finds the mark maps it for reading only, and says so in its next
-//! greeting. From then on a frame of the exchange has no payload, and its numbers are in the memory. All frames still
-//! pass over the connection, so their order, the silence of a peer and its loss are seen there as ever.
+//! greeting. Later frames of the exchange have no payload, and their numbers are in the memory. All frames still pass over
+//! the connection, which shows their order, the silence of a peer and its loss.
 //!
-//! Nobody reads while the owner writes: a peer sends its sum after it has copied the parts, and it begins the next step
+//! A peer does not read while the owner writes. It sends its sum after it has copied the parts, and it begins the next step
 //! after it has copied the sum. A peer that reads at another time gets wrong numbers, and no more.
+//!
+//! Not its job: which numbers are sent when (`exchange`).
 //!
 //! Processes that do not see each other (another machine, user or container, or `--sandbox`) use their connection.
 #![allow(unsafe_code, reason = "memory that another process may write has no safe type")]
@@ -25,7 +27,7 @@ const MARK: usize = 16;
 /// Begin of the numbers, which keeps them aligned.
 const NUMBERS: usize = 64;
 
-/// Where a member's memory for a peer is found.
+/// The place of a member's memory for a peer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Announcement {
     process: u32,

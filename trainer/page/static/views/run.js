@@ -74,7 +74,7 @@ export function run(context, name) {
     try {
       settings = await settingsOf(name, signal);
     } catch (error) {
-      // What else the view shows does not wait for it.
+      // The rest of the view does not wait for it.
       asOf = "";
       if (!signal.aborted && !(error instanceof CallError)) throw error;
       return;

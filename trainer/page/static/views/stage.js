@@ -57,7 +57,7 @@ export function stage(context, name, stageName) {
     if (it && (live || beats === 0 || !isOver(run))) await log.load(signal);
     if (it?.key && beats % CURVES_EVERY === 0 && (live || beats === 0)) await thumbnails.load(signal);
     void thumbnails.appear().catch((error) => {
-      // A server that is away is said by the next beat.
+      // The next beat shows that the server is away.
       if (!(error instanceof CallError)) throw error;
     });
     beats += 1;
