@@ -21,9 +21,9 @@ use std::path::{Path, PathBuf};
 
 use checkpoint::{BLOBS, BlobError, blob_path};
 use protocol::Digest;
+use protocol::digest::Hasher;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use sha2::{Digest as _, Sha256};
 
 use crate::blob::Backend;
 use crate::blob::disk::{regular, write_whole};
@@ -141,7 +141,7 @@ fn names(dir: &Path) -> Result<Vec<String>, BackupError> {
 
 /// Returns the digest and the length of a file, read part by part.
 fn hashed(path: &Path) -> io::Result<(Digest, u64)> {
-    let (mut file, mut hasher, mut bytes) = (File::open(path)?, Sha256::new(), 0);
+    let (mut file, mut hasher, mut bytes) = (File::open(path)?, Hasher::default(), 0);
     let mut part = vec![0; 1 << 20];
     loop {
         let read = file.read(&mut part)?;
@@ -151,9 +151,7 @@ fn hashed(path: &Path) -> io::Result<(Digest, u64)> {
         hasher.update(&part[..read]);
         bytes += read as u64;
     }
-    let hex: String = hasher.finalize().iter().map(|byte| format!("{byte:02x}")).collect();
-    let digest = format!("sha256:{hex}").parse().map_err(|e| io::Error::other(format!("{e}")))?;
-    Ok((digest, bytes))
+    Ok((hasher.finish(), bytes))
 }
 
 fn expect(path: &Path, digest: Digest) -> Result<u64, BackupError> {

@@ -19,7 +19,7 @@ impl StoreId {
     pub(crate) fn random() -> io::Result<Self> {
         let mut bytes = [0_u8; 16];
         File::open("/dev/urandom")?.read_exact(&mut bytes)?;
-        Ok(Self(bytes.iter().map(|byte| format!("{byte:02x}")).collect()))
+        Ok(Self(hex::encode(bytes)))
     }
 
     /// Returns the digits.

@@ -174,14 +174,11 @@ async fn take_over(
 async fn server_key_of(conn: &mut PgConnection) -> Result<ServerKey, sqlx::Error> {
     let conn = &mut Conn::Postgres(conn);
     let fresh = server_key::random().map_err(sqlx::Error::Io)?;
-    let hex: String = fresh.iter().map(|byte| format!("{byte:02x}")).collect();
-    query("INSERT INTO server_keys (one, key) VALUES (1, ?) ON CONFLICT DO NOTHING").bind(hex).execute(conn).await?;
+    let insert = query("INSERT INTO server_keys (one, key) VALUES (1, ?) ON CONFLICT DO NOTHING");
+    insert.bind(hex::encode(fresh)).execute(conn).await?;
     let row = query("SELECT key FROM server_keys").fetch_one(conn).await?;
-    let hex: String = row.try_get(0)?;
-    let bytes: Vec<u8> =
-        (0..hex.len() / 2).filter_map(|i| u8::from_str_radix(hex.get(2 * i..2 * i + 2)?, 16).ok()).collect();
-    bytes
-        .try_into()
+    let key = hex::decode(row.try_get::<String, _>(0)?).unwrap_or_default();
+    key.try_into()
         .map_err(|_| sqlx::Error::ColumnDecode { index: "key".into(), source: "not a key of 32 bytes".into() })
 }
 

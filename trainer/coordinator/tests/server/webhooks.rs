@@ -75,10 +75,10 @@ async fn receive(State(inbox): State<Arc<Mutex<Inbox>>>, headers: HeaderMap, bod
     let (id, time) = (text("webhook-id"), text("webhook-timestamp"));
     let mut mac = Hmac::<Sha256>::new_from_slice(KEY.as_bytes()).unwrap();
     mac.update(format!("{id}.{time}.{body}").as_bytes());
-    let signed: String = mac.finalize().into_bytes().iter().map(|byte| format!("{byte:02x}")).collect();
+    let signed = hex::encode(mac.finalize().into_bytes());
     let said = text("webhook-signature");
     let said = browser::decoded(said.strip_prefix("v1,").unwrap());
-    assert_eq!(said.iter().map(|byte| format!("{byte:02x}")).collect::<String>(), signed);
+    assert_eq!(hex::encode(said), signed);
     let mut inbox = inbox.lock().unwrap();
     let (status, location) = inbox.answers.pop_front().unwrap_or((StatusCode::NO_CONTENT, None));
     inbox.got.push((id, status.as_u16(), serde_json::from_str(&body).unwrap()));
