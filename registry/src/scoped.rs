@@ -198,7 +198,7 @@ impl Records for ScopedRecords {
         Ok(models)
     }
 
-    async fn model(&self, model: &ModelName) -> Result<Option<Model>> {
+    async fn model(&self, model: &ModelName) -> Result<Option<(Model, Vec<Version>)>> {
         if self.sees_model(model).await? { self.all.model(model).await } else { Ok(None) }
     }
 

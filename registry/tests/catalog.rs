@@ -78,7 +78,7 @@ async fn best_is_the_best_finite_value_and_the_older_of_equals() {
     let (store, model) = with_versions(dir.path(), &[0.3, f64::NAN, 0.1, 0.1, f64::NEG_INFINITY]).await;
     assert_eq!(store.resolve("m@best").await.unwrap().version, 3);
     assert_eq!(store.resolve("m@latest").await.unwrap().version, 5);
-    assert_eq!(store.model(&model).await.unwrap().unwrap().best, Some(3));
+    assert_eq!(store.model(&model).await.unwrap().unwrap().0.best, Some(3));
     for missing in ["m:6", "m@prod", "other@best"] {
         let error = store.resolve(missing).await.unwrap_err();
         assert!(matches!(error, QueryError::NotFound(_)) && error.to_string().contains("there are"), "{error}");

@@ -585,7 +585,7 @@ async fn versions_are_numbered_and_never_made_twice(place: &impl Place) {
     assert_eq!(versions.iter().map(|v| v.version).collect::<Vec<_>>(), [1, 2, 3]);
     assert_eq!(versions[1].metrics, metrics(&[("latent_fid", 0.2), ("fid", 0.1)]), "metrics are added");
     assert_eq!(records.version_of(&name, again).await.unwrap().unwrap().version, 2);
-    let model = records.model(&name).await.unwrap().unwrap();
+    let (model, _) = records.model(&name).await.unwrap().unwrap();
     assert_eq!((model.versions, model.best), (3, Some(2)));
     for (reference, version) in [("m@best", 2), ("m@latest", 3), ("m:1", 1)] {
         assert_eq!(records.resolve(reference).await.unwrap().version, version, "{reference}");

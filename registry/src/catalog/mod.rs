@@ -158,8 +158,8 @@ pub trait Records: Debug + Send + Sync {
     /// All models by name.
     async fn models(&self) -> Result<Vec<Model>>;
 
-    /// Returns one model.
-    async fn model(&self, model: &ModelName) -> Result<Option<Model>>;
+    /// Returns one model and its versions, oldest first.
+    async fn model(&self, model: &ModelName) -> Result<Option<(Model, Vec<Version>)>>;
 
     /// Returns a model's versions, oldest first.
     async fn versions(&self, model: &ModelName) -> Result<Vec<Version>>;
@@ -177,7 +177,7 @@ pub trait Records: Debug + Send + Sync {
         let reference: ModelRef = reference.parse().map_err(QueryError::Invalid)?;
         match self.model(&reference.model).await? {
             None => Err(versions::unknown(&reference.model, &self.models().await?)),
-            Some(model) => versions::pick(&reference, &model, &self.versions(&reference.model).await?),
+            Some((model, versions)) => versions::pick(&reference, &model, &versions),
         }
     }
 

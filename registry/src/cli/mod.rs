@@ -240,7 +240,7 @@ async fn answer(command: Command, store: &ReadStore, holder: Option<(&Store, &st
         Command::List => Data::Models { models: store.models().await? },
         Command::Show { reference } => show(store, &reference).await?,
         Command::History { model, alias } => {
-            let model = known(store, &model).await?.model;
+            let model = known(store, &model).await?.0.model;
             let alias = alias.map(|alias| alias.parse::<Alias>()).transpose().map_err(invalid)?;
             let history = store.history(&model, alias.as_ref()).await?;
             Data::History { model, history }
@@ -370,7 +370,7 @@ async fn one(store: &ReadStore, text: &str) -> Result<Version, Refused> {
     if reference.pick.is_some() {
         return Ok(store.resolve(text).await?);
     }
-    let pick = if known(store, text).await?.best.is_some() { BEST } else { LATEST };
+    let pick = if known(store, text).await?.0.best.is_some() { BEST } else { LATEST };
     Ok(store.resolve(&format!("{text}@{pick}")).await?)
 }
 
@@ -392,8 +392,7 @@ async fn leaderboard(store: &ReadStore, of: &str, published: bool) -> Result<Lea
         }
         return Ok(leaderboard::leaderboard(of.to_owned(), &all, None, published.then_some(of)));
     }
-    let model = known(store, of).await?;
-    let versions = store.versions(&model.model).await?;
+    let (model, versions) = known(store, of).await?;
     let format = match versions.first().filter(|_| published) {
         Some(version) => format_of(store, version).await,
         None => None,
@@ -401,10 +400,11 @@ async fn leaderboard(store: &ReadStore, of: &str, published: bool) -> Result<Lea
     Ok(leaderboard::leaderboard(of.to_owned(), &versions, model.metric.as_deref(), format.as_deref()))
 }
 
-async fn known(store: &ReadStore, name: &str) -> Result<Model, Refused> {
+/// Returns a model and its versions, oldest first.
+async fn known(store: &ReadStore, name: &str) -> Result<(Model, Vec<Version>), Refused> {
     let name: ModelName = name.parse().map_err(invalid)?;
     match store.model(&name).await? {
-        Some(model) => Ok(model),
+        Some(found) => Ok(found),
         // The error of `resolve` lists the known models.
         None => Err(store
             .resolve(&format!("{name}@latest"))
@@ -431,8 +431,7 @@ const MOST_LINES: usize = 10_000;
 async fn show(store: &ReadStore, text: &str) -> Result<Data, Refused> {
     let reference: ModelRef = text.parse().map_err(invalid)?;
     if reference.pick.is_none() {
-        let model = known(store, reference.model.as_str()).await?;
-        let versions = store.versions(&reference.model).await?;
+        let (model, versions) = known(store, reference.model.as_str()).await?;
         return Ok(Data::Model { model, versions });
     }
     let version = store.resolve(text).await?;

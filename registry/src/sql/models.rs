@@ -23,27 +23,29 @@ fn number(row: &Row, column: &str) -> Result<u64, sqlx::Error> {
     Ok(row.try_get::<i64, _>(column)?.unsigned_abs())
 }
 
-fn version(row: &Row) -> Result<Version, sqlx::Error> {
-    let aliases: Option<String> = row.try_get("aliases")?;
+/// Reads a version; takes its names out of `aliases`.
+fn version(row: &Row, aliases: &mut BTreeMap<u64, Vec<String>>) -> Result<Version, sqlx::Error> {
+    let version = number(row, "version")?;
     Ok(Version {
         model: ModelName::new(row.try_get::<String, _>("model")?),
-        version: number(row, "version")?,
+        version,
         artifact: digest(row, "artifact")?,
         metrics: numbers(row.try_get("metrics")?),
         source: serde_json::from_str(row.try_get("source")?).unwrap_or_default(),
         created_ms: row.try_get("at_ms")?,
-        aliases: aliases.map(|names| names.split(',').map(str::to_owned).collect()).unwrap_or_default(),
+        aliases: aliases.remove(&version).unwrap_or_default(),
     })
 }
 
-const VERSIONS: &str = "SELECT v.*, (SELECT string_agg(alias, ',') FROM (SELECT alias FROM aliases a \
-    WHERE a.model = v.model AND a.version = v.version ORDER BY alias) AS named) AS aliases \
-    FROM versions v WHERE v.model = ? ORDER BY v.version";
-
 /// Returns all versions of a model, oldest first.
 pub(super) async fn versions(conn: &mut Conn<'_>, model: &ModelName) -> Result<Vec<Version>, sqlx::Error> {
-    let rows = query(VERSIONS).bind(model.as_str()).fetch_all(&mut *conn).await?;
-    rows.iter().map(version).collect()
+    let named = query("SELECT version, alias FROM aliases WHERE model = ? ORDER BY alias");
+    let mut aliases: BTreeMap<u64, Vec<String>> = BTreeMap::new();
+    for row in named.bind(model.as_str()).fetch_all(&mut *conn).await? {
+        aliases.entry(number(&row, "version")?).or_default().push(row.try_get("alias")?);
+    }
+    let rows = query("SELECT * FROM versions WHERE model = ? ORDER BY version").bind(model.as_str());
+    rows.fetch_all(&mut *conn).await?.iter().map(|row| version(row, &mut aliases)).collect()
 }
 
 async fn declared(
@@ -59,11 +61,11 @@ async fn declared(
     Ok(Some((row.try_get("metric")?, mode)))
 }
 
-/// Returns one model.
-pub(super) async fn model(conn: &mut Conn<'_>, name: &ModelName) -> Result<Option<Model>, sqlx::Error> {
+/// Returns one model and its versions, oldest first.
+pub(super) async fn model(conn: &mut Conn<'_>, name: &ModelName) -> Result<Option<(Model, Vec<Version>)>, sqlx::Error> {
     let Some((metric, mode)) = declared(conn, name).await? else { return Ok(None) };
     let versions = versions(conn, name).await?;
-    Ok(Some(versions::summary(name.clone(), metric, mode, &versions)))
+    Ok(Some((versions::summary(name.clone(), metric, mode, &versions), versions)))
 }
 
 /// Returns all models by name.
@@ -71,7 +73,8 @@ pub(super) async fn models(conn: &mut Conn<'_>) -> Result<Vec<Model>, sqlx::Erro
     let rows = query("SELECT model FROM models ORDER BY model").fetch_all(&mut *conn).await?;
     let mut models = Vec::with_capacity(rows.len());
     for row in rows {
-        models.extend(model(conn, &ModelName::new(row.try_get::<String, _>(0)?)).await?);
+        let found = model(conn, &ModelName::new(row.try_get::<String, _>(0)?)).await?;
+        models.extend(found.map(|(model, _)| model));
     }
     Ok(models)
 }

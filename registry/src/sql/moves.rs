@@ -71,7 +71,7 @@ async fn resolve(conn: &mut Conn<'_>, model: &ModelName, pick: Pick) -> Result<V
     let reference = ModelRef { model: model.clone(), pick: Some(pick) };
     match models::model(conn, model).await? {
         None => Err(versions::unknown(model, &models::models(conn).await?)),
-        Some(found) => versions::pick(&reference, &found, &models::versions(conn, model).await?),
+        Some((model, versions)) => versions::pick(&reference, &model, &versions),
     }
 }
 

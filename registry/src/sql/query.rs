@@ -218,7 +218,7 @@ impl Records for SqlRecords {
         Ok(models::models(&mut conn).await?)
     }
 
-    async fn model(&self, model: &ModelName) -> Result<Option<Model>> {
+    async fn model(&self, model: &ModelName) -> Result<Option<(Model, Vec<Version>)>> {
         let mut reader = self.0.reader().await?;
         let mut conn = reader.conn();
         Ok(models::model(&mut conn, model).await?)

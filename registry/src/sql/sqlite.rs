@@ -27,7 +27,11 @@ fn options(dir: &Path) -> SqliteConnectOptions {
         .foreign_keys(true)
         .busy_timeout(Duration::from_secs(10))
         .statement_cache_capacity(200)
+        .row_buffer_size(ROWS_AHEAD)
 }
+
+/// Number of rows that a connection reads ahead of their use. With the default of 50, each row of a longer list wakes a thread.
+const ROWS_AHEAD: usize = 1_024;
 
 /// Opens the writing connection and migrates the schema, after checking that the database belongs to the parts `found`
 /// beside it. Only for the holder of the store's lock.
@@ -110,6 +114,7 @@ fn reading(dir: &Path, closed: bool) -> SqliteConnectOptions {
         .immutable(closed)
         .busy_timeout(Duration::from_secs(10))
         .statement_cache_capacity(200)
+        .row_buffer_size(ROWS_AHEAD)
 }
 
 /// Checks that a database opened for reading belongs to the parts `found` beside it and has this build's schema.
