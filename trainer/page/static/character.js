@@ -5,13 +5,15 @@
 //! hips and chest take their turn from three joints, and knees and elbows from the plane in which they bend. The character is scaled to
 //! the motion's legs, so that feet stand where they stood.
 
+import { size } from "./format.js";
+
 /** @typedef {[number, number, number]} Vec */
 /** Rows of a rotation. @typedef {[Vec, Vec, Vec]} Turn */
 /** Where a picture is taken from: see `camera` in viewer.js. @typedef {{at: Vec, turn: [number, number, number, number], scale: number, distance: number}} Lens */
 /** @typedef {{first: number, count: number, colour: Vec, image: ImageBitmap | null}} Part */
 
 /** Limits of a file. */
-const [BYTES, VERTICES, NODES] = [64e6, 400_000, 2000];
+const [BYTES, VERTICES, NODES] = [64 << 20, 400_000, 2000];
 /** Parts of a body, parents first: name, parent, and the part that it points to. @type {[string, string | null, string | null][]} */
 const ROLES = [
   ["pelvis", null, null], ["spine1", "pelvis", "spine2"], ["spine2", "spine1", "spine3"], ["spine3", "spine2", "neck"], ["neck", "spine3", "head"], ["head", "neck", null],
@@ -104,7 +106,7 @@ class File {
   /** @param {ArrayBuffer} buffer */
   constructor(buffer) {
     const view = new DataView(buffer);
-    if (buffer.byteLength > BYTES) throw new Error(`the file has ${Math.round(buffer.byteLength / 1e6)} MB; expected at most ${BYTES / 1e6}`);
+    if (buffer.byteLength > BYTES) throw new Error(`the file has ${size(buffer.byteLength)}; expected at most ${size(BYTES)}`);
     if (buffer.byteLength < 28 || view.getUint32(0, true) !== 0x46546c67 || view.getUint32(4, true) !== 2) throw new Error("this is no GLB file of glTF 2.0");
     const length = view.getUint32(12, true);
     /** @type {any} */

@@ -3,6 +3,7 @@
 //! Sources: `motion::dataset` for the files, and `motion::features::recover_joints` for the joints, which a test compares with these.
 
 import { blob, part } from "./api.js";
+import { size } from "./format.js";
 
 /** @typedef {{parents: number[], sides: string, head: number, fps: number, metres: number}} Format */
 /** @type {Record<string, Format>} */
@@ -79,7 +80,7 @@ export class Clips {
     this.files = manifest.files ?? {};
     const index = this.files["dataset.json"];
     if (!index) throw new Error("this artifact is no dataset");
-    if (index.bytes > MOST) throw new Error(`its list of clips has ${Math.round(index.bytes / 1e6)} MB, which is too much for a page`);
+    if (index.bytes > MOST) throw new Error(`its list of clips has ${size(index.bytes)}, which is too much for a page`);
     const read = /** @type {Index} */ (await json(index.digest));
     if (read.version !== 1 || !(read.format in FORMATS)) throw new Error("it was made by another version of Stride");
     this.index = read;

@@ -34,15 +34,15 @@ export function rate(perSecond, unit) {
   return `${Number(perSecond.toPrecision(perSecond < 100 ? 2 : 3))} ${unit || "steps"}/s`;
 }
 
-/** @param {number} bytes */
+/** `412.0 MiB`, as the commands write it. @param {number} bytes */
 export function size(bytes) {
-  const units = ["B", "KB", "MB", "GB", "TB"];
+  const units = ["B", "KiB", "MiB", "GiB", "TiB"];
   let at = 0;
-  while (bytes >= 1000 && at < units.length - 1) {
-    bytes /= 1000;
+  while (bytes >= 1024 && at < units.length - 1) {
+    bytes /= 1024;
     at += 1;
   }
-  return `${Number(bytes.toPrecision(3))} ${units[at]}`;
+  return `${at ? bytes.toFixed(1) : bytes} ${units[at]}`;
 }
 
 /** `5 min ago`. @param {number} ms @param {number} nowMs */
