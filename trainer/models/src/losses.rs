@@ -14,7 +14,7 @@ use burn::tensor::{Device, Tensor, TensorData};
 use motion::skeleton::Skeleton;
 use protocol::stage::VaeLoss;
 
-use crate::kernels;
+use crate::kernels::{self, Derivative};
 use crate::networks::Posterior;
 
 pub use crate::kernels::Pointwise;
@@ -209,13 +209,17 @@ pub struct VaeRecipe {
     pub velocity: Pointwise,
     /// Distance of the term on foot velocities.
     pub feet: Pointwise,
+    /// Distance of the term on the velocities of all joints.
+    pub joint_velocity: Pointwise,
+    /// Distance of the term on the accelerations of all joints.
+    pub joint_acceleration: Pointwise,
 }
 
 impl From<VaeLoss> for VaeRecipe {
     /// Uses smooth L1 for all terms, as published.
     fn from(weights: VaeLoss) -> Self {
-        let [feature, joint, velocity, feet] = [Pointwise::SmoothL1; 4];
-        Self { weights, feature, joint, velocity, feet }
+        let [feature, joint, velocity, feet, joint_velocity, joint_acceleration] = [Pointwise::SmoothL1; 6];
+        Self { weights, feature, joint, velocity, feet, joint_velocity, joint_acceleration }
     }
 }
 
@@ -230,6 +234,10 @@ pub struct VaeTerms {
     pub velocity: Option<Tensor<1>>,
     /// The term on the velocities of ankles and feet.
     pub feet: Option<Tensor<1>>,
+    /// The term on the velocities of all joints.
+    pub joint_velocity: Option<Tensor<1>>,
+    /// The term on the accelerations of all joints.
+    pub joint_acceleration: Option<Tensor<1>>,
     /// The KL divergence of the posterior.
     pub kl: Option<Tensor<1>>,
 }
@@ -237,11 +245,21 @@ pub struct VaeTerms {
 impl VaeTerms {
     /// The sum of the terms.
     pub fn total(&self) -> Option<Tensor<1>> {
-        [&self.feature, &self.joint, &self.velocity, &self.feet, &self.kl]
-            .into_iter()
-            .flatten()
-            .cloned()
-            .reduce(|a, b| a + b)
+        self.named().into_iter().filter_map(|(_, term)| term).reduce(|a, b| a + b)
+    }
+
+    /// The terms by the names under which they are recorded.
+    pub fn named(&self) -> [(&'static str, Option<Tensor<1>>); 7] {
+        let Self { feature, joint, velocity, feet, joint_velocity, joint_acceleration, kl } = self.clone();
+        [
+            ("feature", feature),
+            ("joint", joint),
+            ("velocity", velocity),
+            ("feet", feet),
+            ("joint_velocity", joint_velocity),
+            ("joint_acceleration", joint_acceleration),
+            ("kl", kl),
+        ]
     }
 }
 
@@ -264,30 +282,34 @@ pub fn vae(
     let term = |weight: f64, value: &dyn Fn() -> Tensor<1>| (weight != 0.0).then(|| value() * (weight as f32));
     let positions = body.skeleton.layout().positions;
     let local = |x: &Tensor<3>| x.clone().slice([0..batch, 0..frames, positions.clone()]);
-    // Recovering the joints takes many operations, so both terms on joints share the result.
-    let weighs = weights.joint != 0.0 || weights.feet != 0.0;
-    let joints = weighs.then(|| [body.metres(decoded.clone()), body.metres(features.clone())]);
+    // Recovering the joints takes many operations, so all terms on joints share the result.
+    let joints = weights.compares_joints().then(|| [body.metres(decoded.clone()), body.metres(features.clone())]);
     let compared = |x: &Tensor<4>| x.clone().reshape([batch, frames, 3 * body.skeleton.joints]);
+    let change = |weight: f64, distance: Pointwise, which: &[usize], derivative: Derivative| {
+        let [found, expected] = joints.as_ref().filter(|_| frames > derivative.order())?;
+        let lengths: Vec<usize> = lengths.iter().map(|length| length.saturating_sub(derivative.order())).collect();
+        let each = FrameWeights::masked(&lengths, frames - derivative.order(), &device);
+        let of = |x: &Tensor<4>| kernels::joint_derivative(x.clone(), which, derivative, body.skeleton.fps);
+        term(weight, &|| each.compare(distance, of(found), of(expected)))
+    };
+    let feet: Vec<usize> = body.skeleton.left_foot.iter().chain(&body.skeleton.right_foot).copied().collect();
+    let all: Vec<usize> = (0..body.skeleton.joints).collect();
     VaeTerms {
         feature: term(weights.feature, &|| frame_weights.compare(recipe.feature, decoded.clone(), features.clone())),
         joint: joints.as_ref().and_then(|[found, expected]| {
             term(weights.joint, &|| frame_weights.compare(recipe.joint, compared(found), compared(expected)))
         }),
         velocity: term(weights.velocity, &|| frame_weights.compare(recipe.velocity, local(&decoded), local(&features))),
-        feet: joints.as_ref().filter(|_| frames > 1).and_then(|[found, expected]| {
-            let moves = |x: &Tensor<4>| foot_velocities(x, body.skeleton);
-            let steps: Vec<usize> = lengths.iter().map(|length| length.saturating_sub(1)).collect();
-            let each = FrameWeights::masked(&steps, frames - 1, &device);
-            term(weights.feet, &|| each.compare(recipe.feet, moves(found), moves(expected)))
-        }),
+        feet: change(weights.feet, recipe.feet, &feet, Derivative::Velocity),
+        joint_velocity: change(weights.joint_velocity, recipe.joint_velocity, &all, Derivative::Velocity),
+        joint_acceleration: change(
+            weights.joint_acceleration,
+            recipe.joint_acceleration,
+            &all,
+            Derivative::Acceleration,
+        ),
         kl: term(weights.kl, &|| kl(posterior)),
     }
-}
-
-/// Velocities [B, T - 1, 4 x 3] of ankles and feet, per second. `joints` [B, T, J, 3].
-fn foot_velocities(joints: &Tensor<4>, skeleton: &Skeleton) -> Tensor<3> {
-    let feet: Vec<usize> = skeleton.left_foot.iter().chain(&skeleton.right_foot).copied().collect();
-    kernels::joint_velocities(joints.clone(), &feet, skeleton.fps)
 }
 
 #[cfg(test)]
@@ -385,6 +407,33 @@ mod tests {
         let found = terms.feet.expect("it has a weight").into_data().as_slice::<f32>().unwrap()[0];
         // One axis of three counts; smooth L1 of 2 is 1.5.
         assert!((found - 3.0 * 1.5 / 3.0).abs() < 1e-5, "{found}");
+    }
+
+    #[test]
+    fn accelerations_cost_what_shakes() {
+        let skeleton = Skeleton::of(DataFormat::Humanml3d);
+        let device = Device::flex();
+        let body = Body::new(skeleton, &vec![0.0; skeleton.features], &vec![1.0; skeleton.features], &device);
+        let stands = vec![0.0; 5 * skeleton.features];
+        let mut shakes = stands.clone();
+        // The height of all joints but the root goes up and down by .001 m each frame: 1.6 m/s^2 twice a frame.
+        let positions = skeleton.layout().positions;
+        for t in 0..5 {
+            for i in positions.clone().skip(1).step_by(3) {
+                shakes[t * skeleton.features + i] = if t % 2 == 0 { 0.001 } else { -0.001 };
+            }
+        }
+        let rows =
+            |values: &[f32]| Tensor::from_data(TensorData::new(values.to_vec(), [1, 5, skeleton.features]), &device);
+        let weights = VaeLoss { feature: 0.0, joint: 0.0, joint_acceleration: 2.0, kl: 0.0, ..VaeLoss::default() };
+        let zeros = || Tensor::zeros([1, 1, 1], &device);
+        let posterior = Posterior { mu_bnd: zeros(), logvar_bnd: zeros() };
+        let terms = vae(&weights.into(), &body, rows(&shakes), rows(&stands), &posterior, &[5]);
+        assert!(terms.joint.is_none() && terms.joint_velocity.is_none() && terms.feet.is_none());
+        let found = terms.joint_acceleration.expect("it has a weight").into_data().as_slice::<f32>().unwrap()[0];
+        // Smooth L1 of 4 x .001 x 20^2 = 1.6 is 1.1; one axis of three, 21 joints of 22.
+        let expected = 2.0 * 1.1 / 3.0 * 21.0 / 22.0;
+        assert!((found - expected).abs() < 1e-4, "{found}, expected {expected}");
     }
 
     #[test]

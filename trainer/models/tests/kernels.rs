@@ -2,7 +2,7 @@
 #![cfg(feature = "flex")]
 
 use burn::tensor::{Device, Tensor, TensorData};
-use models::kernels::{self, Dropout, KeyMask, stock};
+use models::kernels::{self, Derivative, Dropout, KeyMask, stock};
 use motion::skeleton::Skeleton;
 use protocol::stage::DataFormat;
 
@@ -419,7 +419,7 @@ fn distances_are_the_stock_distances() {
 }
 
 #[test]
-fn joints_and_velocities_are_the_stock_ones() {
+fn joints_and_their_derivatives_are_the_stock_ones() {
     for format in [DataFormat::Humanml3d, DataFormat::Kit] {
         let skeleton = Skeleton::of(format);
         for frames in [1, 2, 33] {
@@ -431,10 +431,12 @@ fn joints_and_velocities_are_the_stock_ones() {
                 let joints = kernels::joints(x.clone(), mean * 0.1, std * 0.1, 1.7, skeleton);
                 let mut all = vec![values(joints.clone())];
                 let mut loss = weighted(joints.clone());
-                if frames > 1 {
-                    let moves = kernels::joint_velocities(joints, &[7, 0, 10], 20.0);
-                    all.push(values(moves.clone()));
-                    loss = loss + weighted(moves);
+                for derivative in [Derivative::Velocity, Derivative::Acceleration] {
+                    if frames > derivative.order() {
+                        let change = kernels::joint_derivative(joints.clone(), &[7, 0, 10], derivative, 20.0);
+                        all.push(values(change.clone()));
+                        loss = loss + weighted(change) * 0.05;
+                    }
                 }
                 all.push(values(x.grad(&loss.backward()).unwrap()));
                 all

@@ -1,4 +1,4 @@
-//! Joint positions of feature rows, and velocities of joints, each in one pass.
+//! Joint positions of feature rows, and velocities and accelerations of joints, each in one pass.
 //!
 //! The turn feature is half the yaw increment, so twice its running sum is the yaw. Row t holds the increment from frame
 //! t to t + 1; turn and velocity of the last row are not used. Derived by hand: a gradient of a running sum is the
@@ -27,21 +27,50 @@ pub fn joints(
     composed(features * std + mean, skeleton) * scale
 }
 
-/// Velocities [B, T - 1, 3 per joint] of the joints `which`: differences of neighbouring frames times `rate`. `joints`
-/// [B, T, J, 3].
-pub fn joint_velocities(joints: Tensor<4>, which: &[usize], rate: f64) -> Tensor<3> {
-    #[expect(clippy::cast_possible_truncation, reason = "frames per second")]
-    let rate = rate as f32;
+/// A derivative of a joint's path by time.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Derivative {
+    /// Difference of neighbouring frames.
+    Velocity,
+    /// Difference of neighbouring velocities.
+    Acceleration,
+}
+
+impl Derivative {
+    /// Number of frames that it lacks.
+    pub const fn order(self) -> usize {
+        match self {
+            Self::Velocity => 1,
+            Self::Acceleration => 2,
+        }
+    }
+
+    /// Factors on successive frames.
+    const fn factors(self) -> &'static [f32] {
+        match self {
+            Self::Velocity => &[-1.0, 1.0],
+            Self::Acceleration => &[1.0, -2.0, 1.0],
+        }
+    }
+}
+
+/// The derivative [B, T - order, 3 per joint] of the joints `which`, at `fps` frames a second. `joints` [B, T, J, 3],
+/// with more frames than the derivative's order.
+pub fn joint_derivative(joints: Tensor<4>, which: &[usize], derivative: Derivative, fps: f64) -> Tensor<3> {
+    #[expect(clippy::cast_possible_truncation, reason = "frames per second, at most squared")]
+    let rate = (0..derivative.order()).fold(1.0, |rate, _| rate * fps) as f32;
     #[cfg(feature = "flex")]
     if fused::takes(&joints) {
-        return fused::run(kernel::Velocities { which: which.to_vec(), rate }, [joints.into()]);
+        return fused::run(kernel::Change { which: which.to_vec(), derivative, rate }, [joints.into()]);
     }
     let [batch, frames, _, _] = joints.dims();
     let width = 3 * which.len();
     let one = |j: &usize| joints.clone().slice([0..batch, 0..frames, *j..j + 1, 0..3]);
     let chosen = Tensor::cat(which.iter().map(one).collect(), 2).reshape([batch, frames, width]);
-    let at = |t: std::ops::Range<usize>| chosen.clone().slice([0..batch, t, 0..width]);
-    (at(1..frames) - at(0..frames - 1)) * rate
+    let left = frames - derivative.order();
+    let from = |(t, factor): (usize, &f32)| chosen.clone().slice([0..batch, t..t + left, 0..width]) * *factor;
+    let terms = derivative.factors().iter().enumerate().map(from);
+    terms.reduce(|sum, term| sum + term).expect("a derivative has factors") * rate
 }
 
 /// Joints of features that are not normalised.
@@ -86,6 +115,7 @@ mod kernel {
     use burn::backend::flex::FlexTensor;
     use motion::skeleton::Skeleton;
 
+    use super::Derivative;
     use crate::kernels::fused::{Fused, make, shape, slice};
 
     /// Feature columns of turn, velocity along x and z, and height.
@@ -254,12 +284,20 @@ mod kernel {
     }
 
     #[derive(Debug, Clone)]
-    pub(super) struct Velocities {
+    pub(super) struct Change {
         pub(super) which: Vec<usize>,
+        pub(super) derivative: Derivative,
         pub(super) rate: f32,
     }
 
-    impl Fused<1> for Velocities {
+    impl Change {
+        /// Coordinates of the joints in a frame.
+        fn coordinates(&self) -> Vec<usize> {
+            self.which.iter().flat_map(|j| 3 * j..3 * j + 3).collect()
+        }
+    }
+
+    impl Fused<1> for Change {
         /// The shape of the joints.
         type Kept = Vec<usize>;
 
@@ -268,27 +306,41 @@ mod kernel {
             let batch = sizes[0];
             let frames = sizes[1];
             let width = 3 * sizes[2];
-            let mut out = Vec::with_capacity(batch * (frames - 1) * 3 * self.which.len());
+            let coordinates = self.coordinates();
+            let left = frames - self.derivative.order();
+            let mut out = Vec::with_capacity(batch * left * coordinates.len());
             for clip in slice(&joints).chunks_exact(frames * width) {
-                for (now, next) in clip.chunks_exact(width).zip(clip[width..].chunks_exact(width)) {
-                    for i in self.which.iter().flat_map(|j| 3 * j..3 * j + 3) {
-                        out.push((next[i] - now[i]) * self.rate);
+                for t in 0..left {
+                    let from = &clip[t * width..];
+                    match self.derivative {
+                        Derivative::Velocity => {
+                            out.extend(coordinates.iter().map(|i| (from[width + i] - from[*i]) * self.rate));
+                        }
+                        Derivative::Acceleration => out.extend(
+                            coordinates
+                                .iter()
+                                .map(|i| (from[2 * width + i] - 2.0 * from[width + i] + from[*i]) * self.rate),
+                        ),
                     }
                 }
             }
-            (make(out, &[batch, frames - 1, 3 * self.which.len()]), sizes)
+            (make(out, &[batch, left, coordinates.len()]), sizes)
         }
 
         fn backward(&self, sizes: Vec<usize>, dy: FlexTensor, _: [bool; 1]) -> [Option<FlexTensor>; 1] {
             let frames = sizes[1];
             let width = 3 * sizes[2];
+            let coordinates = self.coordinates();
+            let left = frames - self.derivative.order();
             let mut out = vec![0.0; sizes.iter().product()];
-            let moved = 3 * self.which.len();
-            for (clip, dy) in out.chunks_exact_mut(frames * width).zip(slice(&dy).chunks_exact((frames - 1) * moved)) {
-                for (t, dy) in dy.chunks_exact(moved).enumerate() {
-                    for (i, d) in self.which.iter().flat_map(|j| 3 * j..3 * j + 3).zip(dy) {
-                        clip[t * width + i] -= d * self.rate;
-                        clip[(t + 1) * width + i] += d * self.rate;
+            let gradients = slice(&dy).chunks_exact(left * coordinates.len());
+            for (clip, dy) in out.chunks_exact_mut(frames * width).zip(gradients) {
+                for (t, dy) in dy.chunks_exact(coordinates.len()).enumerate() {
+                    for (k, factor) in self.derivative.factors().iter().enumerate() {
+                        let to = &mut clip[(t + k) * width..][..width];
+                        for (i, d) in coordinates.iter().zip(dy) {
+                            to[*i] += d * (self.rate * factor);
+                        }
                     }
                 }
             }

@@ -31,7 +31,7 @@ pub use distance::{Pointwise, weighted_distance};
 pub use dropout::{Dropout, dropout};
 pub use gelu::gelu;
 pub use gru::gru;
-pub use joints::{joint_velocities, joints};
+pub use joints::{Derivative, joint_derivative, joints};
 pub use linear::linear;
 pub use mish::mish;
 pub use norm::{add_layer_norm, layer_norm, leaky_layer_norm};

@@ -25,19 +25,35 @@ pub struct VaeLoss {
     /// L_foot).
     #[schemars(range(min = 0.0, max = 1e6))]
     pub feet: f64,
+    /// Smooth L1 on the velocity of all joints, in m/s (our choice).
+    #[schemars(range(min = 0.0, max = 1e6))]
+    pub joint_velocity: f64,
+    /// Smooth L1 on the acceleration of all joints, in m/s^2, which reduces shaking (our choice).
+    #[schemars(range(min = 0.0, max = 1e6))]
+    pub joint_acceleration: f64,
     /// KL divergence from the standard normal, a mean over all elements.
     #[schemars(range(min = 0.0, max = 1e6))]
     pub kl: f64,
     /// Leaves out padded frames (v2); false is v1's plain mean.
     pub masked: bool,
-    /// Share of the steps before the terms on joints and feet start; early, the root drift dominates the posture.
+    /// Share of the steps before the terms on joints start; early, the root drift dominates the posture.
     #[schemars(range(min = 0.0, max = 1.0), extend("x-unit" = "of the steps"))]
     pub joint_from: f64,
 }
 
 impl Default for VaeLoss {
     fn default() -> Self {
-        Self { feature: 1.0, joint: 1.0, velocity: 0.0, feet: 0.0, kl: 1e-4, masked: true, joint_from: 0.0 }
+        Self {
+            feature: 1.0,
+            joint: 1.0,
+            velocity: 0.0,
+            feet: 0.0,
+            joint_velocity: 0.0,
+            joint_acceleration: 0.0,
+            kl: 1e-4,
+            masked: true,
+            joint_from: 0.0,
+        }
     }
 }
 
@@ -136,17 +152,19 @@ impl StageSpec for TrainVae {
     }
 
     fn recorded(&self) -> &'static [&'static str] {
-        if self.loss.feet == 0.0 {
-            &["loss", "feature", "joint", "kl"]
-        } else {
+        if self.loss.joint_velocity != 0.0 || self.loss.joint_acceleration != 0.0 {
+            &["loss", "feature", "joint", "kl", "feet", "joint_velocity", "joint_acceleration"]
+        } else if self.loss.feet != 0.0 {
             &["loss", "feature", "joint", "kl", "feet"]
+        } else {
+            &["loss", "feature", "joint", "kl"]
         }
     }
 
     fn loss_changes(&self) -> Vec<LossChange> {
         let steps = self.training.steps;
-        let weighted = self.loss.joint > 0.0 || self.loss.feet > 0.0;
-        let terms = "the loss includes the terms on joints and feet";
+        let weighted = self.loss.compares_joints();
+        let terms = "the loss includes the terms on joints";
         let terms = LossChange::behind(self.loss.joint_from, steps, terms, "loss.joint_from").filter(|_| weighted);
         let clips = "training changes from short crops to whole clips, which have a higher loss";
         terms.into_iter().chain(LossChange::behind(self.windows.until, steps, clips, "windows.until")).collect()
@@ -158,6 +176,16 @@ impl StageSpec for TrainVae {
 }
 
 impl VaeLoss {
+    /// Returns true if a term compares recovered joints or their derivatives.
+    pub fn compares_joints(&self) -> bool {
+        [self.joint, self.feet, self.joint_velocity, self.joint_acceleration].iter().any(|weight| *weight != 0.0)
+    }
+
+    /// The loss without these terms.
+    pub fn without_joints(&self) -> Self {
+        Self { joint: 0.0, feet: 0.0, joint_velocity: 0.0, joint_acceleration: 0.0, ..self.clone() }
+    }
+
     fn check(&self, p: &mut Problems) {
         if self.feature == 0.0 && self.joint == 0.0 {
             p.add("loss.feature", "`loss.feature` and `loss.joint` are both 0, so nothing is reconstructed", "");

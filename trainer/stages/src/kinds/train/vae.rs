@@ -1,7 +1,7 @@
 //! `train.vae`: the motion VAE. Source: MLD (arXiv:2212.04048) and MotionLCM v2: smooth L1 on normalised features and
 //! on joints in metres, KL as a mean over all elements.
 //!
-//! Ours: an optional first phase on short windows, a term on the speed of feet, changed paths, and batches of similar
+//! Ours: an optional first phase on short windows, terms on the speed of feet and on derivatives of all joints, changed paths, and batches of similar
 //! length. Terms on joints and feet may start later. The unmasked loss of v1 counts padding up to the longest clip of a
 //! slice, not of the batch.
 
@@ -121,19 +121,11 @@ impl Objective for VaeObjective {
         // Early in training the root drift dominates the posture; the terms on joints may start later.
         let mut recipe = VaeRecipe::from(self.settings.loss.clone());
         if step < self.share(self.settings.loss.joint_from) {
-            recipe.weights.joint = 0.0;
-            recipe.weights.feet = 0.0;
+            recipe.weights = recipe.weights.without_joints();
         }
         let terms = losses::vae(&recipe, &self.body, decoded, rows, &posterior, &lengths);
         let mut losses = Losses::new(global);
-        let named = [
-            ("feature", terms.feature),
-            ("joint", terms.joint),
-            ("velocity", terms.velocity),
-            ("feet", terms.feet),
-            ("kl", terms.kl),
-        ];
-        for (name, term) in named {
+        for (name, term) in terms.named() {
             if let Some(term) = term {
                 // The weight is already applied.
                 losses.add(name, term, 1.0);
