@@ -13,6 +13,30 @@ const FUNCTION_WORDS: [&str; 27] = [
     "she", "someone", "the", "their", "then", "they", "to", "while", "with", "woman",
 ];
 
+/// Largest number of times that [`draws`] repeats a clip in an epoch.
+const MOST_DRAWS: usize = 16;
+
+/// The number of times that an epoch shows each clip, so that rare words are shown more often. `captions` are those of
+/// each clip. A clip's weight is `(clips / clips with its rarest word)^exponent`; the clip of median weight is shown once,
+/// each clip at least once.
+pub fn draws(captions: &[Vec<&str>], exponent: f64) -> Vec<usize> {
+    let meaning = |captions: &Vec<&str>| -> BTreeSet<String> {
+        let all = captions.iter().flat_map(|caption| words(caption));
+        all.filter(|word| !FUNCTION_WORDS.contains(&word.as_str())).collect()
+    };
+    let mut clips_with: BTreeMap<String, usize> = BTreeMap::new();
+    for word in captions.iter().flat_map(meaning) {
+        *clips_with.entry(word).or_default() += 1;
+    }
+    let rarest = |clip: &Vec<&str>| meaning(clip).iter().map(|word| clips_with[word]).min().unwrap_or(captions.len());
+    let weights: Vec<f64> =
+        captions.iter().map(|clip| (captions.len() as f64 / rarest(clip) as f64).powf(exponent)).collect();
+    let mut sorted = weights.clone();
+    sorted.sort_by(f64::total_cmp);
+    let median = sorted.get(sorted.len() / 2).copied().unwrap_or(1.0);
+    weights.iter().map(|weight| ((weight / median).round() as usize).clamp(1, MOST_DRAWS)).collect()
+}
+
 /// Words and sentences of training captions.
 #[derive(Debug, Clone, Default)]
 pub struct Vocabulary {
@@ -99,6 +123,17 @@ fn words(text: &str) -> impl Iterator<Item = String> + '_ {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn clips_with_rare_words_are_drawn_more_often() {
+        let mut clips = vec![vec!["a person walks", "someone is walking"]; 20];
+        clips.push(vec!["a person bows"]);
+        // 21 to the power of one half is 4.6; the walks have 1.02.
+        assert_eq!(draws(&clips, 0.5), [&[1; 20][..], &[4]].concat());
+        assert_eq!(draws(&clips, 0.0), vec![1; 21]);
+        assert_eq!(draws(&clips, 2.0)[20], MOST_DRAWS);
+        assert_eq!(draws(&[], 1.0), Vec::<usize>::new());
+    }
 
     fn vocabulary() -> Vocabulary {
         Vocabulary::of([

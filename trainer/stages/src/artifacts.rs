@@ -97,6 +97,9 @@ pub struct LatentsMeta {
     pub lengths: Vec<usize>,
     /// First frame of each row in its entry.
     pub starts: Vec<usize>,
+    /// Number of times that an epoch draws each entry; empty for once each.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub draws: Vec<usize>,
     /// Changes to the paths of training crops, if there are any.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub augmented: Option<Augmented>,

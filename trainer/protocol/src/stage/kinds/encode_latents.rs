@@ -17,6 +17,10 @@ pub struct EncodeLatents {
     /// Number of random crops per entry.
     #[schemars(range(min = 1, max = 256), extend("x-unit" = "crops of an entry"))]
     pub crops: usize,
+    /// Exponent by which trainings on these latents draw clips with rare words more often: a clip is drawn in proportion
+    /// to `1 / (clips with its rarest word)^balance`, at most 16 times as often as most; 0 draws all alike.
+    #[schemars(range(min = 0.0, max = 2.0))]
+    pub balance: f64,
     /// Changes the paths of the training split's crops, for a `train.control` on little data.
     pub augment: Augment,
     /// Number of shards.
@@ -26,7 +30,14 @@ pub struct EncodeLatents {
 
 impl Default for EncodeLatents {
     fn default() -> Self {
-        Self { dataset: "dataset".into(), vae: "vae".into(), crops: 8, augment: Augment::default(), shards: 8 }
+        Self {
+            dataset: "dataset".into(),
+            vae: "vae".into(),
+            crops: 8,
+            balance: 0.0,
+            augment: Augment::default(),
+            shards: 8,
+        }
     }
 }
 

@@ -6,7 +6,8 @@
 use std::collections::BTreeMap;
 
 use motion::Stream;
-use motion::dataset::{Split, crop};
+use motion::dataset::{Dataset, Split, crop};
+use motion::vocabulary;
 use protocol::stage::{self, EncodeLatents};
 use protocol::{ArtifactKind, Digest};
 use serde::{Deserialize, Serialize};
@@ -48,6 +49,21 @@ fn encode_crops(vae: &Autoencoder, crops: &[(usize, usize)], rows: &dyn Fn(usize
     (mu, sigma)
 }
 
+/// The number of times that an epoch draws each entry; empty if the settings do not balance. Only training entries count.
+fn draws(settings: &EncodeLatents, dataset: &Dataset) -> Vec<usize> {
+    if settings.balance == 0.0 {
+        return Vec::new();
+    }
+    let train = dataset.entries_of(stage::Split::Train);
+    let texts = |e: &usize| dataset.entries[*e].captions.iter().map(|c| dataset.captions[*c].text.as_str()).collect();
+    let captions: Vec<Vec<&str>> = train.iter().map(texts).collect();
+    let mut all = vec![1; dataset.entries.len()];
+    for (e, draws) in train.into_iter().zip(vocabulary::draws(&captions, settings.balance)) {
+        all[e] = draws;
+    }
+    all
+}
+
 impl Map for EncodeLatents {
     fn repetitions(&self, entries: &dyn Fn(stage::Split) -> f64) -> f64 {
         entries(stage::Split::All) * self.crops as f64
@@ -79,6 +95,7 @@ impl Map for EncodeLatents {
             captions: Vec::new(),
             lengths: Vec::new(),
             starts: Vec::new(),
+            draws: draws(self, &dataset).get(range.clone()).unwrap_or_default().to_vec(),
             augmented: (!self.augment.is_none()).then(|| Augmented {
                 augment: self.augment.clone(),
                 seed,
@@ -130,6 +147,7 @@ impl Map for EncodeLatents {
                     whole.captions.extend(latents.captions);
                     whole.lengths.extend(latents.lengths);
                     whole.starts.extend(latents.starts);
+                    whole.draws.extend(latents.draws);
                 }
             }
         }

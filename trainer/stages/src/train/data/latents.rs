@@ -3,6 +3,7 @@
 
 use std::cell::RefCell;
 use std::collections::BTreeMap;
+use std::iter::repeat_n;
 
 use burn::tensor::{Device, Tensor, TensorData};
 use models::flat::Entry;
@@ -24,6 +25,7 @@ use crate::train::{Order, Pick};
 pub(crate) struct LatentData {
     latents: Latents,
     embeddings: Embeddings,
+    /// Entries of an epoch, each as many times as it is drawn.
     train: Vec<usize>,
     order: RefCell<Order>,
     seed: Seed,
@@ -66,7 +68,9 @@ impl LatentData {
                 embeddings.meta.captions
             )));
         }
-        let train: Vec<usize> = (0..latents.entries()).filter(|e| latents.meta.splits[*e] == Split::Train).collect();
+        let is_train = |e: &usize| latents.meta.splits[*e] == Split::Train;
+        let times = |e: usize| latents.meta.draws.get(e).copied().unwrap_or(1);
+        let train: Vec<usize> = (0..latents.entries()).filter(is_train).flat_map(|e| repeat_n(e, times(e))).collect();
         if train.is_empty() {
             return Err(no_clips());
         }
