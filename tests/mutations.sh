@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
 # Breaks the code on purpose, one fault at a time, and expects a test to fail: tests/mutations.sh [NAME...]
+# With --check as the first argument it compiles nothing: it only checks that the code of each fault still exists.
 # Works on a copy of the last commit; builds into target/mutations, or into MUTATIONS_TARGET.
 # Exits with 1 if no test finds a fault, or if the code that a fault changes no longer exists.
 set -euo pipefail
@@ -12,6 +13,8 @@ cd "$copy"
 # Each fault is compiled anew and tested until the first program with a failure.
 export CARGO_INCREMENTAL=1 CARGO_PROFILE_DEV_DEBUG=0
 log=$copy/mutation.log
+checks_only=
+if [ "${1:-}" = --check ]; then checks_only=yes && shift; fi
 wanted=("$@")
 missed=0
 
@@ -21,10 +24,15 @@ missed=0
 mutation() {
     local name=$1 file=$2 change=$3 tests=$4 begun=$SECONDS test crate program filter programs
     if [ ${#wanted[@]} -gt 0 ] && [[ ! " ${wanted[*]} " == *" $name "* ]]; then return; fi
-    perl -0pi -e "$change" "$file"
+    # A missing file is reported like a missing line.
+    perl -0pi -e "$change" "$file" || true
     if git diff --quiet; then
         echo "$name: stands no longer in $file"
         missed=1
+        return
+    fi
+    if [ -n "$checks_only" ]; then
+        git checkout --quiet -- .
         return
     fi
     for test in $tests; do
@@ -64,7 +72,7 @@ mutation no-sync-of-the-operating-system registry/src/blob/disk.rs 's/(fn sync\(
 mutation grace-0 registry/src/retention.rs 's/60 \* 60 \* 1000/0/' "registry coordinator"
 mutation no-touch registry/src/blob/store.rs 's/let touched = self\.backend\(\)\.touch\(digest\)\?;/let touched = stat;/' registry
 mutation constant-nonce worker/src/gang/handshake.rs 's/getrandom::fill\(&mut bytes\)/getrandom::fill(&mut bytes[..0])/' worker:lib:gang
-mutation token-over-plain-http trainer/access/src/connection.rs 's/ && !server\.is_local\(\)/ \&\& server.is_local()/' access:lib
+mutation token-over-plain-http trainer/access/src/connection.rs 's/find\(\|address\| !address\.is_local\(\)\)/find(|address| address.is_local())/' access:lib
 mutation pipe-as-token-file trainer/access/src/file.rs 's/if file\.metadata\(\)\?\.is_file\(\)/if true/' access:lib
 mutation lock-follows-links registry/src/blob/disk.rs 's/OFlag::O_NOFOLLOW \| //' registry:lib:lock
 mutation gang-in-the-clear worker/src/gang/seal.rs 's/Ok\(stream\.local_addr\(\)\?\.ip\(\)\.to_canonical\(\) != .*\)$/Ok(stream.local_addr().is_err())/m' worker:lib:gang
@@ -132,7 +140,7 @@ mutation paused-if-interrupted trainer/coordinator/src/state/run.rs 's/self\.par
 mutation every-word-is-known trainer/motion/src/vocabulary.rs 's/!self\.words\.contains_key\(&word\) && //; s/!unknown\.contains\(&word\)/false \&\& !unknown.contains(\&word)/' motion:lib:vocabulary
 mutation parts-of-a-killed-process-stay registry/src/retention.rs 's/place\.ask\(BlobStore::give_up_unfinished\)/place.ask(|_| Ok::<u64, BlobError>(0))/' registry:retention:upload
 mutation upload-without-a-record registry/src/blob/objects/multipart.rs 's/store\.put\(&record, text\.into\(\)\)\.await\.map\(\|_\| \(\)\)/Ok(drop(text))/' registry:conformance:parts_that
-mutation held-until-the-restart registry/src/store.rs 's/self\.order\(Order::Hold \{ task: task\.clone\(\), digest \}\)\.await\?;//' registry:retention:upload
+mutation held-until-the-restart registry/src/store/mod.rs 's/self\.order\(Order::Hold \{ task: task\.clone\(\), digest \}\)\.await\?;//' registry:retention:upload
 mutation digesting-goes-on trainer/motion/src/files.rs 's/if !go_on\(\) \{/if false \&\& !go_on() {/' motion:lib:data_access
 mutation ended-states-stay trainer/coordinator/src/decide/outcome.rs 's/(keep, )at_end: true/$1at_end: false/' coordinator:decisions:ended
 exit $missed
