@@ -145,7 +145,8 @@ fn receive_parts(
         }
         let greeting = Greeting::read(begin.bytes());
         let greeting = greeting.ok_or_else(|| disagree(peer, "sends a malformed greeting".to_owned()))?;
-        let (at, stored) = (greeting.length, greeting.durable);
+        let at = greeting.length;
+        let stored = greeting.durable;
         let announced = greeting.announced.filter(|_| mesh.may_share_memory(peer, barrier, interrupt) == Ok(true));
         mesh.memory(peer).greeted(begin.step, announced.as_ref(), begin.b & MAPPED != 0);
         received.drain |= begin.b & DRAIN != 0;
@@ -214,8 +215,11 @@ fn gather(
     sum: &mut [f32],
     interrupt: Interrupt<'_>,
 ) -> Result<(), Halt> {
-    let (step, slices) = (contribution.step, contribution.slices);
-    let (own, size, length) = (mesh.config.rank, mesh.size(), sum.len());
+    let step = contribution.step;
+    let slices = contribution.slices;
+    let own = mesh.config.rank;
+    let size = mesh.size();
+    let length = sum.len();
     // In a member's memory for a peer, the parts of its nodes come first.
     let begin = |from: usize, to: usize| {
         tree::cover(slices, &tree::share(slices, from, size)).len() * tree::share(length, to, size).len()

@@ -1,32 +1,28 @@
-//! The connections of one generation of a gang: rank i dials every rank below it.
+//! The members of one generation of a gang as one of them sees them: sending, receiving, waiting.
 //!
 //! A mesh opens as soon as a generation is known, on threads of its own. So a member whose stage is in the middle of a
 //! slice still answers its peers. Each link has a reader thread that queues frames. One thread sends keep-alives over
 //! all idle links, so that a peer that computes for minutes differs from one that is gone. A peer is lost if its
-//! connection ends without a goodbye, or if a member waits for it and receives no byte for too long.
+//! connection ends without a goodbye, or if a member waits for it and receives no byte for too long (`peer`).
 //!
-//! Not its job: the meaning of the frames (`exchange`), and the consequences of a loss (the coordinator's decision).
+//! Not its job: making connections (`connect`), the meaning of the frames (`exchange`), and the consequences of a loss
+//! (the coordinator's decision).
 
-use std::collections::VecDeque;
-use std::io;
-use std::net::{Shutdown, TcpStream};
+use std::net::Shutdown;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, Weak};
-use std::thread;
+use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::{Duration, Instant};
 
-use protocol::message::{LossCause, LostPeer, Member};
+use protocol::message::{LossCause, LostPeer};
 use protocol::{Generation, WorkerId};
 use tokio::sync::Notify;
 
-use super::endpoint::{Endpoint, Gang};
-use super::frame::{self, Frame, FrameError, Head, Kind, MAX_PAYLOAD};
-use super::handshake::{self, HandshakeError, Session};
-use super::link::{BLINK, Heard, Link, Pulse, Sign, Writer};
-use super::member::{MeshConfig, Phase, Timing, spawn};
+use super::frame::{Frame, Head, Kind, MAX_PAYLOAD};
+use super::link::{BLINK, Sign};
+use super::member::{MeshConfig, Phase, Timing};
 use super::memory::Between;
 use super::pace::Pace;
-use super::seal::Seal;
+use super::peer::{Patience, Peer, Standing, Verdict};
 use crate::event_count::{EventCount, lock};
 
 /// Limit of queued frames of a state, for a member that reads slower than they arrive: 16 MiB.
@@ -47,84 +43,26 @@ pub(crate) enum Halt {
     Fault(String),
 }
 
-#[derive(Debug, Clone, PartialEq)]
-enum Standing {
-    /// Not connected yet, with the reason of the last failure.
-    Unmet(Option<String>),
-    Up,
-    /// Has left the gang in good order.
-    Left,
-    /// Has moved to a newer generation.
-    Moved,
-    Lost(LossCause, String),
-}
-
-#[derive(Debug)]
-struct Peer {
-    link: Option<Arc<Link>>,
-    /// Received frames with their times of arrival.
-    inbox: VecDeque<(Instant, Frame)>,
-    pulse: Pulse,
-    standing: Standing,
-    phase: Phase,
-}
-
 /// The connections of one generation.
 #[derive(Debug)]
 pub(crate) struct Mesh {
     pub(crate) config: MeshConfig,
     pub(super) timing: Timing,
-    peers: Mutex<Vec<Peer>>,
-    event_count: Arc<EventCount>,
+    pub(super) peers: Mutex<Vec<Peer>>,
+    pub(super) event_count: Arc<EventCount>,
     /// Wakes the poll, which reports lost peers.
-    wake: Arc<Notify>,
+    pub(super) wake: Arc<Notify>,
     /// The rank that the stage waits for, plus one; 0 if it waits for none.
-    waits_for: AtomicUsize,
+    pub(super) waits_for: AtomicUsize,
     pub(super) pace: Pace,
     /// Memory between this member and each peer. Only the stage's threads use it.
-    memory: Vec<Mutex<Between>>,
+    pub(super) memory: Vec<Mutex<Between>>,
     /// True if gradients pass over connections alone, also on one machine.
-    uses_no_memory: AtomicBool,
-    closed: AtomicBool,
+    pub(super) uses_no_memory: AtomicBool,
+    pub(super) closed: AtomicBool,
 }
 
 impl Mesh {
-    /// Creates the mesh and connects in the background.
-    pub(crate) fn open(
-        config: MeshConfig,
-        endpoint: &Arc<Endpoint>,
-        event_count: Arc<EventCount>,
-        wake: Arc<Notify>,
-    ) -> Arc<Self> {
-        let peer = |_: &Member| Peer {
-            link: None,
-            inbox: VecDeque::new(),
-            pulse: Pulse::new(),
-            standing: Standing::Unmet(None),
-            phase: Phase::Working,
-        };
-        let peers = Mutex::new(config.members.iter().map(peer).collect());
-        let timing = endpoint.timing;
-        let waits_for = AtomicUsize::new(0);
-        let closed = AtomicBool::new(false);
-        let pace = Pace::new(config.members.len(), timing.slow);
-        let memory = config.members.iter().map(|_| Mutex::default()).collect();
-        let uses_no_memory = AtomicBool::new(false);
-        let mesh = Self { config, timing, peers, event_count, wake, waits_for, pace, memory, uses_no_memory, closed };
-        let mesh = Arc::new(mesh);
-        if mesh.size() > 1 {
-            let gang: Arc<dyn Gang> = mesh.clone();
-            endpoint.announce(&mesh.config, Arc::downgrade(&gang));
-            for rank in 0..mesh.config.rank {
-                let mesh = mesh.clone();
-                spawn("gang-dial", move || mesh.dial(rank));
-            }
-            let weak = Arc::downgrade(&mesh);
-            spawn("gang-alive", move || keep_alive(&weak, timing));
-        }
-        mesh
-    }
-
     /// Number of members.
     pub(crate) fn size(&self) -> usize {
         self.config.members.len()
@@ -149,7 +87,7 @@ impl Mesh {
         lost.chain(slow).collect()
     }
 
-    fn sign(&self) -> Sign {
+    pub(super) fn sign(&self) -> Sign {
         let head = Head::new(Kind::KeepAlive, 0, self.config.busy.phase() as u32, 0);
         // A thread that wakes just before a keep-alive is due would delay it by a whole interval.
         Sign { head, every: self.timing.keep_alive * 3 / 4 }
@@ -224,7 +162,7 @@ impl Mesh {
         }
     }
 
-    fn is_closed(&self) -> bool {
+    pub(super) fn is_closed(&self) -> bool {
         self.closed.load(Ordering::SeqCst)
     }
 
@@ -279,81 +217,6 @@ impl Mesh {
         self.event_count.notify();
     }
 
-    fn dial(self: Arc<Self>, rank: usize) {
-        let mut refused: Option<Instant> = None;
-        let mut pause = Duration::from_millis(10);
-        while !self.is_closed() {
-            match self.connect(rank) {
-                Ok((stream, session)) => {
-                    self.attach(rank, stream, session);
-                    return;
-                }
-                Err(error) => {
-                    let since =
-                        if error.is_refused() { *refused.get_or_insert_with(Instant::now) } else { Instant::now() };
-                    if since.elapsed() > self.timing.refused {
-                        let reason = format!("nothing listens at {}", self.config.members[rank].peer_address);
-                        self.lose(rank, LossCause::Unreachable, reason);
-                        return;
-                    }
-                    if !error.is_refused() {
-                        refused = None;
-                    }
-                    if let Standing::Unmet(last) = &mut lock(&self.peers)[rank].standing {
-                        *last = Some(error.to_string());
-                    }
-                }
-            }
-            thread::sleep(pause);
-            pause = (pause * 2).min(Duration::from_millis(200));
-        }
-    }
-
-    fn connect(&self, rank: usize) -> Result<(TcpStream, Session), HandshakeError> {
-        let stream = handshake::connect(&self.config.members[rank].peer_address)?;
-        let MeshConfig { task, generation, rank: from, secret, .. } = &self.config;
-        let session = handshake::dial(&stream, task, *generation, *from, rank, secret)?;
-        Ok((stream, session))
-    }
-
-    /// Adds a connection whose other side has authenticated as `rank`.
-    fn attach(self: &Arc<Self>, rank: usize, stream: TcpStream, session: Session) {
-        let Session { sends, receives } = session;
-        let is_local = !sends.is_encrypted();
-        let pulse = lock(&self.peers)[rank].pulse.clone();
-        let both = stream.try_clone().and_then(|reader| {
-            // Keep-alives arrive far more often than this; the timeout only bounds the life of a reader.
-            reader.set_read_timeout(Some(self.timing.patience * 3))?;
-            stream.set_write_timeout(Some(BLINK))?;
-            let socket = stream.try_clone()?;
-            Ok((
-                reader,
-                Link {
-                    socket,
-                    writer: Mutex::new(Writer { stream, seal: sends, pulse: pulse.clone(), signed: Instant::now() }),
-                    is_local,
-                },
-            ))
-        });
-        let (reader, link) = match both {
-            Ok(both) => both,
-            Err(error) => return self.lose(rank, LossCause::Unreachable, error.to_string()),
-        };
-        {
-            let mut peers = lock(&self.peers);
-            if self.is_closed() || !matches!(peers[rank].standing, Standing::Unmet(_)) {
-                return;
-            }
-            let peer = &mut peers[rank];
-            peer.link = Some(Arc::new(link));
-            peer.pulse.beat();
-            peer.standing = Standing::Up;
-        }
-        self.event_count.notify();
-        let mesh = Arc::downgrade(self);
-        spawn("gang-read", move || read(&mesh, rank, &reader, receives, pulse));
-    }
-
     /// Waits while the queue holds its limit of a state's frames. The rest stays with its sender, who sends nothing
     /// else meanwhile. Parts of a sum are queued without a limit, because all members send theirs before they read the
     /// others'.
@@ -372,7 +235,7 @@ impl Mesh {
     }
 
     /// Handles a received frame; frames of the exchange are queued.
-    fn receive(&self, rank: usize, frame: Frame) {
+    pub(super) fn receive(&self, rank: usize, frame: Frame) {
         if frame.kind == Kind::State {
             self.await_room(rank);
         }
@@ -498,7 +361,7 @@ impl Mesh {
                     begun = now;
                 }
                 let silent = now.duration_since(peer.pulse.last().max(awake));
-                verdict(peer, &self.timing, patience, silent, now.duration_since(begun))
+                peer.verdict(&self.timing, patience, silent, now.duration_since(begun))
             };
             // Never under the lock: an interrupt looks at the peers too.
             if let Some(halt) = interrupt() {
@@ -518,39 +381,6 @@ impl Mesh {
     }
 }
 
-/// Result of a look at a peer that a stage waits for.
-enum Verdict {
-    Waits,
-    /// The peer is lost already, or has moved to another gang.
-    Lost,
-    /// The peer must be given up, for this reason.
-    GiveUp(String),
-}
-
-/// Judges a peer that has not sent a sign for `silent` and that a stage has awaited for `waited`.
-fn verdict(peer: &Peer, timing: &Timing, patience: Patience, silent: Duration, waited: Duration) -> Verdict {
-    let limit = timing.patience.as_secs_f32();
-    let too_late = |limit: Duration, how: &str| {
-        if waited <= limit {
-            return Verdict::Waits;
-        }
-        Verdict::GiveUp(format!("it is alive, but {how} after {} s", limit.as_secs_f32()))
-    };
-    match &peer.standing {
-        Standing::Lost(..) | Standing::Moved => Verdict::Lost,
-        Standing::Left if patience == Patience::WhileItLives => Verdict::Waits,
-        Standing::Left => Verdict::GiveUp("it has left".to_owned()),
-        Standing::Unmet(why) if silent > timing.patience => {
-            let why = why.as_deref().unwrap_or("it did not connect");
-            Verdict::GiveUp(format!("no connection within {limit} s: {why}"))
-        }
-        Standing::Up if silent > timing.patience => Verdict::GiveUp(format!("no heartbeat for {limit} s")),
-        Standing::Up if peer.phase == Phase::Starting => too_late(timing.start, "has not started"),
-        Standing::Up => too_late(timing.stall, "has not reached this barrier"),
-        Standing::Unmet(_) => Verdict::Waits,
-    }
-}
-
 /// While it lives, the mesh reports the peer that the stage waits for.
 struct Waiting<'a>(&'a Mesh);
 
@@ -567,77 +397,8 @@ impl Drop for Waiting<'_> {
     }
 }
 
-/// Limit of a wait for a peer.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Patience {
-    /// Until its turn is overdue ([`Timing::stall`], [`Timing::start`]).
-    ForItsTurn,
-    /// As long as it sends keep-alives.
-    WhileItLives,
-}
-
 impl Drop for Mesh {
     fn drop(&mut self) {
         self.close(None);
-    }
-}
-
-/// Reads frames from a link. Threads that outlive their mesh's owner hold it weakly.
-fn read(mesh: &Weak<Mesh>, rank: usize, stream: &TcpStream, mut seal: Seal, pulse: Pulse) {
-    let mut buffered = io::BufReader::with_capacity(64 << 10, Heard { stream, pulse });
-    loop {
-        let frame = frame::read_sealed(&mut buffered, MAX_PAYLOAD, &mut seal);
-        let Some(mesh) = mesh.upgrade() else {
-            // Our side is closed. Keep reading until the peer closes too. Otherwise the kernel resets the connection
-            // and the peer may lose our last frames.
-            let _ = io::copy(&mut buffered, &mut io::sink());
-            return;
-        };
-        match frame {
-            Ok(frame) => mesh.receive(rank, frame),
-            Err(error) => {
-                let parted = matches!(lock(&mesh.peers)[rank].standing, Standing::Left | Standing::Moved);
-                if !parted {
-                    mesh.lose(rank, LossCause::Unreachable, error.to_string());
-                }
-                if !matches!(error, FrameError::Closed) {
-                    // The other side must not continue to send.
-                    let _ = stream.shutdown(Shutdown::Both);
-                }
-                return;
-            }
-        }
-    }
-}
-
-fn keep_alive(mesh: &Weak<Mesh>, timing: Timing) {
-    loop {
-        thread::sleep(timing.keep_alive);
-        let Some(mesh) = mesh.upgrade() else { return };
-        if mesh.is_closed() {
-            return;
-        }
-        let links: Vec<_> = lock(&mesh.peers).iter().map(|peer| peer.link.clone()).collect();
-        for link in links.into_iter().flatten() {
-            // A thread that is writing to a link sends the keep-alive itself.
-            if let Ok(mut writer) = link.writer.try_lock() {
-                // An error becomes visible to a thread that waits for the peer.
-                let _ = writer.sign(&mesh.sign(), timing.patience, &|| mesh.is_closed());
-            }
-        }
-    }
-}
-
-impl Gang for Mesh {
-    fn config(&self) -> &MeshConfig {
-        &self.config
-    }
-
-    fn is_closed(&self) -> bool {
-        self.is_closed()
-    }
-
-    fn attach(self: Arc<Self>, rank: usize, stream: TcpStream, session: Session) {
-        Self::attach(&self, rank, stream, session);
     }
 }

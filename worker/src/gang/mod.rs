@@ -1,5 +1,6 @@
 //! Gangs: connections between members, agreement on states, and sums of gradients.
 
+mod connect;
 pub(crate) mod endpoint;
 pub(crate) mod exchange;
 mod frame;
@@ -9,6 +10,7 @@ pub(crate) mod member;
 mod memory;
 pub(crate) mod mesh;
 mod pace;
+mod peer;
 pub(crate) mod rendezvous;
 mod seal;
 pub(crate) mod tree;

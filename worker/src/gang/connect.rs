@@ -1,0 +1,188 @@
+//! Connections of a mesh: rank i dials every rank below it, and each connection gets a thread that reads its frames.
+
+use std::io;
+use std::net::{Shutdown, TcpStream};
+use std::sync::atomic::{AtomicBool, AtomicUsize};
+use std::sync::{Arc, Mutex, Weak};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use protocol::message::LossCause;
+use tokio::sync::Notify;
+
+use super::endpoint::{Endpoint, Gang};
+use super::frame::{self, FrameError, MAX_PAYLOAD};
+use super::handshake::{self, HandshakeError, Session};
+use super::link::{BLINK, Heard, Link, Pulse, Writer};
+use super::member::{MeshConfig, Timing, spawn};
+use super::mesh::Mesh;
+use super::pace::Pace;
+use super::peer::{Peer, Standing};
+use super::seal::Seal;
+use crate::event_count::{EventCount, lock};
+
+impl Mesh {
+    /// Creates the mesh and connects in the background.
+    pub(crate) fn open(
+        config: MeshConfig,
+        endpoint: &Arc<Endpoint>,
+        event_count: Arc<EventCount>,
+        wake: Arc<Notify>,
+    ) -> Arc<Self> {
+        let peers = Mutex::new(config.members.iter().map(|_| Peer::new()).collect());
+        let timing = endpoint.timing;
+        let waits_for = AtomicUsize::new(0);
+        let closed = AtomicBool::new(false);
+        let pace = Pace::new(config.members.len(), timing.slow);
+        let memory = config.members.iter().map(|_| Mutex::default()).collect();
+        let uses_no_memory = AtomicBool::new(false);
+        let mesh = Self { config, timing, peers, event_count, wake, waits_for, pace, memory, uses_no_memory, closed };
+        let mesh = Arc::new(mesh);
+        if mesh.size() > 1 {
+            let gang: Arc<dyn Gang> = mesh.clone();
+            endpoint.announce(&mesh.config, Arc::downgrade(&gang));
+            for rank in 0..mesh.config.rank {
+                let mesh = mesh.clone();
+                spawn("gang-dial", move || mesh.dial(rank));
+            }
+            let weak = Arc::downgrade(&mesh);
+            spawn("gang-alive", move || keep_alive(&weak, timing));
+        }
+        mesh
+    }
+
+    fn dial(self: Arc<Self>, rank: usize) {
+        let mut refused: Option<Instant> = None;
+        let mut pause = Duration::from_millis(10);
+        while !self.is_closed() {
+            match self.connect(rank) {
+                Ok((stream, session)) => {
+                    self.attach(rank, stream, session);
+                    return;
+                }
+                Err(error) => {
+                    let since =
+                        if error.is_refused() { *refused.get_or_insert_with(Instant::now) } else { Instant::now() };
+                    if since.elapsed() > self.timing.refused {
+                        let reason = format!("nothing listens at {}", self.config.members[rank].peer_address);
+                        self.lose(rank, LossCause::Unreachable, reason);
+                        return;
+                    }
+                    if !error.is_refused() {
+                        refused = None;
+                    }
+                    if let Standing::Unmet(last) = &mut lock(&self.peers)[rank].standing {
+                        *last = Some(error.to_string());
+                    }
+                }
+            }
+            thread::sleep(pause);
+            pause = (pause * 2).min(Duration::from_millis(200));
+        }
+    }
+
+    fn connect(&self, rank: usize) -> Result<(TcpStream, Session), HandshakeError> {
+        let stream = handshake::connect(&self.config.members[rank].peer_address)?;
+        let MeshConfig { task, generation, rank: from, secret, .. } = &self.config;
+        let session = handshake::dial(&stream, task, *generation, *from, rank, secret)?;
+        Ok((stream, session))
+    }
+
+    /// Adds a connection whose other side has authenticated as `rank`.
+    fn attach(self: &Arc<Self>, rank: usize, stream: TcpStream, session: Session) {
+        let Session { sends, receives } = session;
+        let is_local = !sends.is_encrypted();
+        let pulse = lock(&self.peers)[rank].pulse.clone();
+        let both = stream.try_clone().and_then(|reader| {
+            // Keep-alives arrive far more often than this; the timeout only bounds the life of a reader.
+            reader.set_read_timeout(Some(self.timing.patience * 3))?;
+            stream.set_write_timeout(Some(BLINK))?;
+            let socket = stream.try_clone()?;
+            Ok((
+                reader,
+                Link {
+                    socket,
+                    writer: Mutex::new(Writer { stream, seal: sends, pulse: pulse.clone(), signed: Instant::now() }),
+                    is_local,
+                },
+            ))
+        });
+        let (reader, link) = match both {
+            Ok(both) => both,
+            Err(error) => return self.lose(rank, LossCause::Unreachable, error.to_string()),
+        };
+        {
+            let mut peers = lock(&self.peers);
+            if self.is_closed() || !matches!(peers[rank].standing, Standing::Unmet(_)) {
+                return;
+            }
+            let peer = &mut peers[rank];
+            peer.link = Some(Arc::new(link));
+            peer.pulse.beat();
+            peer.standing = Standing::Up;
+        }
+        self.event_count.notify();
+        let mesh = Arc::downgrade(self);
+        spawn("gang-read", move || read(&mesh, rank, &reader, receives, pulse));
+    }
+}
+
+/// Reads frames from a link. Threads that outlive their mesh's owner hold it weakly.
+fn read(mesh: &Weak<Mesh>, rank: usize, stream: &TcpStream, mut seal: Seal, pulse: Pulse) {
+    let mut buffered = io::BufReader::with_capacity(64 << 10, Heard { stream, pulse });
+    loop {
+        let frame = frame::read_sealed(&mut buffered, MAX_PAYLOAD, &mut seal);
+        let Some(mesh) = mesh.upgrade() else {
+            // Our side is closed. Keep reading until the peer closes too. Otherwise the kernel resets the connection
+            // and the peer may lose our last frames.
+            let _ = io::copy(&mut buffered, &mut io::sink());
+            return;
+        };
+        match frame {
+            Ok(frame) => mesh.receive(rank, frame),
+            Err(error) => {
+                let parted = matches!(lock(&mesh.peers)[rank].standing, Standing::Left | Standing::Moved);
+                if !parted {
+                    mesh.lose(rank, LossCause::Unreachable, error.to_string());
+                }
+                if !matches!(error, FrameError::Closed) {
+                    // The other side must not continue to send.
+                    let _ = stream.shutdown(Shutdown::Both);
+                }
+                return;
+            }
+        }
+    }
+}
+
+fn keep_alive(mesh: &Weak<Mesh>, timing: Timing) {
+    loop {
+        thread::sleep(timing.keep_alive);
+        let Some(mesh) = mesh.upgrade() else { return };
+        if mesh.is_closed() {
+            return;
+        }
+        let links: Vec<_> = lock(&mesh.peers).iter().map(|peer| peer.link.clone()).collect();
+        for link in links.into_iter().flatten() {
+            // A thread that is writing to a link sends the keep-alive itself.
+            if let Ok(mut writer) = link.writer.try_lock() {
+                // An error becomes visible to a thread that waits for the peer.
+                let _ = writer.sign(&mesh.sign(), timing.patience, &|| mesh.is_closed());
+            }
+        }
+    }
+}
+
+impl Gang for Mesh {
+    fn config(&self) -> &MeshConfig {
+        &self.config
+    }
+
+    fn is_closed(&self) -> bool {
+        self.is_closed()
+    }
+
+    fn attach(self: Arc<Self>, rank: usize, stream: TcpStream, session: Session) {
+        Self::attach(&self, rank, stream, session);
+    }
+}
