@@ -4,6 +4,7 @@
 //! repeated answer changes nothing. A failed poll changes nothing either: work continues, and the next poll reports
 //! everything again.
 
+use std::convert::Infallible;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
@@ -200,10 +201,12 @@ fn patience(joined: &Joined) -> Duration {
 
 /// Joins and polls until the worker may leave.
 pub(crate) async fn follow(client: &Client, offer: &Join, shared: &Shared) -> End {
-    let mut joined = match join(client, offer, shared).await {
-        Ok(joined) => joined,
-        Err(end) => return end,
-    };
+    let Err(end) = poll_on(client, offer, shared).await;
+    end
+}
+
+async fn poll_on(client: &Client, offer: &Join, shared: &Shared) -> Result<Infallible, End> {
+    let mut joined = join(client, offer, shared).await?;
     let path = format!("/v1/workers/{}/poll", offer.worker);
     let mut version = 0;
     let mut pause = SHORTEST;
@@ -212,7 +215,7 @@ pub(crate) async fn follow(client: &Client, offer: &Join, shared: &Shared) -> En
     let mut away = false;
     loop {
         if (leave || shared.is_leaving()) && shared.is_idle(true) {
-            return End::Left;
+            return Err(End::Left);
         }
         let poll = shared.poll(joined.incarnation, version);
         let answer = tokio::select! {
@@ -236,10 +239,7 @@ pub(crate) async fn follow(client: &Client, offer: &Join, shared: &Shared) -> En
             }
             Err(CallError::NotFound(message)) => {
                 tracing::warn!("the coordinator does not know this worker process: {message}; joining again");
-                joined = match join(client, offer, shared).await {
-                    Ok(joined) => joined,
-                    Err(end) => return end,
-                };
+                joined = join(client, offer, shared).await?;
                 version = 0;
                 // Doubles the pause, so that a coordinator that forgets the worker again at once is not polled in a
                 // tight loop.
@@ -254,7 +254,7 @@ pub(crate) async fn follow(client: &Client, offer: &Join, shared: &Shared) -> En
             Err(error) => {
                 refusals += 1;
                 if refusals == REFUSALS {
-                    return End::Refused(error.to_string());
+                    return Err(End::Refused(error.to_string()));
                 }
                 tracing::warn!("the coordinator refused a poll: {error}");
                 pause = (pause * 2).min(LONGEST);

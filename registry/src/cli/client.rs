@@ -46,7 +46,7 @@ async fn answer(operation: Operation, dir: &Path, options: &ServerOptions) -> An
             with(dir, options, Need::Read, async |place| export_to(place, &model, Destination::Bundle(&file)).await)
                 .await
         }
-        // A new store is made only for a file that is there.
+        // A new store is created only for a file that exists.
         Operation::Import { file, .. } if !file.exists() => bundles::no_such_file(&file.display().to_string()),
         Operation::Import { file, model } => {
             with(dir, options, Need::Make, async |place| import(place, &file, model.as_deref()).await).await
@@ -116,7 +116,8 @@ async fn adopt(dir: &Path, blobs: Option<&crate::Place>, options: &ServerOptions
 }
 
 async fn migrate(from: CatalogPlace, to: CatalogPlace) -> Answer {
-    let (names, holder) = ((from.to_string(), to.to_string()), Holder::this_process("registry migrate"));
+    let names = (from.to_string(), to.to_string());
+    let holder = Holder::this_process("registry migrate");
     let moved = match (&from, &to) {
         (CatalogPlace::Folder(dir), CatalogPlace::Postgres(address)) => {
             migrate::to_postgres(dir, address, holder).await
@@ -203,13 +204,7 @@ async fn with(
     let internal = |_| Answer::refused(error("internal", "the store did not answer", None));
     match options.connect() {
         Ok(None) => {}
-        Ok(Some(server)) => {
-            let url = server.url().to_owned();
-            return work(&Place::At(server)).await.unwrap_or_else(|failed| {
-                let (CallError::Unreachable(why) | CallError::Incomplete(why)) = failed;
-                unreachable_(&format!("cannot reach `{url}`: {why}"))
-            });
-        }
+        Ok(Some(server)) => return at_server(server, work).await,
         Err(e) => return refused(&e),
     }
     if need == Need::Read {
@@ -255,6 +250,14 @@ async fn with(
         }
         tokio::time::sleep(BETWEEN).await;
     }
+}
+
+async fn at_server(server: Server, work: impl AsyncFn(&Place) -> Result<Answer, CallError>) -> Answer {
+    let url = server.url().to_owned();
+    work(&Place::At(server)).await.unwrap_or_else(|failed| {
+        let (CallError::Unreachable(why) | CallError::Incomplete(why)) = failed;
+        unreachable_(&format!("cannot reach `{url}`: {why}"))
+    })
 }
 
 fn refused(e: &ConnectError) -> Answer {

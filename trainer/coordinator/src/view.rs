@@ -98,7 +98,8 @@ impl State {
             let task = execution.tasks.get(*i).filter(|task| !task.is_held() || worker.shunned.is_none())?;
             // A member that joins a running gang gets the state from its peers.
             let resume = if task.is_held() { None } else { task.newest().map(|saved| saved.manifest) };
-            let (inputs, peers) = (execution.artifacts(), task.holders().to_vec());
+            let inputs = execution.artifacts();
+            let peers = task.holders().to_vec();
             Some(Prepare { task: task.id.clone(), inputs, resume, peers })
         });
         open.take(AT_ONCE).collect()
@@ -128,18 +129,7 @@ impl State {
     pub fn view(&self, run: &Run, now: Millis) -> RunView {
         let stages: Vec<StageView> = (0..run.stages.len()).map(|i| self.stage_view(run, i, now)).collect();
         let sweeps = run.sweeps.iter().map(|sweep| self.sweep_view(run, sweep)).collect();
-        RunView {
-            run: run.id.clone(),
-            pipeline: run.pipeline.name.clone(),
-            owner: run.owner.clone(),
-            state: run.state,
-            interrupted: run.is_interrupted(),
-            note: note(run.state, &stages),
-            stages,
-            sweeps,
-            storage: None,
-            times: Default::default(),
-        }
+        RunView { sweeps, ..without_sweeps(run, stages) }
     }
 
     /// A run as lists show it at `now`, without times.
@@ -147,23 +137,12 @@ impl State {
         // Sweeps may have made thousands of stages, which a summary leaves out.
         let main = run.pipeline.stages.iter().enumerate().filter(|(_, stage)| stage.derived.is_none());
         let stages: Vec<StageView> = main.map(|(i, _)| self.stage_view(run, i, now)).collect();
-        let view = RunView {
-            run: run.id.clone(),
-            pipeline: run.pipeline.name.clone(),
-            owner: run.owner.clone(),
-            state: run.state,
-            interrupted: run.is_interrupted(),
-            note: note(run.state, &stages),
-            stages,
-            sweeps: Vec::new(),
-            storage: None,
-            times: Default::default(),
-        };
-        RunSummary::of(&view)
+        RunSummary::of(&without_sweeps(run, stages))
     }
 
     fn stage_view(&self, run: &Run, i: usize, now: Millis) -> StageView {
-        let (stage, status) = (&run.pipeline.stages[i], &run.stages[i]);
+        let stage = &run.pipeline.stages[i];
+        let status = &run.stages[i];
         let execution = self.execution_of(run, &stage.name).map(|execution| &**execution);
         let needs: BTreeSet<&StageName> = stage.inputs.iter().map(|input| &input.stage).collect();
         let mut view = StageView {
@@ -185,7 +164,13 @@ impl State {
             times: Default::default(),
             needs: needs.into_iter().cloned().collect(),
         };
-        match status {
+        self.add_status(&mut view, run, i, execution);
+        view
+    }
+
+    /// Adds what the status of stage `i` knows: state, results, or progress and the reason of waiting.
+    fn add_status(&self, view: &mut StageView, run: &Run, i: usize, execution: Option<&StageExecution>) {
+        match &run.stages[i] {
             Status::Waiting => {}
             Status::Sweeping => {
                 view.state = StageState::Running;
@@ -216,7 +201,10 @@ impl State {
                 view.outputs = known.outputs.clone();
                 view.metrics = known.metrics.clone();
                 (view.wall_s, view.attempt, view.peak_memory) = (*wall_s, *attempt, *peak_memory);
-                view.progress = whole(stage, execution.map(|execution| self.progress(execution)).unwrap_or_default());
+                view.progress = whole(
+                    &run.pipeline.stages[i],
+                    execution.map(|execution| self.progress(execution)).unwrap_or_default(),
+                );
             }
             Status::Failed { message, .. } => {
                 view.state = StageState::Failed;
@@ -227,7 +215,6 @@ impl State {
                 view.message = Some(reason.clone());
             }
         }
-        view
     }
 
     fn active(&self, run: &Run, execution: &StageExecution) -> (StageState, Option<String>) {
@@ -306,6 +293,21 @@ impl State {
                 metrics: Default::default(),
             },
         }
+    }
+}
+
+fn without_sweeps(run: &Run, stages: Vec<StageView>) -> RunView {
+    RunView {
+        run: run.id.clone(),
+        pipeline: run.pipeline.name.clone(),
+        owner: run.owner.clone(),
+        state: run.state,
+        interrupted: run.is_interrupted(),
+        note: note(run.state, &stages),
+        stages,
+        sweeps: Vec::new(),
+        storage: None,
+        times: Default::default(),
     }
 }
 

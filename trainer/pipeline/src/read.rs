@@ -389,17 +389,7 @@ impl Reader {
         graph::check_totals(&stages, &mut found);
         graph::check_references(&stages, &mut found);
         if !all_read {
-            // A stage that could not be read may be the target of a reference.
-            let unread = |name: &str| {
-                written.iter().any(|w| w.name.as_str() == name) && !stages.iter().any(|s| s.name.as_str() == name)
-            };
-            for stage in &stages {
-                let broken: Vec<&str> =
-                    stage.inputs.iter().filter(|i| unread(i.stage.as_str())).map(|i| i.field.as_str()).collect();
-                if let Some(problems) = found.get_mut(&stage.name) {
-                    problems.0.retain(|problem| !broken.contains(&problem.field.as_str()));
-                }
-            }
+            forgive_references(written, &stages, &mut found);
         }
         let sound = all_read && found.values().all(|problems| problems.0.is_empty());
         let sorted = match graph::sort(stages) {
@@ -460,6 +450,19 @@ impl Written {
 
     fn implicit(name: &str, entry: &Entry) -> Self {
         Self { name: name.into(), key_at: entry.key_at, node: Some(entry.value.clone()), path: name.into() }
+    }
+}
+
+/// Removes problems of references to stages that could not be read: they have their own mistakes.
+fn forgive_references(written: &[Written], stages: &[PipelineStage], found: &mut graph::ByStage) {
+    let is_unread = |name: &StageName| {
+        written.iter().any(|w| w.name.as_str() == name.as_str()) && !stages.iter().any(|s| &s.name == name)
+    };
+    for stage in stages {
+        let broken: Vec<&str> = stage.inputs.iter().filter(|i| is_unread(&i.stage)).map(|i| i.field.as_str()).collect();
+        if let Some(problems) = found.get_mut(&stage.name) {
+            problems.0.retain(|problem| !broken.contains(&problem.field.as_str()));
+        }
     }
 }
 

@@ -199,27 +199,7 @@ impl Reader {
                 continue;
             }
             let path = format!("{path}.{}", entry.key);
-            let references: Vec<String> =
-                walk.default.clone().refs().into_iter().map(|reference| reference.field.into_owned()).collect();
-            if keys.is_empty() && entry.key == "steps" {
-                let help = "`steps` of the stage is the budget of every trial; search another setting";
-                self.mistake(entry.key_at, &path, "`steps` cannot be searched", Some(help.into()));
-                continue;
-            }
-            if keys.is_empty() && references.contains(&entry.key) {
-                let message = format!("`{}` names a stage or a folder, so it cannot be searched", entry.key);
-                self.mistake(entry.key_at, &path, message, Some("write one stage for each value instead".into()));
-                continue;
-            }
-            let known = example.as_object().into_iter().flat_map(|known| known.keys().map(String::as_str));
-            let known: Vec<&str> = known
-                .filter(|key| {
-                    !keys.is_empty()
-                        || !(["kind", "steps"].contains(key) || references.iter().any(|field| field == key))
-                })
-                .collect();
-            if !known.contains(&entry.key.as_str()) {
-                let (message, help) = unknown_key(&entry.key, &format!("in {place} of {}", walk.owner), &known);
+            if let Err((message, help)) = walk.searches(&entry.key, keys.is_empty(), example, &place) {
                 self.mistake(entry.key_at, &path, message, Some(help));
                 continue;
             }
@@ -331,6 +311,31 @@ struct Space<'a> {
     owner: String,
     /// True for the stage itself, false for the stage that evaluates.
     of_stage: bool,
+}
+
+impl Space<'_> {
+    /// Returns an error's message and help if the key cannot be searched. `known` is the mapping that has the key,
+    /// at the top of the settings or below.
+    fn searches(&self, key: &str, is_top: bool, known: &Value, place: &str) -> Result<(), (String, String)> {
+        let references: Vec<String> =
+            self.default.clone().refs().into_iter().map(|reference| reference.field.into_owned()).collect();
+        let names = |key: &str| references.iter().any(|field| field == key);
+        if is_top && key == "steps" {
+            let help = "`steps` of the stage is the budget of every trial; search another setting";
+            return Err(("`steps` cannot be searched".to_owned(), help.to_owned()));
+        }
+        if is_top && names(key) {
+            let message = format!("`{key}` names a stage or a folder, so it cannot be searched");
+            return Err((message, "write one stage for each value instead".to_owned()));
+        }
+        let keys = known.as_object().into_iter().flat_map(|known| known.keys().map(String::as_str));
+        let searched: Vec<&str> =
+            keys.filter(|key| !is_top || !(["kind", "steps"].contains(key) || names(key))).collect();
+        if searched.contains(&key) {
+            return Ok(());
+        }
+        Err(unknown_key(key, &format!("in {place} of {}", self.owner), &searched))
+    }
 }
 
 /// Builds `{a: {b: item}}` for the keys `a`, `b`.

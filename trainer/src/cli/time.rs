@@ -5,7 +5,7 @@ use std::path::Path;
 use clap::Args;
 use models::device::DeviceInfo;
 use protocol::stage::Sampler;
-use serde_json::json;
+use serde_json::{Value, json};
 use stages::generate::timing::{self, Times, WARM_UP};
 use stages::generate::{DEFAULT_FRAMES, Generator};
 
@@ -53,6 +53,16 @@ struct Row {
     label: String,
     sampler: Sampler,
     times: Times,
+}
+
+impl Row {
+    fn ratio_to(&self, first: &Self) -> f64 {
+        self.times.mean / first.times.mean
+    }
+
+    fn frames_per_second(&self, frames: usize) -> f64 {
+        frames as f64 / self.times.mean
+    }
 }
 
 pub(crate) async fn time(args: TimeArgs) -> Result<u8> {
@@ -151,64 +161,65 @@ impl Machine {
 
 fn show(rows: &[Row], frames: usize, machine: &Machine, output: Output) {
     let Some(first) = rows.first() else { return };
-    let per_second = |row: &Row| frames as f64 / row.times.mean;
-    let ratio = |row: &Row| row.times.mean / first.times.mean;
     match output {
-        Output::Json => {
-            let row = |row: &Row| {
-                json!({
-                    "model": row.label,
-                    "sampler": row.sampler,
-                    "sentences": row.times.sentences,
-                    "aits_s": row.times.mean,
-                    "median_s": row.times.median,
-                    "p95_s": row.times.p95,
-                    "text_s": row.times.text,
-                    "sampling_s": row.times.sampling,
-                    "decoding_s": row.times.decoding,
-                    "ratio": ratio(row),
-                    "frames_per_second": per_second(row),
-                })
-            };
-            print::json(&json!({
-                "schema_version": 1,
-                "frames": frames,
-                "warm_up": WARM_UP,
-                "machine": {
-                    "backend": machine.backend,
-                    "device": machine.device,
-                    "threads": machine.threads,
-                    "instruction_set": machine.instruction_set,
-                    "processor": machine.processor,
-                },
-                "rows": rows.iter().map(row).collect::<Vec<_>>(),
-            }));
-        }
-        Output::Table => {
-            let milliseconds = |seconds: f64| format!("{:.2}", seconds * 1e3);
-            let cells = rows.iter().map(|row| {
-                vec![
-                    row.label.clone(),
-                    row.sampler.steps.to_string(),
-                    milliseconds(row.times.mean),
-                    milliseconds(row.times.median),
-                    milliseconds(row.times.p95),
-                    format!("{:.3}", ratio(row)),
-                    format!("{:.0}", per_second(row)),
-                ]
-            });
-            let heads = ["MODEL", "STEPS", "AITS ms", "MEDIAN ms", "P95 ms", "RATIO", "FRAMES/s"];
-            let processor = machine.processor.as_deref().unwrap_or("processor unknown");
-            let Machine { backend, device, threads, instruction_set, .. } = machine;
-            print::out(&format!(
-                "{}\n\n{} sentences, one at a time, after {WARM_UP} for warm-up; models alternate; {frames} frames \
-                 each; measured from the sentence to the features\n{backend} ({device}) with {threads} threads, \
-                 {instruction_set}, {processor}",
-                print::table(&heads, cells.collect()),
-                first.times.sentences,
-            ));
-        }
+        Output::Json => print::json(&document(rows, first, frames, machine)),
+        Output::Table => print::out(&table(rows, first, frames, machine)),
     }
+}
+
+fn document(rows: &[Row], first: &Row, frames: usize, machine: &Machine) -> Value {
+    let rows = rows.iter().map(|row| {
+        json!({
+            "model": row.label,
+            "sampler": row.sampler,
+            "sentences": row.times.sentences,
+            "aits_s": row.times.mean,
+            "median_s": row.times.median,
+            "p95_s": row.times.p95,
+            "text_s": row.times.text,
+            "sampling_s": row.times.sampling,
+            "decoding_s": row.times.decoding,
+            "ratio": row.ratio_to(first),
+            "frames_per_second": row.frames_per_second(frames),
+        })
+    });
+    json!({
+        "schema_version": 1,
+        "frames": frames,
+        "warm_up": WARM_UP,
+        "machine": {
+            "backend": machine.backend,
+            "device": machine.device,
+            "threads": machine.threads,
+            "instruction_set": machine.instruction_set,
+            "processor": machine.processor,
+        },
+        "rows": rows.collect::<Vec<_>>(),
+    })
+}
+
+fn table(rows: &[Row], first: &Row, frames: usize, machine: &Machine) -> String {
+    let milliseconds = |seconds: f64| format!("{:.2}", seconds * 1e3);
+    let cells = rows.iter().map(|row| {
+        vec![
+            row.label.clone(),
+            row.sampler.steps.to_string(),
+            milliseconds(row.times.mean),
+            milliseconds(row.times.median),
+            milliseconds(row.times.p95),
+            format!("{:.3}", row.ratio_to(first)),
+            format!("{:.0}", row.frames_per_second(frames)),
+        ]
+    });
+    let heads = ["MODEL", "STEPS", "AITS ms", "MEDIAN ms", "P95 ms", "RATIO", "FRAMES/s"];
+    let processor = machine.processor.as_deref().unwrap_or("processor unknown");
+    let Machine { backend, device, threads, instruction_set, .. } = machine;
+    format!(
+        "{}\n\n{} sentences, one at a time, after {WARM_UP} for warm-up; models alternate; {frames} frames each; measured \
+         from the sentence to the features\n{backend} ({device}) with {threads} threads, {instruction_set}, {processor}",
+        print::table(&heads, cells.collect()),
+        first.times.sentences,
+    )
 }
 
 /// A progress bar, hidden without a terminal.

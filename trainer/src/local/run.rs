@@ -1,6 +1,6 @@
 //! `trainer run`: runs a coordinator, its workers and a pipeline, to the end or to Ctrl-C.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use coordinator::shell::raise_descriptor_limit;
@@ -260,6 +260,16 @@ async fn drain(
     }
 }
 
+fn next_command(model: &str, store: &Path) -> String {
+    let store = match store.to_str() {
+        Some(".stride") => String::new(),
+        _ => format!(" --store {}", client::shown(store)),
+    };
+    format!(
+        "\n{model} is ready. Try:\n  trainer generate \"a person walks in a circle\" --model {model} -o walk.gif{store}"
+    )
+}
+
 fn report(view: &RunView, whys: &Whys, pipeline: &Pipeline, end: &End, options: &Options) -> u8 {
     let interrupted = matches!(end, End::Interrupted { .. });
     match options.output {
@@ -290,14 +300,7 @@ fn report(view: &RunView, whys: &Whys, pipeline: &Pipeline, end: &End, options: 
     match view.state {
         RunState::Finished => {
             if let (Some(model), Output::Table) = (summary::promoted(pipeline, view), options.output) {
-                let store = if options.store.as_os_str() == ".stride" {
-                    String::new()
-                } else {
-                    format!(" --store {}", client::shown(&options.store))
-                };
-                print::out(&format!(
-                    "\n{model} is ready. Try:\n  trainer generate \"a person walks in a circle\" --model {model} -o walk.gif{store}"
-                ));
+                print::out(&next_command(&model, &options.store));
             }
             0
         }

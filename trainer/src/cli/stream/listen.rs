@@ -163,7 +163,7 @@ pub(super) async fn listen(
         () = listener.serve("/v1/stream", &[Scope::Read], handler, stopped) => Ok(0),
         _ = interrupt.recv() => Ok(0),
         _ = terminate.recv() => Ok(0),
-        () = engine.gone() => Err(Problem::new(exit::FAULT, anyhow::anyhow!("the model's thread has ended; this is a bug of Stride's"))),
+        () = engine.gone() => Err(Problem::new(exit::FAULT, anyhow::anyhow!("the model's thread has ended; this is a bug in Stride"))),
     }
 }
 
@@ -307,18 +307,14 @@ impl StreamServer {
         let mut text = String::new();
         loop {
             while !course.is_pinned() {
-                let line: Line = match next.take() {
-                    Some(line) => line,
+                let line = match next.take() {
+                    Some(line) => Ok(line),
                     None => match self.line(lines, course.has_begun()).await? {
                         None => break,
-                        Some(Ok(line)) => line,
-                        Some(Err(what)) => {
-                            tell(sink, what).await?;
-                            continue;
-                        }
+                        Some(line) => line,
                     },
                 };
-                match course.take(line, stream.root()) {
+                match line.and_then(|line| course.take(line, stream.root())) {
                     Ok(()) => break,
                     Err(what) => tell(sink, what).await?,
                 }

@@ -1,9 +1,8 @@
 //! `evaluate.control`: accuracy of motions at target positions, and its cost in quality. Source: OmniControl, MotionLCM
 //! (tables 3 and 4).
 //!
-//! Captions, crops and noise are those of `evaluate.t2m`. For every case (joints and density) positions of every crop
-//! are given to the model, and its motion is measured against them: trajectory, location and average error, each a mean
-//! over motions. The motion is also measured by FID, R-precision, MM-Dist, Diversity and the skating ratio. Without its
+//! Captions, crops and noise are those of `evaluate.t2m`. In every case (joints and density) the model gets positions of
+//! every crop, and its motion is compared with them: trajectory, location and average error, each a mean over motions. The motion is also measured by FID, R-precision, MM-Dist, Diversity and the skating ratio. Without its
 //! control part the same model, with the same noise, is measured against the same positions as `uncontrolled_...`.
 //!
 //! Departs: upstream measures 1,024 random entries in its spatial setting; here it is the whole split, as in its

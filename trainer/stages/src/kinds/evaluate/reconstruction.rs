@@ -102,6 +102,14 @@ fn evaluator(cx: &dyn AttemptContext, name: &str) -> Result<Option<(Digest, Trai
     Ok(Some((digest, TrainedEvaluator::read(&*cx.blobs(), &manifest, &cx.device())?)))
 }
 
+/// Refuses FID over a single clip.
+fn check_fid(clips: usize) -> Result<(), StageError> {
+    if clips >= 2 {
+        return Ok(());
+    }
+    Err(StageError::Input("FID needs at least 2 clips, but the split has 1; leave `evaluator` out".into()))
+}
+
 /// Share of codes in use and their perplexity, each a mean over the codebooks.
 fn usage(codes: &[Vec<u64>]) -> Vec<(String, f64)> {
     if codes.is_empty() {
@@ -129,17 +137,12 @@ impl Map for EvaluateReconstruction {
         if entries.is_empty() {
             return Err(no_entries(self.split));
         }
-        let evaluator = evaluator(cx, &self.evaluator)?;
-        if let Some((_, evaluator)) = &evaluator {
+        let evaluator = evaluator(cx, &self.evaluator)?.map(|(_, evaluator)| evaluator);
+        if let Some(evaluator) = &evaluator {
             evaluator.check(&dataset, &entries)?;
-            if entries.len() < 2 {
-                return Err(StageError::Input(
-                    "FID needs at least 2 clips, but the split has 1; leave `evaluator` out".into(),
-                ));
-            }
+            check_fid(entries.len())?;
         }
         let mut embedded = Embedded::default();
-
         let range = shard_range(entries.len(), index, of);
         let total = range.len() as u64;
         let skeleton = dataset.skeleton();
@@ -160,7 +163,7 @@ impl Map for EvaluateReconstruction {
             measured.normalise(&mut truth);
             let mut stream = Stream::new(seed, "evaluate.reconstruction/noise", 0, e as u64);
             let (sample, mu) = measured.guesses(&truth, frames, &mut stream, &mut codes);
-            if let Some((_, evaluator)) = &evaluator {
+            if let Some(evaluator) = &evaluator {
                 let mut made = sample.clone();
                 measured.denormalise(&mut made);
                 embedded.add(evaluator, natural, made);
@@ -179,7 +182,7 @@ impl Map for EvaluateReconstruction {
         let bytes = serde_json::to_vec(&rows).map_err(|e| StageError::Fault(e.to_string()))?;
         let mut draft = Draft::new(cx, ArtifactKind::Shard, json!({"shard": index, "of": of}));
         draft.add(REPORT_FILE, bytes)?;
-        if let Some((_, evaluator)) = &evaluator {
+        if let Some(evaluator) = &evaluator {
             draft.add(EMBEDDINGS_FILE, embedded.to_bytes(evaluator.width())?)?;
         }
         let output = draft.finish(cx)?;

@@ -35,20 +35,48 @@ fn add(to: &mut Vec<f64>, from: &[f64]) {
     to.iter_mut().zip(from).for_each(|(to, from)| *to += from);
 }
 
-/// Energy of each band and step as a share of the real clips', and how far the step has settled on the last.
-fn metrics(steps: &[Step], real: &[f64], last: &[f64]) -> Result<BTreeMap<String, f64>, StageError> {
-    let mut metrics = BTreeMap::new();
-    for (s, step) in steps.iter().enumerate() {
-        for b in 0..real.len() {
-            let place = format!("{}/{}", b + 1, s + 1);
-            metrics.insert(format!("energy/{place}"), step.energy[b] / real[b].max(f64::MIN_POSITIVE));
-            metrics.insert(format!("settled/{place}"), 1.0 - step.off[b] / last[b].max(f64::MIN_POSITIVE));
+/// Sums over motions of the energies by band.
+#[derive(Debug, Default)]
+struct Sums {
+    /// The entries' crops.
+    real: Vec<f64>,
+    /// The final motions.
+    last: Vec<f64>,
+    /// The predictions of each sampler step.
+    steps: Vec<Step>,
+}
+
+impl Sums {
+    /// Adds a motion's predictions, one for each step of the sampler.
+    fn add_predictions(&mut self, bands: &Bands, motions: &[Vec<f64>], width: usize) -> Result<(), StageError> {
+        let Some(end) = motions.last() else {
+            return Err(StageError::Fault("the sampler has no steps".into()));
+        };
+        add(&mut self.last, &bands.energy(end, width));
+        self.steps.resize(motions.len(), Step::default());
+        for (step, motion) in self.steps.iter_mut().zip(motions) {
+            let off: Vec<f64> = motion.iter().zip(end).map(|(a, b)| a - b).collect();
+            add(&mut step.energy, &bands.energy(motion, width));
+            add(&mut step.off, &bands.energy(&off, width));
         }
+        Ok(())
     }
-    match metrics.iter().find(|(_, value)| !value.is_finite()) {
-        None => Ok(metrics),
-        Some((name, value)) => {
-            Err(StageError::Input(format!("`{name}` is {value}: the model is not trained well enough")))
+
+    /// Energy of each band and step as a share of the real clips', and how far the step has settled on the last.
+    fn metrics(&self) -> Result<BTreeMap<String, f64>, StageError> {
+        let mut metrics = BTreeMap::new();
+        for (s, step) in self.steps.iter().enumerate() {
+            for b in 0..self.real.len() {
+                let place = format!("{}/{}", b + 1, s + 1);
+                metrics.insert(format!("energy/{place}"), step.energy[b] / self.real[b].max(f64::MIN_POSITIVE));
+                metrics.insert(format!("settled/{place}"), 1.0 - step.off[b] / self.last[b].max(f64::MIN_POSITIVE));
+            }
+        }
+        match metrics.iter().find(|(_, value)| !value.is_finite()) {
+            None => Ok(metrics),
+            Some((name, value)) => {
+                Err(StageError::Input(format!("`{name}` is {value}: the model is not trained well enough")))
+            }
         }
     }
 }
@@ -69,9 +97,7 @@ impl Plain for EvaluateSpectrum {
             dataset.normalise(&mut rows);
             rows.into_iter().map(f64::from).collect()
         };
-        let mut real = Vec::new();
-        let mut last = Vec::new();
-        let mut steps = Vec::<Step>::new();
+        let mut sums = Sums::default();
         let mut timesteps = Vec::new();
         for (done, e) in entries.iter().enumerate() {
             if cx.interrupted() {
@@ -83,7 +109,7 @@ impl Plain for EvaluateSpectrum {
             let (start, length) = crop(&mut draw, entry.len, dataset.skeleton());
             let bands = Bands::new(length, fps, &self.bands);
             let rows = &dataset.features(entry)[start * width..(start + length) * width];
-            add(&mut real, &bands.energy(&normalised(rows), width));
+            add(&mut sums.real, &bands.energy(&normalised(rows), width));
 
             let texts: Vec<_> =
                 model.embed(&[dataset.captions[caption].text.as_str()])?.into_iter().map(Rc::new).collect();
@@ -92,24 +118,15 @@ impl Plain for EvaluateSpectrum {
             let predicted = model.predictions(batch, &self.sampler)?;
             let motions: Vec<Vec<f64>> = predicted.iter().map(|(_, motion)| normalised(motion)).collect();
             timesteps = predicted.iter().map(|(t, _)| *t).collect();
-            let Some(end) = motions.last() else {
-                return Err(StageError::Fault("the sampler has no steps".into()));
-            };
-            add(&mut last, &bands.energy(end, width));
-            steps.resize(motions.len(), Step::default());
-            for (step, motion) in steps.iter_mut().zip(&motions) {
-                let off: Vec<f64> = motion.iter().zip(end).map(|(a, b)| a - b).collect();
-                add(&mut step.energy, &bands.energy(motion, width));
-                add(&mut step.off, &bands.energy(&off, width));
-            }
+            sums.add_predictions(&bands, &motions, width)?;
             cx.progress(done as u64 + 1, entries.len() as u64, "motions", &[]);
         }
-        let metrics = metrics(&steps, &real, &last)?;
+        let metrics = sums.metrics()?;
         let count = entries.len() as f64;
         let details = json!({
             "bands_hz": self.bands,
             "timesteps": timesteps,
-            "real_energy": real.iter().map(|sum| sum / count).collect::<Vec<_>>(),
+            "real_energy": sums.real.iter().map(|sum| sum / count).collect::<Vec<_>>(),
             "motions": entries.len(),
             "split": self.split,
             "sampler": self.sampler,

@@ -53,6 +53,63 @@ fn samples_of_one(plan: &Plan<'_>, maker: &Maker<'_>, unit: Unit) -> Result<Vec<
     Ok(embeddings)
 }
 
+/// Embeddings of a shard's captions and motions, and the skating of its motions.
+#[derive(Default)]
+struct Measured {
+    text: Vec<f32>,
+    made: Vec<f32>,
+    /// The motions that FID compares with.
+    real: Vec<f32>,
+    skating: Vec<f32>,
+    /// Samples for [`Part::Many`].
+    many: Vec<f32>,
+}
+
+impl Measured {
+    /// Adds a block of entries: generated, reconstructed, or the crops themselves.
+    fn add_entries(
+        &mut self,
+        plan: &Plan<'_>,
+        source: &Source,
+        maker: Option<&Maker<'_>>,
+        unit: Unit,
+    ) -> Result<(), StageError> {
+        let block = plan.of.block(unit.block);
+        let draws: Vec<Draw> = block.clone().map(|i| plan.of.draw(unit.repeat, i, true)).collect();
+        let crops: Vec<Vec<f32>> = draws.iter().map(|d| plan.of.crop(*d)).collect();
+        self.text.extend(plan.of.trained.captions(draws.iter().map(|d| &plan.of.dataset.captions[d.caption])));
+        let motions = match (source, maker) {
+            (_, Some(maker)) => {
+                self.real.extend(plan.of.trained.motions(&crops));
+                let noise = |k, b| plan.of.stream(&format!("noise {k}"), unit.repeat, block.start + b);
+                maker.motions(plan, &draws, &noise)?
+            }
+            (Source::Reconstructed(reconstructor), _) => {
+                self.real.extend(plan.of.trained.motions(&crops));
+                let both = draws.iter().zip(&crops);
+                both.map(|(draw, crop)| reconstruct(plan, reconstructor, *draw, crop)).collect::<Result<Vec<_>, _>>()?
+            }
+            _ => {
+                let others = block.map(|i| plan.of.crop(plan.of.draw(unit.repeat, i, false)));
+                self.real.extend(plan.of.trained.motions(&others.collect::<Vec<_>>()));
+                crops
+            }
+        };
+        self.skating.extend(motions.iter().map(|motion| skates(motion, plan.of.dataset.skeleton())));
+        self.made.extend(plan.of.trained.motions(&motions));
+        Ok(())
+    }
+
+    fn into_tensors(self, width: usize) -> Tensors {
+        Tensors::default()
+            .with_rows("text", width, self.text)
+            .with_rows("made", width, self.made)
+            .with_rows("real", width, self.real)
+            .with_rows("many", width, self.many)
+            .with("skating", [self.skating.len()], self.skating)
+    }
+}
+
 impl Map for EvaluateT2m {
     fn repetitions(&self, entries: &dyn Fn(Split) -> f64) -> f64 {
         let many = if self.generates() { self.multimodality.captions * self.multimodality.samples } else { 0 };
@@ -69,57 +126,21 @@ impl Map for EvaluateT2m {
         // Every `of`-th unit of either part, since the parts have different costs.
         let mine = |part| in_turn(plan.units().into_iter().filter(move |unit| unit.part == part), index, of);
         let units: Vec<Unit> = mine(Part::Entries).chain(mine(Part::Many)).collect();
-        let mut text = Vec::new();
-        let mut made = Vec::new();
-        let mut real = Vec::new();
-        let mut skating = Vec::new();
-        let mut many = Vec::new();
+        let mut measured = Measured::default();
         for (done, unit) in units.iter().enumerate() {
             if cx.interrupted() {
                 return Ok(Outcome::Yielded { at: 0 });
             }
             match unit.part {
-                Part::Entries => {
-                    let block = plan.of.block(unit.block);
-                    let draws: Vec<Draw> = block.clone().map(|i| plan.of.draw(unit.repeat, i, true)).collect();
-                    let crops: Vec<Vec<f32>> = draws.iter().map(|d| plan.of.crop(*d)).collect();
-                    text.extend(plan.of.trained.captions(draws.iter().map(|d| &plan.of.dataset.captions[d.caption])));
-                    let motions = match (&source, &maker) {
-                        (_, Some(maker)) => {
-                            real.extend(plan.of.trained.motions(&crops));
-                            maker.motions(&plan, &draws, &|k, b| {
-                                plan.of.stream(&format!("noise {k}"), unit.repeat, block.start + b)
-                            })?
-                        }
-                        (Source::Reconstructed(reconstructor), _) => {
-                            real.extend(plan.of.trained.motions(&crops));
-                            let both = draws.iter().zip(&crops);
-                            both.map(|(draw, crop)| reconstruct(&plan, reconstructor, *draw, crop))
-                                .collect::<Result<Vec<_>, _>>()?
-                        }
-                        _ => {
-                            let others = block.map(|i| plan.of.crop(plan.of.draw(unit.repeat, i, false)));
-                            real.extend(plan.of.trained.motions(&others.collect::<Vec<_>>()));
-                            crops
-                        }
-                    };
-                    skating.extend(motions.iter().map(|motion| skates(motion, plan.of.dataset.skeleton())));
-                    made.extend(plan.of.trained.motions(&motions));
-                }
+                Part::Entries => measured.add_entries(&plan, &source, maker.as_ref(), *unit)?,
                 Part::Many => {
                     let maker = maker.as_ref().ok_or_else(|| StageError::Fault("only a model has samples".into()))?;
-                    many.extend(samples_of_one(&plan, maker, *unit)?);
+                    measured.many.extend(samples_of_one(&plan, maker, *unit)?);
                 }
             }
             cx.progress(done as u64 + 1, units.len() as u64, "blocks", &[]);
         }
-        let width = plan.of.trained.width();
-        let tensors = Tensors::default()
-            .with_rows("text", width, text)
-            .with_rows("made", width, made)
-            .with_rows("real", width, real)
-            .with_rows("many", width, many)
-            .with("skating", [skating.len()], skating);
+        let tensors = measured.into_tensors(plan.of.trained.width());
         shards::publish(cx, &Units { units }, EMBEDDINGS_FILE, &tensors, BTreeMap::new())
     }
 

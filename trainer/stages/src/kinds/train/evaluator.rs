@@ -18,10 +18,10 @@ use motion::Stream;
 use motion::dataset::normalise;
 use motion::dataset::{Dataset, crop, window};
 use protocol::stage::{Positions, Split, TrainEvaluator};
-use protocol::{ArtifactKind, Seed};
+use protocol::{ArtifactKind, Digest, Seed};
 
 use crate::artifacts;
-use crate::context::{GangContext, Outcome, StageError};
+use crate::context::{AttemptContext, GangContext, Outcome, StageError};
 use crate::external;
 use crate::kinds::shape::Gang;
 use crate::parts::evaluator::{self, EvaluatorMeta, UNIT};
@@ -216,6 +216,17 @@ impl EvaluatorObjective {
             ..SliceResult::default()
         })
     }
+
+    /// Publishes the two encoders and the movement encoder that they read; the decoder served only its training.
+    fn publish(&self, state: &TrainState, cx: &mut dyn AttemptContext) -> Result<Digest, StageError> {
+        let blank = Evaluator::new(&self.meta.config, &mut Init::blank(&self.device.clone().inner()));
+        let encoder = self.frozen.num_params();
+        let mut weights = state.result(0).to_vec();
+        weights.extend_from_slice(state.result(1));
+        weights.extend_from_slice(&state.result(2)[..encoder]);
+        let trained = (&flat::layout(&blank)[..], &weights[..]);
+        evaluator::publish(cx, &self.meta, trained, &self.words)
+    }
 }
 
 fn turning_point(settings: &TrainEvaluator) -> u64 {
@@ -331,18 +342,10 @@ impl Gang for TrainEvaluator {
             purpose: purpose.clone(),
             seed,
             dropout_seed: dropout_seed(cx),
-            device: plain.clone(),
+            device: plain,
             meta,
         };
-        train(&mut objective, &self.training, cx)?.publish(|state| {
-            let blank = Evaluator::new(&objective.meta.config, &mut Init::blank(&plain.clone().inner()));
-            let encoder = objective.frozen.num_params();
-            let mut weights = state.result(0).to_vec();
-            weights.extend_from_slice(state.result(1));
-            weights.extend_from_slice(&state.result(2)[..encoder]);
-            let trained = (&flat::layout(&blank)[..], &weights[..]);
-            evaluator::publish(cx, &objective.meta, trained, &objective.words)
-        })
+        train(&mut objective, &self.training, cx)?.publish(|state| objective.publish(state, cx))
     }
 }
 
