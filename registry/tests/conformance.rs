@@ -84,7 +84,9 @@ fn what_is_not_there_is_not_found(store: &BlobStore) {
 
 fn a_wrong_name_is_refused(store: &BlobStore) {
     let named = Digest::of(b"other");
-    assert!(matches!(store.put_named(named, b"bytes"), Err(BlobError::Corrupt { expected, .. }) if expected == named));
+    let mut upload = store.begin(5).unwrap();
+    upload.write(b"bytes").unwrap();
+    assert!(matches!(store.commit(upload, named), Err(BlobError::Corrupt { expected, .. }) if expected == named));
     assert!(store.list().unwrap().is_empty());
 }
 

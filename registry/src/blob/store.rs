@@ -78,11 +78,6 @@ impl BlobStore {
         Ok(Self::remembering(Arc::new(folder), &dir.join("blobs/verified")))
     }
 
-    /// Opens the blobs of the store in a folder for reading only; another process may hold its lock.
-    pub fn folder_to_read(dir: &Path) -> Self {
-        Self::new(Folder::to_read(dir))
-    }
-
     /// Makes a store in memory for tests.
     pub fn in_memory() -> Self {
         Self::new(Memory::default())
@@ -211,13 +206,6 @@ impl BlobStore {
         Ok(digest)
     }
 
-    /// Stores bytes under a given digest and refuses them if they do not hash to it.
-    pub fn put_named(&self, digest: Digest, bytes: &[u8]) -> Result<(), BlobError> {
-        let mut upload = self.begin(bytes.len() as u64)?;
-        upload.write(bytes)?;
-        self.commit(upload, digest)
-    }
-
     /// Starts to store a blob of `bytes` bytes.
     pub fn begin(&self, bytes: u64) -> Result<Upload, BlobError> {
         Ok(Upload::new(self.backend().stage(bytes)?, bytes))
@@ -229,7 +217,8 @@ impl BlobStore {
         if found != digest {
             return Err(BlobError::Corrupt { expected: digest, found });
         }
-        let (bytes, content) = (upload.written, upload.content);
+        let bytes = upload.written;
+        let content = upload.content;
         if self.reuse(digest)? {
             self.seen().complete(digest, content);
             return Ok(());

@@ -2,7 +2,7 @@
 //!
 //! `KEY=VALUE` words may follow the token, each key at most once. [`Caller::set`] is the only list of keys.
 
-use protocol::{Group, Owner, WorkerId};
+use protocol::{Group, Owner};
 
 use crate::expiry::Expiry;
 use crate::names::Names;
@@ -86,11 +86,6 @@ impl Caller {
     /// Returns true if it controls the data of `group`.
     pub fn controls(&self, group: Option<&Group>) -> bool {
         self.scopes.allow(Scope::Admin) || group.is_some_and(|group| self.owner().controls(group))
-    }
-
-    /// Returns true if its workers may use this name.
-    pub fn may_name(&self, worker: &WorkerId) -> bool {
-        self.workers.as_ref().is_none_or(|names| names.allow(worker.as_str()))
     }
 
     /// The allowed names of its workers, as written; `None` allows every name.

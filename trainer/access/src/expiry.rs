@@ -64,7 +64,8 @@ fn seconds(text: &str) -> Option<i64> {
 fn days(text: &str) -> Option<i64> {
     let parts: Vec<&str> = text.split('-').collect();
     let [year, month, day] = parts.as_slice() else { return None };
-    let (year, month) = (number(year, 4, 1..=9999)?, number(month, 2, 1..=12)?);
+    let year = number(year, 4, 1..=9999)?;
+    let month = number(month, 2, 1..=12)?;
     let day = number(day, 2, 1..=length(year, month))?;
     let months: i64 = (1..month).map(|month| length(year, month)).sum();
     let before = year - 1;

@@ -25,7 +25,8 @@ pub struct Published {
 
 /// Writes `token` to the folder of the store that this process holds.
 pub fn publish(dir: &Path, token: &Token) -> io::Result<Published> {
-    let (path, fresh) = (path(dir), dir.join(format!("token.{}", std::process::id())));
+    let path = path(dir);
+    let fresh = dir.join(format!("token.{}", std::process::id()));
     let _ = fs::remove_file(&fresh);
     // `create_new` guarantees our owner and mode, even if another file had this name before.
     let mut file = OpenOptions::new().write(true).create_new(true).mode(0o600).open(&fresh)?;

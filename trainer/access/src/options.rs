@@ -44,7 +44,8 @@ pub struct ConnectionOptions {
 impl ConnectionOptions {
     /// Creates a client of the server at `url`.
     pub fn connect(&self, url: &str) -> Result<Server, ConnectError> {
-        let (token, ca) = (self.token.read()?, self.ca.as_deref());
+        let token = self.token.read()?;
+        let ca = self.ca.as_deref();
         if self.insecure { Server::insecure(url, token, ca) } else { Server::new(url, token, ca) }
     }
 }

@@ -66,7 +66,7 @@ impl Scopes {
         Self(scopes.iter().fold(0, |all, scope| all | one(*scope)))
     }
 
-    /// All scopes.
+    /// The set with every scope.
     pub fn all() -> Self {
         Self::of(&[Scope::Admin])
     }

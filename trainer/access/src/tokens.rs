@@ -239,9 +239,9 @@ mod tests {
     #[test]
     fn a_line_may_limit_the_names_of_its_workers() {
         let tokens = read(&format!("nodes worker {A} workers=nodes-*,gpu1\nlab worker {B}\n")).unwrap();
-        let may_name = |token: &str, worker: &str| tokens.find(token).unwrap().may_name(&worker.into());
-        assert!(may_name(A, "nodes-7") && may_name(A, "gpu1") && !may_name(A, "gpu2"));
-        assert!(may_name(B, "nodes-7"), "without `workers=` every name is allowed");
+        let names = tokens.find(A).unwrap().worker_names().unwrap();
+        assert!(names.allow("nodes-7") && names.allow("gpu1") && !names.allow("gpu2"));
+        assert!(tokens.find(B).unwrap().worker_names().is_none(), "without `workers=` every name is allowed");
     }
 
     #[test]
@@ -290,7 +290,8 @@ mod tests {
     fn a_project_or_a_name_says_what_is_seen() {
         let text = format!("alice submit {A} project=motion expires=2026-12-31\nbob submit,read {B}\n");
         let tokens = read(&text).unwrap();
-        let (alice, bob) = (tokens.find(A).unwrap(), tokens.find(B).unwrap());
+        let alice = tokens.find(A).unwrap();
+        let bob = tokens.find(B).unwrap();
         assert_eq!(alice.sees(), Some(Group::of("anna", Some("motion"))));
         assert!(alice.controls(alice.sees().as_ref()) && !alice.may_see(None));
         assert_eq!(bob.sees(), None);

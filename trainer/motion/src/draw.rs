@@ -38,7 +38,8 @@ impl View {
     fn project(&self, p: [f64; 3]) -> ([f64; 2], f64) {
         let [x, y, z] = [0, 1, 2].map(|k| p[k] - self.looking_at[k]);
         let (sin, cos) = TURN.sin_cos();
-        let (right, near) = (x * cos - z * sin, x * sin + z * cos);
+        let right = x * cos - z * sin;
+        let near = x * sin + z * cos;
         let (tip_sin, tip_cos) = TIP.sin_cos();
         let up = y * tip_cos - near * tip_sin;
         ([self.centre[0] + self.scale * right, self.centre[1] - self.scale * up], near * tip_cos + y * tip_sin)
@@ -112,9 +113,11 @@ fn ground(canvas: &mut Canvas, view: &View, reach: f64) {
     let step = 0.5;
     let [x, _, z] = view.looking_at;
     let cells = (reach / step).ceil() as i64;
-    let (x0, z0) = ((x / step).round() * step, (z / step).round() * step);
+    let x0 = (x / step).round() * step;
+    let z0 = (z / step).round() * step;
     for i in -cells..=cells {
-        let (d, r) = (i as f64 * step, cells as f64 * step);
+        let d = i as f64 * step;
+        let r = cells as f64 * step;
         let mut line = |a: [f64; 3], b: [f64; 3]| canvas.line(view.project(a).0, view.project(b).0, 1.0, GRID);
         line([x0 + d, 0.0, z0 - r], [x0 + d, 0.0, z0 + r]);
         line([x0 - r, 0.0, z0 + d], [x0 + r, 0.0, z0 + d]);
@@ -187,18 +190,11 @@ pub fn rgb_along_to(
     film(joints, skeleton, title, waypoints, |canvas, _| out.write_all(&canvas.bytes()))
 }
 
-/// Writes an animated GIF: the motion at its own speed, with the camera following the root and `title` above.
+/// Writes an animated GIF: the motion at its own speed, with the camera following the root, its waypoints and `title`
+/// above.
 ///
 /// # Errors
 /// If `out` fails, or the joints are not a whole number of frames.
-pub fn gif_to(joints: &[f32], skeleton: &Skeleton, title: &str, out: impl Write) -> io::Result<()> {
-    gif_along_to(joints, skeleton, title, &[], out)
-}
-
-/// Like [`gif_to`], with the waypoints of the motion.
-///
-/// # Errors
-/// As [`gif_to`].
 pub fn gif_along_to(
     joints: &[f32],
     skeleton: &Skeleton,
@@ -221,7 +217,7 @@ pub fn gif_along_to(
     })
 }
 
-/// Writes an animated GIF with [`gif_to`] to a file.
+/// Writes an animated GIF without waypoints to a file.
 ///
 /// # Errors
 /// If the file cannot be written, or the joints are not a whole number of frames.

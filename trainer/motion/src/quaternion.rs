@@ -123,14 +123,3 @@ pub fn matmul(a: [Vec3; 3], b: [Vec3; 3]) -> [Vec3; 3] {
 pub fn apply(m: [Vec3; 3], v: Vec3) -> Vec3 {
     m.map(|row| dot(row, v))
 }
-
-/// Makes a track of quaternions continuous: of `q` and `-q`, the same rotation, each frame gets the one nearer to the
-/// frame before.
-pub fn make_continuous(track: &mut [Quat]) {
-    for t in 1..track.len() {
-        let (before, now) = (track[t - 1], track[t]);
-        if before.iter().zip(now).map(|(a, b)| a * b).sum::<f64>() < 0.0 {
-            track[t] = now.map(|v| -v);
-        }
-    }
-}

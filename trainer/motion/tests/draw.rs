@@ -16,7 +16,7 @@ fn a_gif_plays_as_long_as_the_motion() {
     let skeleton = Skeleton::of(DataFormat::Humanml3d);
     let (title, joints) = motion();
     let mut bytes = vec![];
-    draw::gif_to(&joints, skeleton, &title, &mut bytes).unwrap();
+    draw::gif_along_to(&joints, skeleton, &title, &[], &mut bytes).unwrap();
     let mut decoder = gif::DecodeOptions::new();
     decoder.set_color_output(gif::ColorOutput::RGBA);
     let mut decoder = decoder.read_info(&bytes[..]).unwrap();
@@ -99,7 +99,7 @@ fn what_was_told_is_drawn() {
     let (found, height) = purple(sheet(Given { kept: &[0..5, 15..21], ..Given::default() }));
     assert!(found > 60 && height == plain, "{found} pixels of what was drawn, {height} high");
     let (mut plain, mut along) = (vec![], vec![]);
-    draw::gif_to(&joints, skeleton, &title, &mut plain).unwrap();
+    draw::gif_along_to(&joints, skeleton, &title, &[], &mut plain).unwrap();
     draw::gif_along_to(&joints, skeleton, &title, &waypoints, &mut along).unwrap();
     assert_ne!(plain, along);
 }
@@ -134,6 +134,7 @@ fn a_sheet_has_a_row_a_motion_with_its_note_and_its_way_from_above() {
     let (turned, _) = pixels(&[row("", &turned), row("", &joints)]);
     let (poses, way) = (differ(&turned, 0..684), differ(&turned, 684..size[0]));
     assert!(way > 60 && poses < 8, "{way} lines of the way and {poses} of the poses");
-    let error = draw::gif_to(&[0.0; 65], Skeleton::of(DataFormat::Humanml3d), "", vec![]).unwrap_err().to_string();
+    let error =
+        draw::gif_along_to(&[0.0; 65], Skeleton::of(DataFormat::Humanml3d), "", &[], vec![]).unwrap_err().to_string();
     assert!(error.contains("65 coordinates"), "{error}");
 }

@@ -19,8 +19,8 @@ use protocol::Manifest;
 use protocol::stage::{DataFormat, Family, Sampler, Solver};
 
 use super::steering::Steering;
-use super::weights;
-use crate::artifacts::{self, DenoiserMeta, VaeMeta, word};
+use super::{expect_format, weights};
+use crate::artifacts::{self, DenoiserMeta, VaeMeta};
 use crate::context::StageError;
 
 /// Width of the time sinusoid in every published denoiser.
@@ -108,14 +108,7 @@ impl Autoencoder {
 
     /// Refuses data of another format than the training data.
     pub fn check_format(&self, format: DataFormat) -> Result<(), StageError> {
-        if self.meta.format == format {
-            return Ok(());
-        }
-        let ours = word(&self.meta.format);
-        let theirs = word(&format);
-        Err(StageError::Input(format!(
-            "the VAE was trained on `{ours}` features, but the dataset has `{theirs}` features"
-        )))
+        expect_format("the VAE", self.meta.format, format)
     }
 
     /// Computes `(x - mean) / std` with the statistics of the training data, in place.

@@ -38,6 +38,16 @@ pub fn part(blobs: &dyn Blobs, model: &Model, role: &Role, kind: ArtifactKind) -
     Ok(manifest)
 }
 
+/// Refuses a dataset in another format than that of the training data of `what`.
+fn expect_format(what: &str, trained_on: DataFormat, found: DataFormat) -> Result<(), StageError> {
+    if trained_on == found {
+        return Ok(());
+    }
+    let ours = trained_on.name();
+    let theirs = found.name();
+    Err(StageError::Input(format!("{what} was trained on `{ours}` features, but the dataset has `{theirs}` features")))
+}
+
 /// Reads a manifest from the blobs of an artifact; `what` names it in errors.
 pub fn manifest(blobs: &dyn Blobs, digest: Digest, what: &str) -> Result<Manifest, StageError> {
     let bytes = blobs.get(digest).map_err(artifacts::blob_error)?;

@@ -16,8 +16,8 @@ use protocol::stage::{DataFormat, TokenizerNetwork};
 use protocol::{ArtifactKind, Digest, Manifest};
 use serde::{Deserialize, Serialize};
 
-use super::weights;
-use crate::artifacts::{self, Draft, HostTensor, MODEL_FILE, Tensors, to_meta, word};
+use super::{expect_format, weights};
+use crate::artifacts::{self, Draft, HostTensor, MODEL_FILE, Tensors, to_meta};
 use crate::context::{AttemptContext, ContextError, StageError};
 
 /// Meta of an artifact of kind `tokenizer`.
@@ -113,14 +113,7 @@ impl TrainedTokenizer {
 
     /// Refuses data of another format than the training data.
     pub fn check_format(&self, format: DataFormat) -> Result<(), StageError> {
-        if self.meta.format == format {
-            return Ok(());
-        }
-        let ours = word(&self.meta.format);
-        let theirs = word(&format);
-        Err(StageError::Input(format!(
-            "the tokenizer was trained on `{ours}` features, but the dataset has `{theirs}` features"
-        )))
+        expect_format("the tokenizer", self.meta.format, format)
     }
 
     /// Computes `(x - mean) / std` with the statistics of the training data, in place.
