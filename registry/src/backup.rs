@@ -66,7 +66,7 @@ pub enum BackupError {
     Disk {
         /// The operation that failed.
         did: &'static str,
-        /// Its path.
+        /// Path of the failed operation.
         path: PathBuf,
         /// Cause from the operating system.
         cause: io::Error,
@@ -110,7 +110,8 @@ impl Manifest {
     }
 
     fn summary(&self) -> Summary {
-        let (blobs, bytes) = (self.blobs.len() as u64, self.blobs.values().sum());
+        let blobs = self.blobs.len() as u64;
+        let bytes = self.blobs.values().sum();
         Summary { store: self.store.clone(), at_ms: self.at_ms, blobs, bytes }
     }
 }
@@ -141,7 +142,9 @@ fn names(dir: &Path) -> Result<Vec<String>, BackupError> {
 
 /// Returns the digest and the length of a file, read part by part.
 fn hashed(path: &Path) -> io::Result<(Digest, u64)> {
-    let (mut file, mut hasher, mut bytes) = (File::open(path)?, Hasher::default(), 0);
+    let mut file = File::open(path)?;
+    let mut hasher = Hasher::default();
+    let mut bytes = 0;
     let mut part = vec![0; 1 << 20];
     loop {
         let read = file.read(&mut part)?;
@@ -184,7 +187,9 @@ impl ReadStore {
         let copy = to.join(&database);
         let rows = Rows::from(self.copy_to(&copy).await?);
         sync(&copy)?;
-        let (blobs, from, store) = (self.blobs().clone(), self.dir().to_owned(), self.id().clone());
+        let blobs = self.blobs().clone();
+        let from = self.dir().to_owned();
+        let store = self.id().clone();
         let ended = |e: tokio::task::JoinError| BackupError::Damaged(format!("copying stopped early: {e}"));
         let needed = retention::needed(&BlobCalls::of(self), &rows).await?;
         let work = move || {
@@ -236,7 +241,8 @@ fn copy_blobs(
     to: &Path,
     needed: BTreeSet<Digest>,
 ) -> Result<BTreeMap<Digest, u64>, BackupError> {
-    let (mut copied, mut shards) = (BTreeMap::new(), BTreeSet::new());
+    let mut copied = BTreeMap::new();
+    let mut shards = BTreeSet::new();
     for digest in needed {
         let target = blob_path(to, digest);
         if target.exists()
@@ -337,7 +343,10 @@ pub async fn restore(backup: &Path, to: &Path, place: Option<&Place>) -> Result<
 
 /// Makes a store from a backup in `fresh` and checks it as `fsck` does.
 async fn verified(backup: &Path, fresh: &Path, manifest: &Manifest, place: Option<&Place>) -> Result<(), BackupError> {
-    let (from, to, parts, place) = (backup.to_owned(), fresh.to_owned(), manifest.clone(), place.cloned());
+    let from = backup.to_owned();
+    let to = fresh.to_owned();
+    let parts = manifest.clone();
+    let place = place.cloned();
     let ended = |e: tokio::task::JoinError| BackupError::Damaged(format!("copying stopped early: {e}"));
     let copied = tokio::task::spawn_blocking(move || copy_back(&from, &to, &parts, place)).await.map_err(ended)?;
     // Every other copy of the database is refused from then on.
@@ -356,7 +365,8 @@ async fn verified(backup: &Path, fresh: &Path, manifest: &Manifest, place: Optio
 /// Copies a backup to `fresh` and its blobs to `place`. Returns the epoch in the marker there.
 fn copy_back(backup: &Path, fresh: &Path, manifest: &Manifest, place: Option<Place>) -> Result<u64, BackupError> {
     make_dir(&fresh.join("blobs"))?;
-    let (from, to) = (backup.join(&manifest.database), fresh.join(folder::DATABASE));
+    let from = backup.join(&manifest.database);
+    let to = fresh.join(folder::DATABASE);
     // Copied, not linked: a store must not share files with its backup.
     fs::copy(&from, &to).map_err(disk("cannot copy", &from))?;
     expect(&to, manifest.database_digest)?;
@@ -405,7 +415,8 @@ fn put_back(blobs: &BlobStore, from: &Path, digest: Digest) -> Result<(), Backup
     }
     let mut file = File::open(from).map_err(disk("cannot read", from))?;
     let bytes = file.metadata().map_err(disk("cannot read", from))?.len();
-    let (mut upload, mut part) = (blobs.begin(bytes).map_err(stored)?, vec![0; 1 << 20]);
+    let mut upload = blobs.begin(bytes).map_err(stored)?;
+    let mut part = vec![0; 1 << 20];
     loop {
         let read = file.read(&mut part).map_err(disk("cannot read", from))?;
         if read == 0 {

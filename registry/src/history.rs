@@ -118,7 +118,7 @@ pub struct HistoryEntry {
     /// The token that asked for it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub actor: Option<String>,
-    /// The reason.
+    /// Reason that the actor gave.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub why: Option<String>,
 }

@@ -102,7 +102,7 @@ pub enum Mismatch {
     /// A marker cannot be read.
     #[error("cannot read `{path}`: {message}")]
     Unreadable {
-        /// The marker.
+        /// Path of the marker.
         path: String,
         /// The error.
         message: String,
@@ -361,7 +361,8 @@ pub(crate) async fn check(
     match records.stored().await.map_err(|e| format!("cannot read the database: {e}"))? {
         Some(stored) if stored.id != *id => Err(format!("the database belongs to store {}, not {id}", stored.id)),
         Some(stored) if marker.epoch > stored.epoch => {
-            let (found, known) = (stored.epoch, marker.epoch);
+            let found = stored.epoch;
+            let known = marker.epoch;
             Err(Mismatch::Copied { database: database.to_owned(), found, marker: place, known }.to_string())
         }
         Some(_) => Ok(()),
@@ -403,7 +404,8 @@ impl Witness {
 
     /// Writes the witness of a database that was just opened.
     pub(crate) fn begin(dir: &Path, stored: &Stored) -> io::Result<Self> {
-        let (dir, store) = (dir.to_owned(), stored.id.clone());
+        let dir = dir.to_owned();
+        let store = stored.id.clone();
         let mut witness = Self { dir, store, commits: stored.commits, written: 0, at: Instant::now(), cycle: None };
         witness.write()?;
         Ok(witness)

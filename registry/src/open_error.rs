@@ -29,7 +29,7 @@ pub enum OpenError {
         marker: String,
     },
     /// Database, blobs and folder do not belong together, or one of them is missing or too old.
-    #[error("store `{}` is not whole: {mismatch}", dir.display())]
+    #[error("store `{}` is incomplete: {mismatch}", dir.display())]
     Mismatch {
         dir: PathBuf,
         /// The mismatch.
@@ -156,7 +156,8 @@ impl OpenError {
     }
 
     pub(crate) fn io(path: &Path, e: &io::Error) -> Self {
-        let (path, message) = (path.to_owned(), e.to_string());
+        let path = path.to_owned();
+        let message = e.to_string();
         if is_full(e) {
             Self::Full { path, message }
         } else if is_read_only(e) {

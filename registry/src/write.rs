@@ -128,7 +128,7 @@ pub enum Write {
     Shard {
         /// Grant whose fence is checked.
         grant: Grant,
-        /// The artifact.
+        /// Manifest of the shard's artifact.
         output: Digest,
     },
     /// A stage's value under its key; the stage is cached from then on. The first writer of a key wins; another output

@@ -131,7 +131,7 @@ impl Rendered {
     }
 }
 
-/// Where the parser is in a row of a table.
+/// The parser's position in a row of a table.
 #[derive(PartialEq)]
 enum Row {
     None,
@@ -191,12 +191,15 @@ fn document(
     let up = "../".repeat(chapter.path.matches('/').count());
     let turn = |to: Option<&source::Chapter>, class: &str| {
         to.map_or_else(String::new, |to| {
-            let (name, title) = (html_name(&to.path), escaped(&to.title));
+            let name = html_name(&to.path);
+            let title = escaped(&to.title);
             format!("<a class=\"{class}\" rel=\"{class}\" href=\"{up}{name}\">{title}</a>\n")
         })
     };
-    let (title, list) = (escaped(&chapter.title), contents(root, &chapter.path, &up));
-    let (before, next) = (turn(before, "prev"), turn(next, "next"));
+    let title = escaped(&chapter.title);
+    let list = contents(root, &chapter.path, &up);
+    let before = turn(before, "prev");
+    let next = turn(next, "next");
     format!(
         "<!doctype html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n<title>{title} · Stride</title>\n\
          <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n\

@@ -321,7 +321,8 @@ impl ActiveAssignment {
     pub(crate) fn doing(&self) -> Doing {
         let state = lock(&self.state);
         let (lost, waits_for) = state.newest.as_ref().map(|mesh| (mesh.lost(), mesh.waits_for())).unwrap_or_default();
-        let (holds, peak_memory) = (state.holds, state.peak_memory);
+        let holds = state.holds;
+        let peak_memory = state.peak_memory;
         let doing = Doing::new(state.assignment.grant.clone(), state.progress.clone());
         Doing { holds, waits_for, lost, peak_memory, ..doing }
     }

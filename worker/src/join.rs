@@ -200,7 +200,9 @@ fn system(what: &'static str) -> impl Fn(io::Error) -> JoinError {
 
 /// Starts the thread that fetches inputs ahead.
 fn start_preparing(shared: &Arc<Shared>, client: &Client, cache: &Arc<Cache>) -> Result<JoinHandle<()>, JoinError> {
-    let (shared, client, cache) = (shared.clone(), client.clone(), Arc::clone(cache));
+    let shared = shared.clone();
+    let client = client.clone();
+    let cache = Arc::clone(cache);
     let run = move || shared.preparation.run(&client, &cache);
     thread::Builder::new().name("prepare".to_owned()).spawn(run).map_err(system("the prefetch thread"))
 }

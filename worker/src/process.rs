@@ -13,8 +13,9 @@ pub fn tune_allocator() {
     ]);
 }
 
-/// Limits the arenas of a process that serves. Each thread of glibc gets an arena of its own, which keeps what a large
-/// answer needed once: 244 MB after a short form of `benches/many.rs`, 123 MB with two arenas. Call it before any thread starts.
+/// Limits the arenas of a process that serves; call it before any thread starts. With glibc each thread gets an arena of
+/// its own, which keeps the memory of its largest answer. After a short form of `benches/many.rs` the process had 244 MB,
+/// with two arenas 123 MB.
 pub fn tune_allocator_of_a_server() {
     #[cfg(all(target_os = "linux", target_env = "gnu"))]
     set_allocator(&[(libc::M_ARENA_MAX, 2)]);

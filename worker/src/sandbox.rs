@@ -1,9 +1,8 @@
 //! Landlock rules of `--sandbox`: the files that a worker's process may still access.
 //!
-//! The rules are a second wall behind [`DataAccess`](stages::external::DataAccess): they hold for every thread and every library of the
-//! process, whatever a pipeline names. The kernel applies them to the calling thread and to those that it starts, so they are
-//! set before any other thread exists. Landlock limits TCP by port alone; which hosts a worker reaches is for the unit file or
-//! the container to say.
+//! The rules are a second line of defence behind [`DataAccess`](stages::external::DataAccess). They apply to every thread and
+//! library of the process, for any pipeline. The kernel applies them to the calling thread and its children, so they are
+//! set before another thread exists. Landlock limits TCP by port only; the unit file or the container limits the hosts.
 
 use std::path::{Path, PathBuf};
 
@@ -56,7 +55,7 @@ pub(crate) enum SandboxError {
     /// A folder that the worker needs cannot be opened.
     #[error("--sandbox: cannot open `{path}`: {message}")]
     Path {
-        /// The folder.
+        /// The folder that cannot be opened.
         path: String,
         /// Its error.
         message: String,

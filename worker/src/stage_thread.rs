@@ -124,7 +124,8 @@ fn attempt(held: &Arc<ActiveAssignment>, bench: &Bench) {
 /// The span of an attempt, in the trace of its run.
 fn span(held: &ActiveAssignment) -> Span {
     let assignment = held.assignment();
-    let (stage, grant) = (&assignment.stage, &assignment.grant);
+    let stage = &assignment.stage;
+    let grant = &assignment.grant;
     let span = tracing::trace_span!(
         target: SPANS, "task", stride.run = %stage.run, stride.stage = %stage.name, stride.kind = stage.settings.kind(),
         stride.task = %grant.task, stride.attempt = grant.attempt.0, stride.worker = %grant.worker

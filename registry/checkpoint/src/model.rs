@@ -42,7 +42,7 @@ pub enum ModelError {
     Missing {
         /// The missing part.
         missing: Role,
-        /// Its parts.
+        /// Roles of the model's parts.
         have: Vec<String>,
     },
     /// The model has no part of a kind, or several.
@@ -52,13 +52,13 @@ pub enum ModelError {
         kind: ArtifactKind,
         /// True if there are several.
         several: bool,
-        /// Its parts.
+        /// Roles of the model's parts.
         have: Vec<String>,
     },
     /// A part was made for another part than the model's.
     #[error("the part `{role}` was trained with the `{needs}` {wanted}, but the model has {found}")]
     Unfit {
-        /// The part.
+        /// Role of the refused part.
         role: Role,
         /// Role of the part that it needs.
         needs: Role,
@@ -108,7 +108,9 @@ pub fn part_of_kind<E>(
     kind: ArtifactKind,
     mut read: impl FnMut(Digest) -> Result<Manifest, E>,
 ) -> Result<Result<(Role, Digest, Manifest), ModelError>, E> {
-    let (mut found, mut have, mut several) = (None, Vec::new(), false);
+    let mut found = None;
+    let mut have = Vec::new();
+    let mut several = false;
     for (role, digest) in &model.parts {
         let manifest = read(*digest)?;
         have.push(format!("`{role}` ({})", word(manifest.kind)));

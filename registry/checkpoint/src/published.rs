@@ -329,9 +329,11 @@ mod tests {
         let digests: BTreeMap<&str, Digest> =
             parts.iter().map(|(role, _)| (*role, Digest::of(role.as_bytes()))).collect();
         let meta = json!({"generator": generator, "format": "humanml3d", "parts": digests});
-        let (mut manifest, mut bytes) = (Manifest::new(ArtifactKind::Model, meta), BTreeMap::new());
+        let mut manifest = Manifest::new(ArtifactKind::Model, meta);
+        let mut bytes = BTreeMap::new();
         for (role, names) in parts {
-            let (name, own) = (format!("{role}/model.safetensors"), file(names));
+            let name = format!("{role}/model.safetensors");
+            let own = file(names);
             let entry = FileEntry { digest: Digest::of(&own), bytes: own.len() as u64 };
             manifest.files.insert(name.clone(), entry);
             bytes.insert(name, own);

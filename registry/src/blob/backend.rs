@@ -106,7 +106,7 @@ pub trait Backend: Send + Sync + fmt::Debug {
 
 /// A blob being written to a [`Backend`]. Dropping it deletes the bytes.
 pub trait Staged: Send + fmt::Debug {
-    /// Appends bytes.
+    /// Appends bytes to the unnamed blob.
     fn write(&mut self, bytes: &[u8]) -> Result<(), BlobError>;
     /// Gives the blob its name and returns when it is durable. Returns `false` and changes nothing if the name is
     /// taken. The name never shows part of a blob.

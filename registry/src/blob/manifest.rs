@@ -24,7 +24,7 @@ pub enum ManifestError {
     /// A newer build wrote the manifest.
     #[error("manifest {digest} has format {found}; this build reads {expected}; use a newer build", expected = Manifest::FORMAT)]
     Format {
-        /// The manifest.
+        /// Digest of the manifest.
         digest: Digest,
         /// Format number of the manifest.
         found: u32,
@@ -32,7 +32,7 @@ pub enum ManifestError {
     /// A file is missing or has another length.
     #[error("manifest {digest} lists `{file}` as blob {blob} of {expected} bytes, which is {found}")]
     Incomplete {
-        /// The manifest.
+        /// Digest of the manifest.
         digest: Digest,
         /// The file's name in the manifest.
         file: String,

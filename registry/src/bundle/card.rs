@@ -29,7 +29,8 @@ const FACTS: [&str; 12] = [
 
 /// Writes the card of a version; `parts` are the manifests of its parts.
 pub fn card(version: &Version, manifest: &Manifest, model: &Model, parts: &BTreeMap<Role, Manifest>) -> String {
-    let (name, number) = (&version.model, version.version);
+    let name = &version.model;
+    let number = version.version;
     let mut text = format!(
         "# {name}, version {number}\n\nA text-to-motion model: `{}`, which generates motions of {}.\n\n\
          | | |\n|---|---|\n| artifact | `{}` |\n| generator | `{}` |\n| data format | {} |\n",

@@ -308,7 +308,8 @@ fn manifest(name: &str, content: &[u8]) -> Result<Manifest> {
     let manifest: Manifest = serde_json::from_slice(content)
         .map_err(|e| refuse(format!("this build cannot parse it as a manifest: {e}")))?;
     if manifest.format != Manifest::FORMAT {
-        let (found, known) = (manifest.format, Manifest::FORMAT);
+        let found = manifest.format;
+        let known = Manifest::FORMAT;
         return Err(refuse(format!("it has format {found}, and this build reads {known}; use a newer build")));
     }
     // A part's manifest is named by the digest of its canonical bytes, so other bytes are refused.

@@ -17,7 +17,7 @@ const BLOCK: u64 = 512;
 /// Reason why a bundle cannot be written.
 #[derive(Debug, thiserror::Error)]
 pub enum WriteError {
-    /// Writing failed.
+    /// The output cannot be written.
     #[error(transparent)]
     Io(#[from] io::Error),
     /// The content is invalid.

@@ -225,16 +225,16 @@ pub enum Order {
     Rollback(RollbackOrder),
     /// Deletes a task's checkpoints that the policy does not keep.
     PruneCheckpoints {
-        /// The task.
+        /// Task of the checkpoints.
         task: TaskId,
-        /// The policy.
+        /// Number and rank of the checkpoints to keep.
         keep: Keep,
         /// The stage's value is stored.
         at_end: bool,
     },
     /// Keeps an artifact even if no row names it.
     Pin {
-        /// The artifact.
+        /// Manifest of the artifact.
         digest: Digest,
         /// Reason of the pin; `None` removes the pin.
         reason: Option<String>,

@@ -111,7 +111,7 @@ pub struct EndedRow {
     pub archive: String,
 }
 
-/// The value of a stage.
+/// A stored result: what a run has computed under a stage's key.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct StageResultRow {
     /// The stage's key.

@@ -255,13 +255,15 @@ pub fn evaluations(title: &str, all: impl IntoIterator<Item = (String, BTreeMap<
 /// Compares two versions metric by metric, in the papers' order; other metrics come last.
 pub fn compare(left: &Version, right: &Version) -> Comparison {
     let name = |version: &Version| format!("{}:{}", version.model, version.version);
-    let (a, b) = (measures(&left.metrics), measures(&right.metrics));
+    let a = measures(&left.metrics);
+    let b = measures(&right.metrics);
     let base = |key: &str| key.rsplit('.').next().unwrap_or(key).to_owned();
     let place = |key: &str| COLUMNS.iter().position(|c| c.key == base(key)).unwrap_or(COLUMNS.len());
     let mut keys: Vec<&String> = a.keys().chain(b.keys().filter(|key| !a.contains_key(*key))).collect();
     keys.sort_by_key(|key| (place(key), (*key).clone()));
     let metrics = keys.into_iter().map(|key| {
-        let (left, right) = (a.get(key).copied(), b.get(key).copied());
+        let left = a.get(key).copied();
+        let right = b.get(key).copied();
         let both = left.zip(right).map(|(left, right)| difference(left, right, better(&base(key))));
         Difference { metric: key.clone(), left, right, difference: both.map(|b| b.0), verdict: both.map(|b| b.1) }
     });

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 /// A value with its 95 % interval.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Measure {
-    /// The mean.
+    /// Mean over the repeats.
     pub value: f64,
     /// Half the width of the interval, if repeats were measured.
     pub half: Option<f64>,

@@ -86,7 +86,8 @@ impl FromStr for Gate {
             .filter_map(|op| text.find(op.0).map(|at| (at, *op)))
             .min_by_key(|(at, (sign, _))| (*at, std::cmp::Reverse(sign.len())))
             .ok_or_else(|| bad("it has none of `<=`, `<`, `>=`, `>`".into()))?;
-        let (metric, right) = (text[..at].trim(), text[at + sign.len()..].trim());
+        let metric = text[..at].trim();
+        let right = text[at + sign.len()..].trim();
         if metric.is_empty() || !metric.bytes().all(|b| b.is_ascii_alphanumeric() || b"._-/@".contains(&b)) {
             return Err(bad(format!("`{metric}` is not the name of a metric")));
         }

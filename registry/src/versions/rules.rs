@@ -112,7 +112,7 @@ pub(crate) fn compare(
     }
 }
 
-/// Parses gates.
+/// Parses gates; an invalid one is a conflict.
 pub(crate) fn gates(texts: &[String]) -> Result<Vec<Gate>, WriteError> {
     let gate = |text: &String| text.parse().map_err(|e: ParseGateError| WriteError::Conflict(e.to_string()));
     texts.iter().map(gate).collect()

@@ -106,10 +106,11 @@ fn check_run(state: &State, run: &Run, broken: &mut Vec<String>) {
     }
 }
 
-/// Checks C14.
+/// C14: indexes agree with the tasks, workers and runs that they index.
 fn check_index(state: &State) -> Vec<String> {
     let mut broken = Vec::new();
-    let (mut places, mut holds) = (BTreeMap::new(), BTreeMap::new());
+    let mut places = BTreeMap::new();
+    let mut holds = BTreeMap::new();
     for (key, execution) in &state.executions {
         if execution.users.is_empty() && !execution.is_busy() {
             broken.push(format!("C15: execution {key} is unused and idle, and still in memory"));
@@ -266,7 +267,7 @@ pub fn check_change(before: &State, after: &State) -> Vec<String> {
     broken
 }
 
-/// Checks C17.
+/// C17: a gang keeps a polling member that holds its state.
 fn check_state_is_kept(before: &State, after: &State, task: &Task, now: &Task, broken: &mut Vec<String>) {
     let Lease::Held { holders, drain_by: None, .. } = &task.lease else { return };
     let reporter = now.reported.as_ref().filter(|_| now.reported != task.reported).map(|report| &report.grant.worker);

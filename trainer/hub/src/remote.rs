@@ -214,7 +214,9 @@ impl Remote<'_> {
             fixed: sha256.is_some(),
             pause: PAUSE,
         };
-        let (mut announced, repository, said) = (false, self.name, &mut *self.said);
+        let mut announced = false;
+        let repository = self.name;
+        let said = &mut *self.said;
         let mut arrived = |arrived: Arrived| {
             if let Some(bytes) = arrived.of.filter(|bytes| !announced && *bytes >= TOLD_BYTES) {
                 said(&format!("fetching {name} of {repository} ({} MB)", bytes >> 20));

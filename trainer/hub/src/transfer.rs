@@ -81,7 +81,9 @@ pub(crate) fn transfer(
     part: &Path,
     arrived: &mut dyn FnMut(Arrived),
 ) -> Result<(), Interrupted> {
-    let (mut most, mut failed, mut pause) = (0, 0, wanted.pause);
+    let mut most = 0;
+    let mut failed = 0;
+    let mut pause = wanted.pause;
     loop {
         let Err(Failed { why, after }) = attempt(client, wanted, part, arrived) else { return Ok(()) };
         let bytes = length(part);
@@ -203,7 +205,8 @@ fn append(
         return Err(Interrupted::TooLarge.into());
     }
     let mut file = opened(part, start, strong_tag(response.headers())).map_err(io(part))?;
-    let (mut bytes, mut piece) = (start, vec![0; 256 << 10]);
+    let mut bytes = start;
+    let mut piece = vec![0; 256 << 10];
     arrived(Arrived { bytes, of });
     loop {
         let count = match response.read(&mut piece) {

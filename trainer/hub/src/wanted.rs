@@ -127,7 +127,9 @@ fn weights(repository: &mut dyn Repository, folder: &str) -> Result<(), Failure>
         weight_map: BTreeMap<String, String>,
     }
     let at = |name: &str| below(folder, name);
-    let (whole, index, pickle) = (at("model.safetensors"), at("model.safetensors.index.json"), at("pytorch_model.bin"));
+    let whole = at("model.safetensors");
+    let index = at("model.safetensors.index.json");
+    let pickle = at("pytorch_model.bin");
     if repository.names().contains(&whole) {
         return repository.get(&whole).map(drop);
     }

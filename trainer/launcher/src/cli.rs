@@ -126,7 +126,7 @@ pub enum ArgumentError {
 }
 
 impl KindArgs {
-    /// The server that is asked for demand.
+    /// The server that reports the demand for workers.
     ///
     /// # Errors
     /// None is named, or it cannot be used.
@@ -153,7 +153,8 @@ impl KindArgs {
     }
 
     fn engine(&self, engine: Engine, worker: WorkerCommand) -> Result<Box<dyn Launcher>, ArgumentError> {
-        let (prefix, options) = (self.plan().prefix, self.options.clone());
+        let prefix = self.plan().prefix;
+        let options = self.options.clone();
         Ok(match engine {
             Engine::Slurm => Box::new(Slurm { worker, options, limit: LIMIT }),
             Engine::Kubernetes => Box::new(Kubernetes::new(worker, prefix, options, LIMIT)),
@@ -170,7 +171,8 @@ impl JobsArgs {
     /// # Errors
     /// The engine's options are wrong.
     pub fn engine(&self) -> Result<Box<dyn Launcher>, ArgumentError> {
-        let (program, url) = (String::new(), String::new());
+        let program = String::new();
+        let url = String::new();
         let worker =
             WorkerCommand { program, url, backend: self.kind.backend, labels: self.kind.labels(), more: Vec::new() };
         self.kind.engine(self.engine, worker)

@@ -59,7 +59,7 @@ pub struct Observation<'a> {
     pub jobs: &'a [Job],
 }
 
-/// A change that the engine is asked for.
+/// A change requested from the engine.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Action {
     /// Submit a job for a new worker.

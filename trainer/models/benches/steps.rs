@@ -166,7 +166,7 @@ fn least(times: Vec<Duration>) -> f64 {
     times.into_iter().min().unwrap_or_default().as_secs_f64()
 }
 
-/// What to run, from the command line.
+/// The benchmarks named on the command line.
 struct Plan {
     count: usize,
     words: Vec<String>,

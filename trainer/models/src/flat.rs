@@ -110,7 +110,7 @@ pub fn replace<M: Module, E>(module: M, mut fill: impl FnMut(&mut [f32]) -> Resu
     })
 }
 
-/// Replaces the module's parameters, each by as many values as `next` is asked for.
+/// Replaces the module's parameters by values of `next`, which gets the number of values of each.
 fn renew<M: Module, E>(module: M, next: impl FnMut(usize) -> Result<Vec<f32>, E>) -> Result<M, E> {
     struct Renew<F, E> {
         next: F,

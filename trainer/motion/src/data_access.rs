@@ -32,7 +32,7 @@ pub enum AccessError {
     Outside {
         /// As the pipeline has it.
         path: String,
-        /// The roots.
+        /// Folders that may be read.
         roots: String,
     },
     /// The content is not the expected one.
@@ -79,7 +79,7 @@ pub struct DataAccess {
     roots: Option<Vec<Arc<Root>>>,
     /// Compares content with its expected digest.
     verifies: bool,
-    /// For messages.
+    /// Name of the machine in messages.
     machine: String,
     hashes: Hashes,
 }
@@ -179,7 +179,8 @@ impl DataAccess {
         let Some(expected) = expected else { return Err(AccessError::Unresolved { path: folder.path }) };
         let before = self.fingerprint(&folder, &path, go_on)?;
         if before.digest != *expected {
-            let (machine, found) = (self.machine.clone(), before.digest);
+            let machine = self.machine.clone();
+            let found = before.digest;
             return Err(AccessError::Differs { path: folder.path, machine, found, expected: *expected });
         }
         Ok(Opened { folder, path, before: Some(before) })
@@ -286,7 +287,7 @@ mod tests {
         }
         let said = opened("root/set").tree().unwrap_err().to_string();
         assert!(said.contains("is outside the data root"), "{said}");
-        // What a reader of paths is given cannot be led elsewhere.
+        // An opened path stays on its file, even if a link takes the file's place.
         let held = opened("root/set/a").hold().unwrap();
         fs::remove_file(at("root/set/a")).unwrap();
         symlink(at("out/secret"), at("root/set/a")).unwrap();

@@ -1,7 +1,8 @@
 //! Opens files of folders with untrusted content.
 //!
-//! A [`DataPath`] is a path together with the permission to open it: anywhere ([`DataPath::local`], for a user's own commands), or beneath a
-//! [`Root`] alone (for a worker whose pipelines come from other users). Parsers of such files take one and open files through it.
+//! A [`DataPath`] is a path together with the permission to open it. A user's own commands may open any path
+//! ([`DataPath::local`]). A worker whose pipelines come from other users may open paths below a [`Root`] only. Parsers of
+//! such files take a `DataPath` and open files through it.
 //!
 //! A path there may be a named pipe, which would block forever, a device, a folder, or a far larger file than expected.
 //! So a file is checked before it is opened, opened without blocking, checked again, and read up to a limit.
@@ -42,7 +43,7 @@ impl DataPath {
         Self { path, shown, root: Some(root) }
     }
 
-    /// The path as it was named, for messages and endings. To open it is this type's job.
+    /// The path as it was named, for messages and file name extensions. Only this type opens it.
     pub fn shown(&self) -> &Path {
         &self.shown
     }
@@ -172,7 +173,7 @@ impl DataPath {
     /// True if there is an entry of that name, which may be a dangling link.
     pub fn has_entry(&self) -> bool {
         match &self.root {
-            // A link that leads out is there; opening it says so.
+            // A link that leads out of the root exists; opening it reports the error.
             Some(root) => !matches!(root.locate(&self.path), Err(e) if e.kind() == io::ErrorKind::NotFound),
             None => self.path.symlink_metadata().is_ok(),
         }
@@ -197,7 +198,7 @@ impl DataPath {
     /// cycles), are errors.
     ///
     /// # Errors
-    /// What stands in the way, with its path.
+    /// The first path that cannot be read, with the cause.
     pub fn tree(&self) -> io::Result<Vec<Self>> {
         let named =
             |path: &Self, error: io::Error| io::Error::new(error.kind(), format!("{}: {error}", path.display()));
@@ -275,7 +276,7 @@ impl Stamp {
         }
     }
 
-    /// The file's identity, whatever its content.
+    /// The file's identity: device and inode.
     pub(crate) fn file(&self) -> (u64, u64) {
         (self.device, self.inode)
     }

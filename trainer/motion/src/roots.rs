@@ -22,7 +22,7 @@ const TRIES: usize = 64;
 pub struct Root {
     /// As it was given, absolute.
     path: PathBuf,
-    /// Without links.
+    /// The path with all links resolved.
     canonical: PathBuf,
     folder: OwnedFd,
 }

@@ -45,7 +45,7 @@ const FOLDER: &str = "FOLDER";
 /// The viewer of motions as a module that exports `mount`, for pages of other crates.
 pub const VIEWER: &str = include_str!("../static/viewer.js");
 
-/// Its style.
+/// The style sheet of the viewer.
 pub const VIEWER_STYLE: &str = include_str!("../static/viewer.css");
 
 /// The addresses at which the page itself is shown: each is a view. The page itself parses the part after the last slash.
@@ -181,7 +181,7 @@ pub fn folder() -> &'static str {
     &PAGE.folder
 }
 
-/// A file of this build by its folder and its path.
+/// Returns the embedded file of this build at `folder/name`.
 #[must_use]
 pub fn find(folder: &str, name: &str) -> Option<&'static File> {
     PAGE.files.iter().find(|file| folder == PAGE.folder && file.name == name)

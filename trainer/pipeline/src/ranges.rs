@@ -28,7 +28,7 @@ static PLACEMENT: LazyLock<Value> = LazyLock::new(|| Placement::json_schema(&mut
 pub(crate) enum Range {
     /// Whole numbers, both ends included.
     Whole(u64, u64),
-    /// Real numbers.
+    /// Real numbers between two bounds.
     Real(Bound<f64>, Bound<f64>),
 }
 

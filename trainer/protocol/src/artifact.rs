@@ -207,7 +207,7 @@ impl Manifest {
     }
 }
 
-/// Adds the digests that stand in `meta` to `found`.
+/// Adds all digests in `meta` to `found`.
 pub fn mentioned(meta: &serde_json::Value, found: &mut Vec<Digest>) {
     use serde_json::Value;
 

@@ -1,10 +1,10 @@
 //! Untrusted texts for a terminal.
 //!
-//! A caption, a path or a stage's message may hold escape sequences, which a terminal obeys: they clear what stands there, change its title, or
-//! answer as if the user had typed. What is printed goes through [`printable`], at the place where it is printed.
+//! A caption, a path or a stage's message may contain escape sequences. A terminal obeys them: they clear its text,
+//! change its title, or answer as if the user had typed. Every print of such text calls [`printable`].
 //!
-//! Errors quote files through [`excerpt`] and [`json_mistake`] alone. They show nothing of a file unless the process asked for it with
-//! [`show_excerpts`]: a worker reads files that those who see its messages may not read.
+//! Errors quote files only through [`excerpt`] and [`json_mistake`]. These show nothing of a file before the process
+//! calls [`show_excerpts`], because a worker reads files that the readers of its messages may not read.
 
 use std::borrow::Cow;
 use std::fmt::Write as _;
@@ -44,12 +44,12 @@ pub fn show_excerpts() {
     SHOWS_EXCERPTS.store(true, Ordering::Relaxed);
 }
 
-/// The beginning of a text out of a file, for an error; `...` unless this process shows excerpts.
+/// Returns the beginning of a file's text for an error message, or `...` if this process may not quote files.
 pub fn excerpt(text: &str) -> String {
     if SHOWS_EXCERPTS.load(Ordering::Relaxed) { beginning(text) } else { HIDDEN.to_owned() }
 }
 
-/// Names out of a file, for an error, at most `most` of them; `...` unless this process shows excerpts.
+/// Returns at most `most` names from a file for an error message, or `...` if this process may not quote files.
 pub fn excerpts<'a>(names: impl IntoIterator<Item = &'a str>, most: usize) -> String {
     if !SHOWS_EXCERPTS.load(Ordering::Relaxed) {
         return HIDDEN.to_owned();

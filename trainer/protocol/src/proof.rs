@@ -1,4 +1,4 @@
-//! How a worker's call proves whose it is, and a manifest that its blobs are its maker's own.
+//! Proof of the owner of a worker's call, and of the uploader of a manifest's blobs.
 //!
 //! Names and grants can be guessed. So a call shows a secret in the header [`SECRET_HEADER`]:
 //!

@@ -52,7 +52,7 @@ fn check_revision(stage: &str, settings: &TextEmbed) -> Result<()> {
         .hint("remove `revision`, or set `path` to a name on huggingface.co, such as `openai/clip-vit-base-patch32`"))
 }
 
-/// Replaces names by folders, and fetches those that are not in the cache.
+/// Replaces names on the hub by folders of the cache, and downloads missing ones.
 pub(crate) fn resolve(pipeline: &mut Pipeline) -> Result<()> {
     for (stage, settings) in encoders(pipeline) {
         let Some((name, encoder)) = named(settings) else {

@@ -214,13 +214,13 @@ pub fn expect(what: &str, manifest: &Manifest, kind: ArtifactKind) -> Result<(),
     if manifest.kind == kind {
         return Ok(());
     }
-    Err(StageError::Input(format!("{what} is an artifact of kind {:?}; expected {kind:?}", manifest.kind)))
+    Err(StageError::Input(format!("{what} is {}; expected {}", manifest.kind.noun(), kind.noun())))
 }
 
 fn entry<'a>(manifest: &'a Manifest, name: &str) -> Result<&'a FileEntry, StageError> {
     manifest.files.get(name).ok_or_else(|| {
-        let have: Vec<_> = manifest.files.keys().map(String::as_str).collect();
-        StageError::Input(format!("the artifact of kind {:?} has no file `{name}`; it has {have:?}", manifest.kind))
+        let have: Vec<_> = manifest.files.keys().map(|file| format!("`{file}`")).collect();
+        StageError::Input(format!("no file `{name}` in {}; it has {}", manifest.kind.noun(), have.join(", ")))
     })
 }
 

@@ -36,7 +36,7 @@ pub enum ContextError {
     /// A stored object is damaged or missing.
     #[error("{0}")]
     Damaged(String),
-    /// What was asked for makes no sense: a fault of ours.
+    /// The request contradicts the state of the stage: a fault of ours.
     #[error("{0}")]
     Fault(String),
 }
@@ -212,8 +212,8 @@ pub trait GangContext: AttemptContext {
         true
     }
 
-    /// Whether what is stored from here on is a checkpoint that may be made later: then an upload that cannot be taken now fails instead of
-    /// being waited for, and [`can_save`](Self::can_save) is `false` for a while.
+    /// Declares that the following uploads belong to a checkpoint that may be saved later. If the store is busy, such an
+    /// upload fails instead of waiting, and [`can_save`](Self::can_save) returns false for a while.
     fn may_postpone(&mut self, may: bool) {
         let _ = may;
     }

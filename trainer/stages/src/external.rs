@@ -1,7 +1,7 @@
 //! Files and folders outside the store, by the settings that name them.
 //!
-//! The one way for a stage to a path of its settings. What is given was digested and is what the stage's key says; it is looked at again once
-//! it was read. A stage makes no path of its own: `tests/layers.rs` holds this.
+//! The only way for a stage to open a path of its settings. The content has the digest in the stage's key, which is
+//! checked before and after reading. A stage builds no path itself (`tests/layers.rs` checks this).
 
 use std::collections::BTreeMap;
 
@@ -31,11 +31,11 @@ impl Given {
     }
 }
 
-/// Opens all that the settings of the task name, has it read, and refuses what changed meanwhile.
+/// Opens the files and folders that the task's settings name, calls `read`, and fails if one of them changed meanwhile.
 ///
 /// # Errors
-/// If something may not be read, is not what the stage expects, or `read` fails; [`StageError::Interrupted`] if the grant
-/// ends or a stop is requested before all was digested.
+/// If a path may not be read, its content is not the expected one, or `read` fails. [`StageError::Interrupted`] if the
+/// grant ends or a stop is requested during digesting.
 pub fn read<C: AttemptContext + ?Sized, T>(
     cx: &mut C,
     read: impl FnOnce(&mut C, &Given) -> Result<T, StageError>,

@@ -151,7 +151,10 @@ impl Tokenizer {
             )));
         }
         if let Some(id) = [rules.end, rules.pad].into_iter().chain(rules.first).find(|id| *id as usize >= rows) {
-            return Err(refuse(format!("the token id {id} is needed, but the embedding table has {rows} rows")));
+            return Err(refuse(format!(
+                "the tokenizer uses the token id {id}, but the embedding table has {rows} rows; use the tokenizer and the \
+                 weights of the same model"
+            )));
         }
         if rules.most <= rules.added() {
             return Err(refuse(format!(

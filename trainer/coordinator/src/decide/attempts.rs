@@ -53,7 +53,8 @@ impl Deciding<'_> {
 
     /// Ends an attempt. The next one starts after a back-off. If the budget is spent, the execution fails instead.
     pub(crate) fn try_again(&mut self, key: Digest, i: usize, why: &str, fault: bool) {
-        let (now, policy) = (self.now(), self.state.policy.clone());
+        let now = self.now();
+        let policy = self.state.policy.clone();
         self.why = Some(why.to_owned());
         let tried = self.change(key, i, |task| {
             let drain_by = matches!(task.lease, Lease::Held { drain_by: Some(_), .. });
@@ -95,7 +96,8 @@ impl Deciding<'_> {
 
     /// Derives the secret of a generation: unpredictable, and different for every fence.
     pub(crate) fn secret(&self, task: &Task) -> impl FnOnce(Fence) -> String + use<> {
-        let (entropy, id) = (self.moment.entropy, task.id.clone());
+        let entropy = self.moment.entropy;
+        let id = task.id.clone();
         move |fence| Digest::of(format!("{entropy} {id} {fence}").as_bytes()).hex()
     }
 

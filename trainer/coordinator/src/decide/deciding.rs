@@ -30,7 +30,7 @@ pub(crate) struct Deciding<'a> {
     pub(crate) why: Option<String>,
     /// Changed runs that are not reconciled yet.
     pub(crate) unreconciled: BTreeSet<u64>,
-    /// Changed runs.
+    /// Runs that this decision has changed.
     pub(crate) runs: BTreeSet<u64>,
     /// Changed executions, and executions with a changed user.
     pub(crate) touched: BTreeSet<Digest>,

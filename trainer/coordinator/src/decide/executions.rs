@@ -69,13 +69,15 @@ impl Deciding<'_> {
 
     /// Restores the tasks, budgets and working time of an earlier try.
     fn take_up(&mut self, archived: &StageExecution) {
-        let (key, fence) = (archived.key, self.state.fence);
+        let key = archived.key;
+        let fence = self.state.fence;
         let again = |task: &Task| {
             let mut task = Task { fence: task.fence.max(fence), ..task.clone() };
             task.reset_budgets();
             task
         };
-        let (run, stage) = (archived.run.clone(), archived.stage.clone());
+        let run = archived.run.clone();
+        let stage = archived.stage.clone();
         self.record(Fact::ExecutionSource { key, run: run.clone(), stage });
         self.record(Fact::Tasks { key, tasks: archived.tasks.iter().map(again).collect() });
         if let Some(instruction_set) = archived.instruction_set.clone() {

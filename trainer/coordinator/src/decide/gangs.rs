@@ -27,7 +27,8 @@ impl Deciding<'_> {
         let words = Arc::clone(&self.state.heard.words);
         let suspicions: Vec<u32> =
             members.iter().map(|member| self.state.workers.get(&member.worker).map_or(0, |w| w.suspicions)).collect();
-        let (now, hearing_ms) = (self.now(), self.state.policy.hearing_ms);
+        let now = self.now();
+        let hearing_ms = self.state.policy.hearing_ms;
         let verdict_of = |slow| Complaints::of(&words, task, slow).verdict(now, hearing_ms, &suspicions);
         let mut verdict = verdict_of(true);
         // A gang with a slow member is better than one with too few members.
@@ -55,7 +56,8 @@ impl Deciding<'_> {
 
     /// Removes a hung member that the rest of its gang waits for.
     pub(crate) fn gang_stalled(&mut self, task: &TaskId, fence: Fence) -> Result<bool, Rejected> {
-        let (now, stall_ms) = (self.now(), self.state.policy.stall_ms);
+        let now = self.now();
+        let stall_ms = self.state.policy.stall_ms;
         let (key, i) = self.place(task)?;
         let task = &self.state.executions[&key].tasks[i];
         let Some(rank) = evidence::hung(&self.state.heard.words, task, now, stall_ms).filter(|_| task.fence == fence)

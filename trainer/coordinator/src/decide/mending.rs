@@ -31,7 +31,8 @@ impl Deciding<'_> {
             self.fences.push(fence);
         }
         for (giver, (number, stage)) in &givers {
-            let (execution, run) = (Arc::clone(&self.state.executions[giver]), Arc::clone(&self.state.runs[number]));
+            let execution = Arc::clone(&self.state.executions[giver]);
+            let run = Arc::clone(&self.state.runs[number]);
             // Another reader may have found the damage before.
             if execution.is_over() {
                 self.want_again(&execution, &run, stage, true);

@@ -207,11 +207,13 @@ fn left_state(settings: &StageSettings, task: &Task) -> Result<Option<Digest>, R
     let end = training.end().0;
     match task.newest() {
         Some(saved) if saved.step == end => Ok(Some(saved.manifest)),
-        other => Err(Rejected::Conflict(format!(
-            "task `{}` stops at step {end} for another stage to continue, but its newest checkpoint is of step {:?}",
-            task.id,
-            other.map(|saved| saved.step)
-        ))),
+        other => {
+            let newest = other.map_or("none".to_owned(), |saved| format!("of step {}", saved.step));
+            Err(Rejected::Conflict(format!(
+                "task `{}` finished without its checkpoint of step {end}, where another stage continues; its newest one is {newest}",
+                task.id
+            )))
+        }
     }
 }
 

@@ -30,7 +30,8 @@ impl Deciding<'_> {
             self.take_over_results(number);
             self.sweep(number);
             let run = &self.state.runs[&number];
-            let (state, parked) = (run.state_by_stages(), run.parked);
+            let state = run.state_by_stages();
+            let parked = run.parked;
             if state != run.state {
                 if state == RunState::Failed {
                     let name = run.failed().map(|j| run.pipeline.stages[j].name.to_string()).unwrap_or_default();
@@ -65,7 +66,8 @@ impl Deciding<'_> {
                     };
                     let wall_s = if *cached { 0.0 } else { execution.wall_s(now) };
                     let peak_memory = self.state.peak_memory(execution).filter(|_| !cached);
-                    let (known, attempt) = (Arc::clone(known), execution.attempt());
+                    let known = Arc::clone(known);
+                    let attempt = execution.attempt();
                     Status::Done { key, how, known, wall_s, attempt, peak_memory }
                 }
             };

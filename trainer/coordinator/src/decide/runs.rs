@@ -65,7 +65,8 @@ impl Deciding<'_> {
 
     /// Refuses another run if the limit is reached.
     fn check_room(&self) -> Result<(), Rejected> {
-        let (live, most) = (self.state.runs.size(), self.state.policy.live_runs);
+        let live = self.state.runs.size();
+        let most = self.state.policy.live_runs;
         if live < most {
             return Ok(());
         }

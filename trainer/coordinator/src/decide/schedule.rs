@@ -158,7 +158,8 @@ fn fit(state: &State, execution: &StageExecution, task: &Task) -> Vec<Member> {
 
 /// The idle worker for task `i`. A worker that is too slow for a task, or dies of it, would be the first one each time.
 fn next_worker(state: &State, execution: &StageExecution, i: usize) -> Option<Member> {
-    let (task, mut idle) = (&execution.tasks[i], idle(state, execution));
+    let task = &execution.tasks[i];
+    let mut idle = idle(state, execution);
     if task.failed_on.is_empty() { idle.next() } else { idle.min_by_key(|member| task.failures_on(&member.worker)) }
 }
 

@@ -14,7 +14,8 @@ use crate::state::worker::Sign;
 
 impl Deciding<'_> {
     pub(crate) fn started(&mut self, alone: bool, park: bool) {
-        let (now, before) = (self.now(), self.state.now);
+        let now = self.now();
+        let before = self.state.now;
         self.record(Fact::Draining { draining: false });
         let keys: Vec<Digest> = self.state.executions.keys().copied().collect();
         for key in keys {

@@ -126,7 +126,8 @@ fn unfold(run: &mut Run, k: usize) {
 
 /// The outcome of the ticket with stages at `place`; `None` while they are in progress.
 fn found(state: &State, run: &Run, sweep: &Sweeping, place: usize) -> Option<Found> {
-    let (train, eval) = (&run.stages[place], &run.stages[place + 1]);
+    let train = &run.stages[place];
+    let eval = &run.stages[place + 1];
     let stage = &run.pipeline.stages[sweep.stage];
     if let Some((key, message)) = [train, eval].into_iter().find_map(|status| match status {
         Status::Failed { key, message } => Some((*key, message.clone())),
@@ -183,7 +184,9 @@ fn concluded(run: &Run, sweep: &Sweeping) -> Status {
     metrics.insert("sweep.trial".into(), trial as f64);
     let numbers = sweep.search.trials()[trial].iter().filter_map(|(path, value)| Some((path, value.as_f64()?)));
     metrics.extend(numbers.map(|(path, value)| (format!("sweep.{path}"), value)));
-    let (mut how, mut seconds, mut peak_memory) = (StageState::Cached, 0.0, None);
+    let mut how = StageState::Cached;
+    let mut seconds = 0.0;
+    let mut peak_memory = None;
     for status in made() {
         if let Status::Done { how: this, wall_s, peak_memory: peak, .. } = status {
             seconds += wall_s;

@@ -2,8 +2,8 @@
 //!
 //! Work is issued as numbered tickets, each for one rung of one trial. Results arrive in any order but are folded in
 //! the order of tickets. Ticket `n` is a function of the results of tickets `0..=n - parallel` only. The decisions are
-//! therefore a function of the sweep and the seed: neither the number of workers nor their speed or restarts can change
-//! a trial, a rung or the best. The price is that a slow ticket delays the `parallel` tickets after it.
+//! therefore a function of the sweep and the seed. The number of workers, their speed and their restarts change no trial,
+//! no rung and no result. The cost: a slow ticket delays the `parallel` tickets after it.
 //!
 //! | question | answer |
 //! |---|---|
@@ -150,7 +150,9 @@ impl Search {
     }
 
     fn standing(&self) -> Standing<'_> {
-        let (mode, factor, rungs) = (self.mode, self.factor, self.rungs.len());
+        let mode = self.mode;
+        let factor = self.factor;
+        let rungs = self.rungs.len();
         Standing { mode, factor, rungs, known: &self.known, issued: &self.issued }
     }
 

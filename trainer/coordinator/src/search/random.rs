@@ -23,7 +23,8 @@ pub(super) fn points(sweep: &Sweep, settings: &StageSettings, name: &StageName, 
         points.truncate(count.min(all));
         return points;
     }
-    let (mut points, mut seen) = (Vec::new(), BTreeSet::new());
+    let mut points = Vec::new();
+    let mut seen = BTreeSet::new();
     for trial in 0..count as u64 {
         let point = (0..AGAIN).find_map(|again| {
             let draw = |(path, domain): (&String, &Domain)| {

@@ -60,7 +60,7 @@ const UNSENT: usize = 256 << 10;
 /// Limits of connections.
 #[derive(Debug, Clone)]
 pub struct Connections {
-    /// All connections.
+    /// Largest number of connections.
     pub most: usize,
     /// Connections without a valid token so far.
     pub anonymous: usize,
@@ -143,7 +143,8 @@ impl OpenConnections {
             }
         }
         self.open.fetch_add(1, Ordering::Relaxed);
-        let (id, leave) = (self.next.fetch_add(1, Ordering::Relaxed), Arc::new(Notify::new()));
+        let id = self.next.fetch_add(1, Ordering::Relaxed);
+        let leave = Arc::new(Notify::new());
         anonymous.insert(id, Anonymous { since: Instant::now(), leave: Arc::clone(&leave) });
         let open_connections = Arc::clone(self);
         let client = OnceLock::new();
@@ -179,7 +180,8 @@ impl Peer {
 
     /// A call of this connection.
     fn call(self: &Arc<Self>) -> Arc<Self> {
-        let (open_connections, leave) = (Arc::clone(&self.open_connections), Arc::clone(&self.leave));
+        let open_connections = Arc::clone(&self.open_connections);
+        let leave = Arc::clone(&self.leave);
         let connection = Some(Arc::clone(self));
         let Self { id, from, encrypted, .. } = **self;
         Arc::new(Self { id, from, encrypted, open_connections, leave, client: OnceLock::new(), connection })
@@ -300,7 +302,9 @@ async fn accept(listener: Listener, router: axum::Router, open_connections: Arc<
             });
             continue;
         };
-        let (router, tls, idle) = (router.clone(), listener.tls.clone(), open_connections.limits.idle);
+        let router = router.clone();
+        let tls = listener.tls.clone();
+        let idle = open_connections.limits.idle;
         connections.spawn(async move {
             let leave = Arc::clone(&peer.leave);
             tokio::select! {
@@ -362,7 +366,8 @@ async fn serve_streams<S>(stream: S, router: axum::Router, peer: Arc<Peer>, idle
 where
     S: AsyncRead + AsyncWrite + Unpin + Send + 'static,
 {
-    let (calls, connection) = (Arc::new(AtomicU64::new(0)), Arc::clone(&peer));
+    let calls = Arc::new(AtomicU64::new(0));
+    let connection = Arc::clone(&peer);
     let begun = Arc::clone(&calls);
     let service = service_fn(move |mut request: Request<Incoming>| {
         begun.fetch_add(1, Ordering::Relaxed);
@@ -382,7 +387,8 @@ where
     let mut serving = pin!(http.serve_connection(TokioIo::new(stream), service));
     // This function and the service hold the connection when no call does.
     let at_rest = Arc::strong_count(&peer);
-    let (mut seen, mut leaving) = (0, false);
+    let mut seen = 0;
+    let mut leaving = false;
     loop {
         tokio::select! {
             ended = serving.as_mut() => {
@@ -396,7 +402,7 @@ where
                 let is_idle = begun == seen && Arc::strong_count(&peer) == at_rest;
                 seen = begun;
                 if is_idle && leaving {
-                    // The client was told, and keeps the connection open.
+                    // The client was asked to close the connection, and keeps it open.
                     return;
                 }
                 if is_idle {

@@ -4,7 +4,7 @@
 //! whose token is another at every start. The proof is made with the server's key, so that a session outlives a restart and nothing of it
 //! is stored. It ends at its time, with its token, or when it is signed out; what was signed out is forgotten at a restart.
 //!
-//! The user's own session can also be bought with a key that is good once, and stands in the fragment of a printed link.
+//! The user's own session can also be bought with a key that works once. It is the fragment of a printed link.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -210,7 +210,8 @@ mod tests {
     #[test]
     fn a_key_is_good_once() {
         let sessions = sessions(1);
-        let (one, other) = (sessions.key(), sessions.key());
+        let one = sessions.key();
+        let other = sessions.key();
         assert!(sessions.redeem(&one) && !sessions.redeem(&one));
         assert!(sessions.redeem(&other) && !sessions.redeem(""));
     }

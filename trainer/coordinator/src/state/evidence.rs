@@ -52,7 +52,8 @@ impl Word {
     /// generation are never withdrawn.
     pub fn after(known: Option<&Self>, doing: &Doing, at: Millis) -> Self {
         let same_process = |word: &&Self| {
-            let (old, new) = (&word.grant, &doing.grant);
+            let old = &word.grant;
+            let new = &doing.grant;
             (&old.task, old.attempt, old.incarnation) == (&new.task, new.attempt, new.incarnation)
         };
         let known = known.filter(same_process);

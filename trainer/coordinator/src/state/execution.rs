@@ -90,9 +90,9 @@ pub struct StageExecution {
     pub tasks: Tasks,
     /// Milliseconds of work before `busy_since`.
     pub wall_ms: u64,
-    /// The start of the current period in which a task is held.
+    /// Start of the current period in which workers hold a task; `None` while none does.
     pub busy_since: Option<Millis>,
-    /// The start of the current period in which no task is held.
+    /// Start of the current period in which no worker holds a task.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub idle_since: Option<Millis>,
     /// Set if it continued from data of an earlier try.

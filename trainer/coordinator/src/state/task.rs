@@ -296,7 +296,8 @@ impl Task {
         self.checkpoints.retain(|old| old.step < saved.step);
         self.checkpoints.push(saved);
         let stay = keep.kept(&self.checkpoints.iter().map(|saved| &saved.metrics).collect::<Vec<_>>());
-        let (mut kept, mut dropped) = (Vec::new(), Vec::new());
+        let mut kept = Vec::new();
+        let mut dropped = Vec::new();
         for (saved, stays) in std::mem::take(&mut self.checkpoints).into_iter().zip(stay) {
             if stays { kept.push(saved) } else { dropped.push(saved) }
         }

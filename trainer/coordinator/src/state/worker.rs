@@ -88,7 +88,7 @@ pub struct Identity {
     pub secret: Digest,
 }
 
-/// A worker's newest process.
+/// A worker, as its newest process described it.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Worker {
     /// The number of this process.

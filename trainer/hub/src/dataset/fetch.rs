@@ -1,4 +1,4 @@
-//! The order of fetching a set: what is there, the archive, its files, the tables, the rename.
+//! Fetching of a set, in this order: existing files, the archive, its files, the tables, the rename.
 
 use std::collections::BTreeMap;
 use std::fs::{self, File};
@@ -79,7 +79,7 @@ pub struct Fetched {
 }
 
 impl Fetch<'_> {
-    /// Returns true if the licence was accepted before: the set is there, or an earlier attempt began it.
+    /// Returns true if the licence was accepted before: the set exists, or an earlier attempt has started to fetch it.
     pub fn is_accepted(&self) -> bool {
         is_taken(self.folder) || Staging::is_accepted(self.folder)
     }
@@ -128,7 +128,8 @@ impl Fetch<'_> {
 
     /// Checks an existing folder.
     fn compare(&self) -> Result<Fetched, FetchError> {
-        let (mut differ, mut missing) = (Vec::new(), 0);
+        let mut differ = Vec::new();
+        let mut missing = 0;
         for (name, listed) in &self.set.files {
             let path = self.folder.join(name);
             match is_listed(&path, listed) {
@@ -169,7 +170,7 @@ impl Fetch<'_> {
         }
     }
 
-    /// Transfers the archive unless it is there, and takes the files out of it.
+    /// Downloads the archive unless it exists, and extracts the files.
     fn take_from_address(
         &self,
         address: &str,
@@ -177,7 +178,8 @@ impl Fetch<'_> {
         missing: &mut BTreeMap<&str, &Listed>,
         progress: &mut dyn FnMut(Progress),
     ) -> Result<(), FetchError> {
-        let (archive, part) = (staging.archive(), staging.archive_part());
+        let archive = staging.archive();
+        let part = staging.archive_part();
         if !archive.is_file() {
             let refused = |why: String| FetchError::Refused { address: address.into(), why };
             let away = |why: String| FetchError::Away { address: address.into(), why };
@@ -256,7 +258,8 @@ fn from_folder(
         let path: PathBuf = path.shown().to_owned();
         let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
         let Some((name, listed)) = missing.get_key_value(name.as_str()) else { continue };
-        let (name, listed) = (*name, *listed);
+        let name = *name;
+        let listed = *listed;
         let file = File::open(&path).map_err(io_error(&path, 0))?;
         staging.keep(name, listed, file).map_err(|wrong| match wrong {
             Wrong::Content(what) => FetchError::Content { from: from(), what },

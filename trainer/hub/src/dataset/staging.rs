@@ -107,7 +107,9 @@ impl Staging {
     pub(crate) fn keep(&self, name: &str, listed: &Listed, mut bytes: impl Read) -> Result<(), Wrong> {
         let folder = self.files();
         let mut file = tempfile::NamedTempFile::new_in(&folder).map_err(Wrong::Io)?;
-        let (mut hasher, mut piece, mut written) = (Sha256::new(), vec![0; 256 << 10], 0_u64);
+        let mut hasher = Sha256::new();
+        let mut piece = vec![0; 256 << 10];
+        let mut written = 0_u64;
         loop {
             let count = match bytes.read(&mut piece) {
                 Ok(0) => break,

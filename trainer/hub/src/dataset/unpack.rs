@@ -43,7 +43,8 @@ pub(crate) fn unpack(
         }
         let name = long_name.take().unwrap_or_else(|| last_name(&entry.path_bytes()));
         let Some((name, listed)) = missing.get_key_value(name.as_str()) else { continue };
-        let (name, listed) = (*name, *listed);
+        let name = *name;
+        let listed = *listed;
         if !matches!(entry.header().entry_type(), EntryType::Regular | EntryType::Continuous) {
             return Err(Wrong::Content(format!("`{name}` is not a regular file of the archive")));
         }

@@ -53,9 +53,9 @@ pub struct ClipTextConfig {
 /// Tables of tokens and positions.
 #[derive(Module, Debug)]
 pub struct ClipEmbeddings {
-    /// Token -> H.
+    /// One vector of width H for each token.
     pub token_embedding: Embedding,
-    /// Position -> H.
+    /// One vector of width H for each position.
     pub position_embedding: Embedding,
 }
 

@@ -17,7 +17,7 @@ pub struct Layers {
 }
 
 impl Layers {
-    /// Creates blocks of `config`'s size, without memory.
+    /// Creates `config.layers` blocks with initial weights. They attend only to their own sequence.
     pub fn new(init: &mut Init<'_>, config: &StackConfig) -> Self {
         let StackConfig { width, feed_forward, layers, .. } = *config;
         let mut block = || {

@@ -79,7 +79,7 @@ pub struct PlainConv {
 pub struct ResidualConv {
     /// First convolution, scaled and shifted by the timestep.
     pub blocks_0: ScaledConv,
-    /// Second convolution.
+    /// Second convolution, without the timestep.
     pub blocks_1: PlainConv,
     /// Time -> scale and shift of the first convolution, initialised to zero.
     pub time_mlp_1: Linear,

@@ -9,7 +9,7 @@ use crate::units::counted;
 /// Number of timesteps of every published noise schedule.
 const TIMESTEPS: usize = 1000;
 
-/// Solver from noise to a motion by a model's predictions.
+/// The method that turns noise into a motion by a model's predictions.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub enum Solver {
     /// The solver of the model's paper: DDIM (MLD), ancestral sampling (MDM), the stochastic DPM-Solver++
@@ -372,7 +372,8 @@ mod tests {
 
     #[test]
     fn what_a_model_was_measured_with_is_one_sampler_or_a_question() {
-        let (one, four) = (sampler(1, &[]), sampler(4, &[]));
+        let one = sampler(1, &[]);
+        let four = sampler(4, &[]);
         assert_eq!(measured_with([]), Ok(None));
         assert_eq!(measured_with([("fid", &one), ("t2m", &one.clone())]), Ok(Some(&one)));
         let refused = measured_with([("fid", &one), ("t2m_1", &one), ("t2m_4", &four)]).unwrap_err();

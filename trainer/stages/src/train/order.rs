@@ -1,7 +1,7 @@
 //! The examples in a step's batch: a function of (seed, step), never of an iterator.
 //!
 //! Each epoch takes the examples in a keyed permutation. If they have lengths, a pool of several batches is sorted by
-//! length and cut again, so that a batch, and a slice of it, has little padding and even cost. The batches of a pool
+//! length and cut into batches again. So a batch and its slices have little padding and even cost. The batches of a pool
 //! are in a keyed order. Each place in the sequence of examples has a number that keys all other draws of the example.
 
 use std::collections::HashMap;

@@ -1,7 +1,7 @@
 //! Attention over up to [`MOST`] tokens, all heads of all sequences in one call.
 //!
-//! The weights of a head are kept transposed, [K, Q rounded up], so that lanes of a register hold neighbouring queries:
-//! the softmax over keys then needs no sum across lanes, and all products are those of [`tile`]. A head's operands stay
+//! The weights of a head are kept transposed, [K, Q rounded up], so that lanes of a register hold neighbouring queries.
+//! The softmax over keys then needs no sum across lanes, and all products are those of [`tile`]. A head's operands stay
 //! in the nearest cache. Weights of queries that are only rounding have no influence.
 
 use super::Sizes;

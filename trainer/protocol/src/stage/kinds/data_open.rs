@@ -12,7 +12,7 @@ use crate::stage::{DataFormat, Output, Problems, Ref, Shape, StageSpec};
 pub struct DataOpen {
     /// Format of the dataset: skeleton, rate and features.
     pub format: DataFormat,
-    /// Folder, relative to the working directory. Its content's digest is part of the key, not the path.
+    /// Folder, relative to the working directory. The stage's key has the digest of its content, not its path.
     pub path: String,
 }
 

@@ -62,7 +62,8 @@ impl StageSpec for DistillPcm {
         if let Some(grid) = self.distillation.grid()
             && self.phases > grid
         {
-            let (phases, skip) = (self.phases, self.distillation.skip);
+            let phases = self.phases;
+            let skip = self.distillation.skip;
             let message = format!("`phases` is {phases}, but the grid of `skip` {skip} has only {grid} points");
             p.add("phases", message, "use fewer phases or a smaller `skip`");
         }

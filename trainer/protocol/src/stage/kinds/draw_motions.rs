@@ -23,7 +23,7 @@ const POSITIONS: usize = 1_200;
 pub struct DrawMotions {
     /// Stage that gives the model.
     pub model: String,
-    /// Sentences to draw.
+    /// Descriptions of the motions to draw.
     pub sentences: Vec<String>,
     /// Motions of each sentence, with consecutive seeds. They have one length.
     #[schemars(range(min = 1, max = 64))]

@@ -119,7 +119,9 @@ impl StageSpec for EvaluateControl {
     }
 
     fn check_neighbours(&self, stages: &Neighbours<'_>, p: &mut Problems) {
-        let (model, dataset, evaluator) = (&self.model, &self.dataset, &self.evaluator);
+        let model = &self.model;
+        let dataset = &self.dataset;
+        let evaluator = &self.evaluator;
         if stages.stage(model).is_some_and(|stage| stage.get::<TrainControl>().is_none() && stage.family().is_some()) {
             let message = format!("`{model}` has no control part");
             p.add("model", message, "name a `train.control` stage");
@@ -129,7 +131,8 @@ impl StageSpec for EvaluateControl {
             if let (Some(ours), Some(theirs)) = (ours, stages.format(name))
                 && ours != theirs
             {
-                let (theirs, ours) = (theirs.skeleton(), ours.skeleton());
+                let theirs = theirs.skeleton();
+                let ours = ours.skeleton();
                 let message = format!("`{name}` has skeletons of {theirs}, but the clips of `{dataset}` have {ours}");
                 p.add(field, message, "use a dataset in the model's format");
             }

@@ -71,7 +71,8 @@ impl StageSpec for EvaluateSpectrum {
         if let (Some(ours), Some(theirs)) = (stages.format(&self.dataset), stages.format(model))
             && ours != theirs
         {
-            let (theirs, ours) = (theirs.skeleton(), ours.skeleton());
+            let theirs = theirs.skeleton();
+            let ours = ours.skeleton();
             let message =
                 format!("`{model}` generates motions of {theirs}, but the clips of `{}` have {ours}", self.dataset);
             p.add("model", message, "use a dataset in the model's format");

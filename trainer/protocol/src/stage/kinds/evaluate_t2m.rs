@@ -191,7 +191,8 @@ impl StageSpec for EvaluateT2m {
     }
 
     fn check_neighbours(&self, stages: &Neighbours<'_>, p: &mut Problems) {
-        let (evaluator, dataset) = (&self.evaluator, &self.dataset);
+        let evaluator = &self.evaluator;
+        let dataset = &self.dataset;
         if let (Some(ours), Some(theirs)) = (stages.format(dataset), stages.format(evaluator))
             && ours != theirs
         {

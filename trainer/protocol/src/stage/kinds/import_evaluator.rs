@@ -16,7 +16,7 @@ pub(super) const WORDS_ORIGIN: &str = "its word vectors (GloVe), linked in githu
 #[serde(default)]
 pub struct ImportEvaluator {
     /// Folder in the published layout: `text_mot_match/model/finest.tar` (or `finest.safetensors`) and `mean.npy` and
-    /// `std.npy` in `meta` or in the only folder `Comp_*/meta`. Its content's digest is part of the key, not the path.
+    /// `std.npy` in `meta` or in the only folder `Comp_*/meta`. The stage's key has the digest of its content, not its path.
     pub path: String,
     /// Format of its training data.
     pub format: DataFormat,

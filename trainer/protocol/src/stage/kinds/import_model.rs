@@ -66,7 +66,7 @@ pub enum TextActivation {
 #[serde(default)]
 pub struct ImportModel {
     /// File with the weights, of torch (`.ckpt`, `.tar`, `.pth`, `.pt`) or `.safetensors` under the same names. No code
-    /// in it is executed. Its content's digest is part of the key, not the path.
+    /// in it is executed. The stage's key has the digest of its content, not its path.
     pub path: String,
     /// Network to import from the file.
     pub part: ImportedPart,
@@ -96,7 +96,8 @@ pub struct ImportModel {
     /// For `lcm`: range of the guidance scales w in its training.
     #[schemars(extend("minimum" = 0.0, "maximum" = 1e3))]
     pub guidance: (f64, f64),
-    /// For `lcm`: the solver's step k in training, which samplers without `timesteps` follow: 100 (v2), 20 (v1).
+    /// For `lcm`: length of a solver step in training, the paper's k: 100 (v2), 20 (v1). Samplers without `timesteps`
+    /// use the same grid.
     #[schemars(range(min = 1, max = 1_000), extend("x-unit" = "timesteps"))]
     pub skip: usize,
     /// For `control`: targets in its training.

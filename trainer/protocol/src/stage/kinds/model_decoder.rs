@@ -36,7 +36,8 @@ impl StageSpec for ModelDecoder {
     }
 
     fn check_neighbours(&self, stages: &Neighbours<'_>, p: &mut Problems) {
-        let (model, decoder) = (&self.model, &self.decoder);
+        let model = &self.model;
+        let decoder = &self.decoder;
         if matches!(stages.family(model), Some(Family::Features { .. })) {
             let message = format!("`{model}` generates motion features, so `{decoder}` has nothing to decode");
             p.add("model", message, "use a model that generates tokens or latents");
@@ -44,7 +45,8 @@ impl StageSpec for ModelDecoder {
         if let (Some(ours), Some(theirs)) = (stages.format(model), stages.format(decoder))
             && ours != theirs
         {
-            let (ours, theirs) = (ours.skeleton(), theirs.skeleton());
+            let ours = ours.skeleton();
+            let theirs = theirs.skeleton();
             let message = format!("`{decoder}` decodes motions of {theirs}, but `{model}` generates motions of {ours}");
             p.add("decoder", message, "train the decoder on the model's dataset");
         } else if let Some(encoder) = stages.tokenizer_of_model(model).or_else(|| stages.vae_of_model(model)) {

@@ -29,7 +29,7 @@ pub struct TextEmbed {
     pub encoder: TextEncoder,
     /// Folder with the published encoder, in the layout of Hugging Face or of sentence-transformers. If there is no
     /// such folder, its name on huggingface.co, such as `sentence-transformers/sentence-t5-large`. `hashed` has none.
-    /// The content's digest is part of the key, not the path.
+    /// The stage's key has the digest of its content, not its path.
     pub path: String,
     /// Branch, tag or commit of a name on huggingface.co; empty is `main`. Not part of the key either.
     pub revision: String,

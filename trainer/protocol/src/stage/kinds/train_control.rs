@@ -59,7 +59,8 @@ pub struct ControlLoss {
 
 impl Default for ControlLoss {
     fn default() -> Self {
-        let (distance, mean) = (ControlDistance::default(), ControlMean::default());
+        let distance = ControlDistance::default();
+        let mean = ControlMean::default();
         Self { latent: 1.0, tokens: 0.0, control: 1.0, distance, mean, metres: false }
     }
 }

@@ -69,7 +69,7 @@ pub struct TrainEvaluator {
     /// Stage that gives the clips.
     pub dataset: String,
     /// Folder with the published word vectors (`our_vab_data.npy`, `our_vab_words.pkl`, `our_vab_idx.pkl`); empty uses
-    /// the built-in hashed ones. Its content's digest is part of the key, not the path.
+    /// the built-in hashed ones. The stage's key has the digest of its content, not its path.
     pub words: String,
     /// Size of the networks.
     pub network: EvaluatorNetwork,

@@ -168,7 +168,8 @@ impl StageSpec for TrainTokens {
         if let Some(other) = stages.read_by(&self.tokens, ArtifactKind::Tokenizer)
             && other != self.tokenizer
         {
-            let (tokens, ours) = (&self.tokens, &self.tokenizer);
+            let tokens = &self.tokens;
+            let ours = &self.tokenizer;
             let message = format!("`tokenizer` is `{ours}`, but `{tokens}` was encoded with `{other}`");
             p.add(
                 "tokenizer",

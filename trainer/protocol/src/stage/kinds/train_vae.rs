@@ -200,7 +200,8 @@ impl Windows {
                 p.add("windows.min", format!("`windows.min` is {}; expected at least 4 frames", self.min), "");
             }
             if self.min > self.max {
-                let (min, max) = (self.min, self.max);
+                let min = self.min;
+                let max = self.max;
                 p.add("windows.max", format!("`windows.max` is {max}, which is less than `windows.min` ({min})"), "");
             }
             if self.batch != 0 {

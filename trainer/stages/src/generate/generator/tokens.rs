@@ -155,7 +155,8 @@ pub(super) fn open(model: &Model, blobs: &dyn Blobs, device: &Device) -> Result<
     let theirs = (tokenizer.meta().codes, tokenizer.meta().quantizers);
     if ours != theirs {
         return Err(StageError::Input(format!(
-            "the generator has {} of {} codes, but the tokenizer has {} of {}",
+            "the generator was trained with {} of {} codes, but the tokenizer has {} of {} codes; use the tokenizer that it \
+             was trained with",
             counted(ours.1, "codebook"),
             ours.0,
             theirs.1,

@@ -55,9 +55,10 @@ fn import(settings: &ImportEvaluator, cx: &mut dyn AttemptContext, given: &Given
     let expected = skeleton.layout().contacts.start;
     if config.features != expected {
         return Err(refuse(format!(
-            "its movements have {} features, but the format {:?} has {expected}; set `format` to the format that it \
+            "its movements have {} features, but the format `{}` has {expected}; set `format` to the format that it \
              was trained on",
-            config.features, settings.format
+            config.features,
+            settings.format.name()
         )));
     }
     if (config.word, config.classes) != (WORD_WIDTH, CLASSES) {

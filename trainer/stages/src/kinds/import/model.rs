@@ -124,6 +124,18 @@ fn part(
     Ok(draft.into_manifest())
 }
 
+fn size_in_words(config: &MomaskConfig) -> String {
+    let MomaskConfig { codes, quantizers, network, text_dim } = config;
+    format!(
+        "{} of {codes} codes, {} of width {}, feed-forward width {}, token width {} and caption width {text_dim}",
+        counted(*quantizers, "codebook"),
+        counted(network.layers, "layer"),
+        network.width,
+        network.feed_forward,
+        network.embedding,
+    )
+}
+
 /// The setting's value if it departs from the rule, else `None`.
 fn departing(found: bool, rule: bool) -> Option<bool> {
     (found != rule).then_some(found)
@@ -512,8 +524,10 @@ impl Import<'_> {
         let config = sizes::of_residual(&found, self.heads)?;
         if config != *first {
             return Err(found.refuse(format!(
-                "it has {config:?}, but the masked transformer has {first:?}; use two networks of the same size, \
-                 trained with the same tokenizer"
+                "it has {}, but the masked transformer has {}; use two networks of the same size, trained with the same \
+                 tokenizer",
+                size_in_words(&config),
+                size_in_words(first)
             )));
         }
         let entries = layout(&ResidualTransformer::new(&config, true, &mut Init::shapes(&self.device)));

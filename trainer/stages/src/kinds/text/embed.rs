@@ -30,8 +30,8 @@ struct ShardMeta {
     first: usize,
 }
 
-/// Digest of an encoder's digest. A shard does not upload the encoder, so its manifest must not name the encoder's artifact, which another
-/// run may have stored: a manifest names only blobs that its worker has uploaded or reads.
+/// Digest of an encoder's digest. A manifest names only blobs that its worker has uploaded or reads. A shard does neither
+/// with the encoder, which another run may have stored, so its manifest must not contain the encoder's digest.
 fn fingerprint(encoder: Digest) -> Digest {
     Digest::of(encoder.to_string().as_bytes())
 }
