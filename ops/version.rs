@@ -29,7 +29,8 @@ pub(crate) fn print_version() {
         .collect();
     features.sort();
     let features = if features.is_empty() { "none".to_owned() } else { features.join(", ") };
-    let (version, licence) = (variable("CARGO_PKG_VERSION"), variable("CARGO_PKG_LICENSE"));
+    let version = variable("CARGO_PKG_VERSION");
+    let licence = variable("CARGO_PKG_LICENSE");
     println!("cargo::rustc-env=STRIDE_VERSION={version} ({commit}; features: {features}; licence: {licence})");
 }
 

@@ -27,7 +27,8 @@ pub async fn to_postgres(dir: &Path, to: &PostgresAddress, holder: Holder) -> Re
     pool.close().await;
     let rows = copied?;
     close(held).await;
-    let (from, moved) = (folder::database(dir), dir.join(format!("{}.moved", folder::DATABASE)));
+    let from = folder::database(dir);
+    let moved = dir.join(format!("{}.moved", folder::DATABASE));
     fs::rename(&from, &moved).map_err(|e| OpenError::io(&moved, &e))?;
     store::remember_catalog(dir, to)?;
     // Raises the epoch, also beside the blobs.

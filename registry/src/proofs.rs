@@ -248,7 +248,8 @@ mod tests {
     #[test]
     fn a_name_keeps_a_blob_and_a_condemned_blob_takes_the_proof() {
         let proofs = Arc::new(Proofs::default());
-        let (digest, file) = (Digest::of(b"manifest"), Digest::of(b"file"));
+        let digest = Digest::of(b"manifest");
+        let file = Digest::of(b"file");
         assert!(is_unproven(&proofs, digest));
         let proof = proofs.begin().found(digest, artifact(digest, file));
         proofs.begin_collection();

@@ -188,7 +188,9 @@ impl From<Needs> for Rows {
         let forgotten: BTreeSet<&TaskId> = needs.done_shards.iter().collect();
         let stays = |root: &&Root| root.shard.as_ref().is_none_or(|task| !forgotten.contains(task));
         let roots = needs.roots.iter().filter(stays).map(|root| (root.digest, root.what.clone())).collect();
-        let (parents, forget_shards, live) = (needs.parents, needs.done_shards, needs.live);
+        let parents = needs.parents;
+        let forget_shards = needs.done_shards;
+        let live = needs.live;
         Self { roots, parents, forget_shards, held: BTreeSet::new(), live }
     }
 }
@@ -257,7 +259,8 @@ async fn mark(
 /// Returns the blobs that the rows need, after checking that they exist.
 pub(crate) async fn needed(place: &BlobCalls, rows: &Rows) -> Result<BTreeSet<Digest>, QueryError> {
     let check = |(root, why): (&Digest, &String)| {
-        let (root, why) = (*root, why.clone());
+        let root = *root;
+        let why = why.clone();
         let checked = place.ask(move |blobs| blobs.complete_manifest(root));
         async move { checked.await.map(|_| ()).map_err(|e| QueryError::Blob(format!("{why}: {e}"))) }
     };

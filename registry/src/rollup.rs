@@ -95,7 +95,8 @@ mod tests {
     use super::*;
 
     fn all(values: impl IntoIterator<Item = (i64, f64)>) -> (Open, Vec<(usize, Bucket)>) {
-        let (mut open, mut full) = (Open::default(), Vec::new());
+        let mut open = Open::default();
+        let mut full = Vec::new();
         for (step, value) in values {
             open.add(0, Bucket::of(step, Some(value)), &mut full);
         }
@@ -106,7 +107,8 @@ mod tests {
     fn buckets_count_values_whatever_their_steps_are() {
         let (open, full) = all((0..4_096 + 70).map(|i| (i * 50, i as f64)));
         let of = |level| full.iter().filter(|(l, _)| *l == level).map(|(_, bucket)| *bucket).collect::<Vec<_>>();
-        let (first, second) = (of(1), of(2));
+        let first = of(1);
+        let second = of(2);
         assert_eq!((first.len(), second.len()), (65, 1));
         assert!(first.iter().all(|bucket| bucket.count == 64) && second[0].count == 4_096);
         assert_eq!((first[1].first_step, first[1].last_step), (64 * 50, 127 * 50));
@@ -137,7 +139,8 @@ mod tests {
         let values = |range: std::ops::Range<i64>| range.map(|step| (step, step as f64));
         for end in [10, 64, 100, 4_096, 5_000] {
             let (open, full) = all(values(0..end));
-            let (mut again, mut none) = (Open::default(), Vec::new());
+            let mut again = Open::default();
+            let mut none = Vec::new();
             let after = full.iter().filter(|(level, _)| *level == 2).map(|(_, bucket)| bucket.last_step).max();
             for (_, bucket) in full.iter().filter(|(level, bucket)| *level == 1 && Some(bucket.last_step) > after) {
                 again.add(1, *bucket, &mut none);

@@ -77,7 +77,8 @@ mod tests {
 
     #[test]
     fn names_of_stores_differ_and_read_back() {
-        let (one, other) = (StoreId::random().unwrap(), StoreId::random().unwrap());
+        let one = StoreId::random().unwrap();
+        let other = StoreId::random().unwrap();
         assert_ne!(one, other);
         assert_eq!(one.to_string().parse(), Ok(one));
         assert!("../../a".parse::<StoreId>().is_err());

@@ -46,7 +46,8 @@ impl Reader {
         digest: Digest,
         stat: Stat,
     ) -> Result<Self, BlobError> {
-        let (source, findings) = (backend.read(digest, 0)?, Arc::clone(findings));
+        let source = backend.read(digest, 0)?;
+        let findings = Arc::clone(findings);
         Ok(Self { findings, digest, stat, source, state: State::Hashing(Hasher::default()), held_back: None })
     }
 
@@ -58,7 +59,8 @@ impl Reader {
         stat: Stat,
         from: u64,
     ) -> Result<Self, BlobError> {
-        let (source, findings) = (backend.read(digest, from)?, Arc::clone(findings));
+        let source = backend.read(digest, from)?;
+        let findings = Arc::clone(findings);
         Ok(Self { findings, digest, stat, source, state: State::Verified, held_back: None })
     }
 

@@ -123,7 +123,8 @@ impl BlobStore {
             return Ok(());
         }
         // Hashed without the lock that every other upload needs.
-        let (mut hasher, mut written) = (Hasher::default(), 0);
+        let mut hasher = Hasher::default();
+        let mut written = 0;
         let mut read = |part: &[u8]| {
             hasher.update(part);
             written += part.len() as u64;

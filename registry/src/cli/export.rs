@@ -62,7 +62,8 @@ pub(super) async fn weights(
     if !single {
         empty_folder(path)?;
     }
-    let (mut names, mut left_out) = (Vec::new(), plan.left_out);
+    let mut names = Vec::new();
+    let mut left_out = plan.left_out;
     for planned in &plan.files {
         let to = if single { path.to_owned() } else { path.join(planned.name) };
         let written = written(source, &manifest, planned, &to).await?;

@@ -78,12 +78,16 @@ pub fn render(data: &Data) -> String {
         Data::Forgotten { runs } => forgotten(runs),
         Data::BackedUp { summary, dir } => {
             let Summary { store, at_ms, blobs, bytes } = summary;
-            let (at, bytes, dir) = (format_ms(*at_ms), size(*bytes), dir.display());
+            let at = format_ms(*at_ms);
+            let bytes = size(*bytes);
+            let dir = dir.display();
             format!("store {store} of {at} is in `{dir}`: the database and {blobs} blobs ({bytes}), all verified\n")
         }
         Data::Restored { summary, dir } => {
             let Summary { store, at_ms, blobs, bytes } = summary;
-            let (at, bytes, dir) = (format_ms(*at_ms), size(*bytes), dir.display());
+            let at = format_ms(*at_ms);
+            let bytes = size(*bytes);
+            let dir = dir.display();
             format!("`{dir}` is store {store} as of {at}: {blobs} blobs ({bytes}), all verified\n")
         }
         Data::Migrated { from, to, rows } => {
@@ -97,7 +101,8 @@ pub fn render(data: &Data) -> String {
             format!("{}:{} is in `{}`: {}{without}\n", version.model, version.version, dir.display(), files.join(", "))
         }
         Data::Imported { version, file } => {
-            let (model, number) = (&version.model, version.version);
+            let model = &version.model;
+            let number = version.version;
             format!(
                 "`{file}` is {model}:{number}; `trainer generate \"a person walks\" --model {model}:{number}` uses it\n"
             )
@@ -241,7 +246,9 @@ fn removed(dry_run: bool, plan: &Plan) -> String {
     }
     let verb = if dry_run { "would remove" } else { "removed" };
     let fresh = if plan.fresh == 0 { String::new() } else { format!(", {} within their grace period", plan.fresh) };
-    let (count, bytes, kept) = (plan.remove.len(), size(plan.bytes), plan.kept);
+    let count = plan.remove.len();
+    let bytes = size(plan.bytes);
+    let kept = plan.kept;
     let uploads = match plan.uploads {
         0 => String::new(),
         1 => ", the parts of 1 unfinished upload".to_owned(),

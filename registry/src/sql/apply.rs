@@ -31,7 +31,8 @@ pub(super) async fn apply(
     let mut fences = Fences::read(conn, writes).await?;
     // One time for the end of a run and of its last stage, in any order of their rows.
     let now = clock::now_ms();
-    let (mut decisions, mut shards) = (Vec::new(), BTreeMap::new());
+    let mut decisions = Vec::new();
+    let mut shards = BTreeMap::new();
     for write in writes {
         if let Some(grant) = write.grant() {
             fences.check(grant)?;
@@ -64,7 +65,8 @@ pub(super) async fn apply(
                 add_shard(&mut shards, &grant.task, *output)?;
             }
             Write::StageResult { grant: _, key, run, stage, kind, outputs, metrics, inputs, wall_s } => {
-                let (run, stage) = (run.as_str(), stage.as_str());
+                let run = run.as_str();
+                let stage = stage.as_str();
                 let made = Made { key: *key, run, stage, kind, outputs, metrics, inputs, wall_s: *wall_s };
                 set_result(conn, proofs, &made).await?;
             }
@@ -73,8 +75,12 @@ pub(super) async fn apply(
                 moves::register(conn, model, *artifact, kind, metrics, source).await?;
             }
             Write::Promote { model, alias, artifact, require, reason, actor } => {
-                let (model, alias, to) = (model.clone(), alias.clone(), Which::Artifact(*artifact));
-                let (require, reason, actor) = (require.clone(), reason.clone(), actor.clone());
+                let model = model.clone();
+                let alias = alias.clone();
+                let to = Which::Artifact(*artifact);
+                let require = require.clone();
+                let reason = reason.clone();
+                let actor = actor.clone();
                 moves::promote(conn, &PromoteOrder { model, alias, to, expect: None, require, reason, actor }).await?;
             }
         }
@@ -323,7 +329,8 @@ struct Made<'a> {
 }
 
 async fn set_result(conn: &mut Conn<'_>, proofs: &Proofs, made: &Made<'_>) -> Result<()> {
-    let (key, outputs) = (made.key.to_string(), json(made.outputs));
+    let key = made.key.to_string();
+    let outputs = json(made.outputs);
     let stored = one(conn, query("SELECT outputs FROM stage_results WHERE key = ?").bind(&key)).await?;
     match stored.map(|row| row.get::<String, _>(0)) {
         Some(stored) if stored == outputs => return Ok(()),

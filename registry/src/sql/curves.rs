@@ -76,7 +76,8 @@ pub(super) async fn points(
     keys: Option<&[String]>,
     page: Page,
 ) -> Result<BTreeMap<String, Curve>> {
-    let (after, limit) = (page.after.map_or(-1, int), i64::try_from(page.limit).unwrap_or(i64::MAX));
+    let after = page.after.map_or(-1, int);
+    let limit = i64::try_from(page.limit).unwrap_or(i64::MAX);
     let mut curves = BTreeMap::new();
     for (key, segments) in segments(conn, run, stage, keys).await? {
         let mut points = Vec::new();

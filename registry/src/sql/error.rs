@@ -60,7 +60,8 @@ fn kind(e: &sqlx::Error) -> Kind {
 }
 
 pub(super) fn open_error(path: &Path, e: &sqlx::Error) -> OpenError {
-    let (path, message) = (path.to_owned(), e.to_string());
+    let path = path.to_owned();
+    let message = e.to_string();
     match kind(e) {
         Kind::ReadOnly | Kind::CannotOpen => OpenError::ReadOnly { path, message },
         Kind::Full => OpenError::Full { path, message },

@@ -125,7 +125,8 @@ fn history_row(row: &Row) -> Result<HistoryRow, QueryError> {
 pub(super) async fn stage_times(conn: &mut Conn<'_>, of_run: &RunId) -> Result<BTreeMap<StageName, Times>, QueryError> {
     let find = query("SELECT stage, started_ms, ended_ms FROM stage_times WHERE run = ?").bind(of_run.as_str());
     let times = |row: &Row| -> Result<(StageName, Times), QueryError> {
-        let (started_ms, ended_ms) = (row.try_get("started_ms")?, row.try_get("ended_ms")?);
+        let started_ms = row.try_get("started_ms")?;
+        let ended_ms = row.try_get("ended_ms")?;
         Ok((StageName::new(row.try_get::<String, _>("stage")?), Times { created_ms: None, started_ms, ended_ms }))
     };
     find.fetch_all(conn).await?.iter().map(times).collect()
@@ -137,7 +138,8 @@ pub(super) async fn run_times(conn: &mut Conn<'_>, runs: &[RunId]) -> Result<BTr
                 CASE WHEN state IN ('finished', 'failed', 'cancelled') THEN {greatest}(updated_ms, coalesce((SELECT max(ended_ms) FROM stage_times WHERE stage_times.run = runs.run), 0)) END AS ended_ms \
                 FROM runs WHERE run IN {texts ?}";
     let times = |row: &Row| -> Result<(RunId, Times), QueryError> {
-        let (created_ms, started_ms) = (row.try_get("created_ms")?, row.try_get("started_ms")?);
+        let created_ms = row.try_get("created_ms")?;
+        let started_ms = row.try_get("started_ms")?;
         let times = Times { created_ms, started_ms, ended_ms: row.try_get("ended_ms")? };
         Ok((RunId::new(row.try_get::<String, _>("run")?), times))
     };

@@ -109,7 +109,8 @@ pub(crate) async fn take_or_find(
     name: &str,
     terms: &LeaderTerms,
 ) -> Result<std::result::Result<u64, Leader>> {
-    let (begun, first) = (Instant::now(), read(conn).await?);
+    let begun = Instant::now();
+    let first = read(conn).await?;
     loop {
         if let Some(epoch) = take(conn, name, terms).await? {
             return Ok(Ok(epoch));

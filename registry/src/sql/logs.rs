@@ -34,7 +34,9 @@ pub(super) async fn add(conn: &mut Conn<'_>, grant: &Grant, first: u64, lines: &
 }
 
 async fn stream(conn: &mut Conn<'_>, grant: &Grant) -> Result<i64, WriteError> {
-    let (task, attempt, worker) = (grant.task.as_str(), int(grant.attempt.0), grant.worker.as_str());
+    let task = grant.task.as_str();
+    let attempt = int(grant.attempt.0);
+    let worker = grant.worker.as_str();
     let find = query("SELECT id FROM log_streams WHERE task = ? AND attempt = ? AND worker = ?");
     if let Some(row) = one(conn, find.bind(task).bind(attempt).bind(worker)).await? {
         return Ok(row.get(0));
@@ -57,7 +59,8 @@ async fn not_stored(
     let find = query(find).bind(stream).bind(int(first) - LINES as i64).bind(int(first + lines.len() as u64));
     let stored = find.fetch_all(&mut *conn).await.map_err(write_error)?;
     let place = |line: i64| usize::try_from(line - int(first)).unwrap_or(0).min(lines.len());
-    let (mut begin, mut new) = (0, Vec::new());
+    let mut begin = 0;
+    let mut new = Vec::new();
     let mut gap = |from: usize, to: usize| {
         new.extend((from..to).step_by(LINES).map(|begin| begin..(begin + LINES).min(to)));
     };
@@ -108,7 +111,8 @@ pub(super) async fn last(
                 (SELECT id FROM log_streams WHERE run = ?1 AND (?2 IS NULL OR stage = ?2)) ORDER BY id DESC LIMIT ?3) \
                 ORDER BY b.id DESC";
     let find = query(find).bind(of_run.as_str()).bind(stage.map(StageName::as_str)).bind(limit);
-    let (mut batches, mut rows) = (find.fetch(&mut *conn), Vec::new());
+    let mut batches = find.fetch(&mut *conn);
+    let mut rows = Vec::new();
     while rows.len() < limit as usize
         && let Some(batch) = batches.try_next().await?
     {

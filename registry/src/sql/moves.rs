@@ -194,7 +194,8 @@ async fn set_alias(
         Action::Promote => HistoryKind::Promoted,
         Action::Rollback => HistoryKind::RolledBack,
     };
-    let (model_name, why) = (Some(model.clone()), format!("@{alias} is version {to}: {reason}"));
+    let model_name = Some(model.clone());
+    let why = format!("@{alias} is version {to}: {reason}");
     let entry =
         HistoryEntry { model: model_name, actor: Some(actor.to_owned()), why: Some(why), ..HistoryEntry::new(kind) };
     history::add(conn, &[entry], clock::now_ms()).await?;

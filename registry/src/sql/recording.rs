@@ -62,7 +62,8 @@ impl Recording {
             let value = (!row.value.is_nan()).then_some(row.value);
             by_key.entry(&row.key).or_default().push((int(row.step), value));
         }
-        let (mut fresh, mut full) = (Vec::with_capacity(rows.len()), Vec::new());
+        let mut fresh = Vec::with_capacity(rows.len());
+        let mut full = Vec::new();
         for (key, mut values) in by_key {
             values.sort_by_key(|(step, _)| *step);
             values.dedup_by_key(|(step, _)| *step);
@@ -97,7 +98,8 @@ impl Recording {
 }
 
 async fn find_recorder(conn: &mut Conn<'_>, grant: &Grant) -> Result<Recorder> {
-    let (task, attempt) = (grant.task.as_str(), int(grant.attempt.0));
+    let task = grant.task.as_str();
+    let attempt = int(grant.attempt.0);
     let find = query("SELECT id FROM recorders WHERE task = ? AND attempt = ?").bind(task).bind(attempt);
     let Some(row) = one(conn, find).await? else {
         // Fences keep earlier tries from saving anything now, so the newest of theirs is what this one continued from.
@@ -153,7 +155,8 @@ impl Series {
 }
 
 async fn find_series(conn: &mut Conn<'_>, grant: &Grant, key: &str, full: &mut Vec<Full>) -> Result<Series> {
-    let (task, attempt) = (grant.task.as_str(), int(grant.attempt.0));
+    let task = grant.task.as_str();
+    let attempt = int(grant.attempt.0);
     let find = "SELECT id FROM series WHERE task = ? AND attempt = ? AND key = ?";
     if let Some(row) = one(conn, query(find).bind(task).bind(attempt).bind(key)).await? {
         return load(conn, row.get(0), full).await;

@@ -198,7 +198,9 @@ fn summary(row: &Row) -> Result<RunSummary> {
         let count: i64 = row.try_get(column)?;
         u32::try_from(count).map_err(|_| QueryError::Database(format!("`{column}` of a run is {count}")))
     };
-    let (state, owner, token) = (text("state")?, text("owner")?, text("token")?);
+    let state = text("state")?;
+    let owner = text("owner")?;
+    let token = text("token")?;
     let known = RunState::named(&state);
     let state = known.ok_or_else(|| QueryError::Database(format!("`{state}` is no state of a run")))?;
     let project = owner.strip_prefix('@').map(str::to_owned);

@@ -327,7 +327,8 @@ fn word_of_postgres(name: &str, argument: &str) -> String {
 /// Numbers the values: `?` and `?2` become `$1` and `$2`.
 fn numbered(sql: &str) -> String {
     let mut text = String::with_capacity(sql.len() + 20);
-    let (mut rest, mut next) = (sql, 1);
+    let mut rest = sql;
+    let mut next = 1;
     while let Some((before, after)) = rest.split_once('?') {
         let digits = after.bytes().take_while(u8::is_ascii_digit).count();
         text.push_str(before);

@@ -150,7 +150,8 @@ pub(super) async fn count(conn: &mut Conn<'_>, table: &'static str) -> Result<u6
 /// Sums up the rows of a table.
 async fn sum(conn: &mut Conn<'_>, table: &'static str) -> Result<Sum> {
     let columns = columns(conn, table).await?;
-    let (mut sum, mut rows) = (Sum::default(), select(table, &columns).build().fetch(conn));
+    let mut sum = Sum::default();
+    let mut rows = select(table, &columns).build().fetch(conn);
     while let Some(row) = rows.try_next().await? {
         sum.add(&values(&columns, &row)?);
     }
@@ -169,7 +170,8 @@ async fn copy(from: &mut Conn<'_>, to: &mut Conn<'_>, table: &'static str) -> Re
     let mut clear = Builder::new("DELETE FROM ");
     clear.push_name(table);
     clear.build().execute(to).await?;
-    let (mut sum, mut rows) = (Sum::default(), select(table, &columns).build().fetch(from));
+    let mut sum = Sum::default();
+    let mut rows = select(table, &columns).build().fetch(from);
     let mut batch = Vec::with_capacity(ROWS);
     while let Some(row) = rows.try_next().await? {
         let values = values(&columns, &row)?;
@@ -285,7 +287,8 @@ mod tests {
         migrations::OF_POSTGRES.run_direct(None, &mut server, false).await.unwrap();
         let dir = tempfile::tempdir().unwrap();
         let mut file = sqlite::make_copy(&dir.path().join("file")).await.unwrap();
-        let (server, file) = (&mut Conn::Postgres(&mut server), &mut Conn::Sqlite(&mut file));
+        let server = &mut Conn::Postgres(&mut server);
+        let file = &mut Conn::Sqlite(&mut file);
         for table in TABLES {
             let columns_ = columns(server, table).await.unwrap();
             assert!(!columns_.is_empty(), "{table}");

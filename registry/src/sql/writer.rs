@@ -60,7 +60,8 @@ impl Session {
     async fn keep_up(&mut self) {
         self.witness.catch_up();
         let Some((leadership, _)) = &self.leading else { return };
-        let (leadership, begun) = (leadership.clone(), Instant::now());
+        let leadership = leadership.clone();
+        let begun = Instant::now();
         match leader::renew(&mut self.link.conn(), &leadership).await {
             Ok(true) => leadership.renewed(begun),
             Ok(false) => leadership.end(),
@@ -209,7 +210,8 @@ async fn store(
     group: &[(Order, Answer)],
     results: &mut Vec<Result<Done, WriteError>>,
 ) -> Result<u64, WriteError> {
-    let (begun, before) = (Instant::now(), session.commits);
+    let begun = Instant::now();
+    let before = session.commits;
     loop {
         if session.is_superseded() {
             return Err(WriteError::Superseded { epoch: session.epoch });

@@ -316,7 +316,8 @@ impl Store {
     async fn take_by(dir: &Path, asked: Asked, holder: Holder) -> Result<Self, OpenError> {
         let held = opening::open(dir, asked, holder).await?;
         let HeldStore { dir, id, blobs, catalog, records, address, lease, lock, proofs, leading } = held;
-        let (opened_ms, calls) = (clock::now_ms(), Calls::default());
+        let opened_ms = clock::now_ms();
+        let calls = Calls::default();
         let read = ReadStore(Arc::new(Reading { dir, id, opened_ms, blobs, calls, records, address, _closed: None }));
         Ok(Self(Arc::new(Inner { read, catalog, _lease: lease, lock, proofs, leading })))
     }
@@ -382,7 +383,10 @@ impl Store {
         reason: &str,
         actor: &str,
     ) -> Result<Promotion, WriteError> {
-        let (model, alias, reason, actor) = (model.clone(), alias.clone(), reason.to_owned(), actor.to_owned());
+        let model = model.clone();
+        let alias = alias.clone();
+        let reason = reason.to_owned();
+        let actor = actor.to_owned();
         promoted(self.order(Order::Rollback(RollbackOrder { model, alias, to, expect, reason, actor })).await?)
     }
 

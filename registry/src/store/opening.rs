@@ -256,7 +256,8 @@ impl Database {
 /// Waits until no other process holds the blobs of a store that is about to be opened.
 async fn wait_until_free(dir: &Path, inspection: &Inspection, terms: LeaseTerms) -> Result<(), OpenError> {
     let own = lease::lock_of(dir).map_err(|e| OpenError::io(dir, &e))?;
-    let (place, marker) = (Arc::clone(&inspection.blobs), inspection.blobs.marker_place());
+    let place = Arc::clone(&inspection.blobs);
+    let marker = inspection.blobs.marker_place();
     let waiting = tokio::task::spawn_blocking(move || lease::wait_until_free(&*place, &own, terms));
     let failed = |message: String| OpenError::Blobs { dir: dir.to_owned(), message };
     let waited = waiting.await.map_err(|e| failed(e.to_string()))?.map_err(|e| failed(e.to_string()))?;
@@ -272,7 +273,8 @@ async fn mark(
     held: Option<Held>,
 ) -> Result<Marker, OpenError> {
     let marker = Marker { store: stored.id.clone(), epoch: stored.epoch, held };
-    let (place, written) = (blobs.place(), marker.clone());
+    let place = blobs.place();
+    let written = marker.clone();
     let writing = tokio::task::spawn_blocking(move || written.write(old.as_ref(), &*place));
     let failed = |message: String| OpenError::Blobs { dir: dir.to_owned(), message };
     if writing.await.map_err(|e| failed(e.to_string()))?.map_err(|e| failed(e.to_string()))? {

@@ -134,7 +134,8 @@ impl Inspection {
     /// Reads the parts and changes nothing. A place other than the recorded one is an error, unless the blobs were
     /// `moved` there or the store does not exist yet.
     pub(super) async fn of(dir: &Path, asked: &RequestedPlace, moved: bool) -> Result<Self, OpenError> {
-        let (dir, asked) = (dir.to_owned(), asked.clone());
+        let dir = dir.to_owned();
+        let asked = asked.clone();
         let path = dir.clone();
         let looking = tokio::task::spawn_blocking(move || Self::inspect(&dir, asked, moved));
         looking.await.map_err(|e| OpenError::io(&path, &io::Error::other(e)))?

@@ -114,7 +114,8 @@ impl ObjectStore for SlowBucket {
     }
 
     fn delete_stream(&self, paths: BoxStream<'static, Result<Path>>) -> BoxStream<'static, Result<Path>> {
-        let (bucket, objects) = (self.clone(), self.clone());
+        let bucket = self.clone();
+        let objects = self.clone();
         let paths = paths.then(move |path| {
             let bucket = bucket.clone();
             async move {
@@ -126,7 +127,8 @@ impl ObjectStore for SlowBucket {
     }
 
     fn list(&self, prefix: Option<&Path>) -> BoxStream<'static, Result<ObjectMeta>> {
-        let (bucket, all) = (self.clone(), self.0.objects.list(prefix));
+        let bucket = self.clone();
+        let all = self.0.objects.list(prefix);
         async move {
             bucket.pass().await;
             all

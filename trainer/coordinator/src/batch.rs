@@ -207,7 +207,8 @@ impl<T> Batches<T> {
         instead: Option<WriteError>,
         mut moment: impl FnMut() -> Moment,
     ) -> Turn<T> {
-        let (mut next, mut writes) = (State::clone(&self.state), Vec::new());
+        let mut next = State::clone(&self.state);
+        let mut writes = Vec::new();
         let mut decided = Vec::with_capacity(asks.len());
         for (ask, ticket) in asks {
             let result = match &ask {

@@ -76,7 +76,8 @@ pub(crate) fn of(state: &State, fact: &Fact, why: Option<&str>) -> Vec<HistoryEn
 }
 
 pub(crate) fn about(execution: &StageExecution, kind: HistoryKind) -> HistoryEntry {
-    let (run, stage) = (Some(execution.run.clone()), Some(execution.stage.clone()));
+    let run = Some(execution.run.clone());
+    let stage = Some(execution.stage.clone());
     HistoryEntry { run, stage, ..HistoryEntry::new(kind) }
 }
 
@@ -122,7 +123,8 @@ fn of_task(execution: &StageExecution, task: &Task, change: &TaskChange, why: Op
         }
         (Lease::Held { holders: before, .. }, Some(Lease::Held { holders: after, .. })) => {
             let names = |members: &[Member]| members.iter().map(|m| m.worker.clone()).collect::<BTreeSet<_>>();
-            let (before, after) = (names(before), names(after));
+            let before = names(before);
+            let after = names(after);
             let join = |names: Vec<&WorkerId>| names.iter().map(|name| name.as_str()).collect::<Vec<_>>().join(", ");
             let (gone, come) =
                 (before.difference(&after).collect::<Vec<_>>(), after.difference(&before).collect::<Vec<_>>());

@@ -65,7 +65,8 @@ fn heard(state: &mut State, now: Millis, worker: WorkerId, poll: Poll) -> Result
         }
     }
     if is_ready_for_more(state, known, &poll) {
-        let (worker, incarnation) = (worker.clone(), poll.incarnation);
+        let worker = worker.clone();
+        let incarnation = poll.incarnation;
         events.push(Event::WorkerReady { worker, incarnation, tasks: poll.ready });
     }
     let before = state.heard.workers.get(&worker).copied().unwrap_or_default();

@@ -56,7 +56,9 @@ impl Registration {
             let part = output(run, &StageName::new(stage));
             parts.insert(role, part.ok_or_else(|| format!("stage `{stage}` has no output"))?);
         }
-        let (mut candidates, mut metrics, mut keys) = (Vec::new(), Vec::new(), Vec::new());
+        let mut candidates = Vec::new();
+        let mut metrics = Vec::new();
+        let mut keys = Vec::new();
         for from in &settings.from {
             let stage = StageName::new(from.as_str());
             let model = output(run, &stage).ok_or_else(|| format!("`from`: stage `{from}` has no output"))?;
@@ -123,7 +125,8 @@ fn metrics_of(run: &Run, model: &str, sampler: Option<&Sampler>) -> BTreeMap<Str
 }
 
 fn together(known: &[(&StageName, &BTreeMap<String, f64>)]) -> BTreeMap<String, f64> {
-    let (mut all, mut first) = (BTreeMap::new(), BTreeMap::new());
+    let mut all = BTreeMap::new();
+    let mut first = BTreeMap::new();
     for (stage, metrics) in known {
         for (metric, value) in *metrics {
             if known.len() > 1 {
@@ -231,7 +234,8 @@ mod tests {
         let metrics = |pairs: &[(&str, f64)]| -> BTreeMap<String, f64> {
             pairs.iter().map(|(key, value)| ((*key).to_owned(), *value)).collect()
         };
-        let (one, four) = (StageName::new("one"), StageName::new("four"));
+        let one = StageName::new("one");
+        let four = StageName::new("four");
         let first = metrics(&[("fid", 0.3), ("latent_fid", 0.1)]);
         let second =
             metrics(&[("fid", 0.2), ("fid.lower", 0.1), ("fid.upper", 0.3), ("top1", 0.5), ("top1.upper", 0.6)]);

@@ -119,7 +119,8 @@ fn joints(file: &Path, array: Array, rate: Option<f64>) -> Result<Joints, String
         ));
     }
     if let Some(at) = array.data.iter().position(|v| !v.is_finite()) {
-        let (frame, joint) = (at / (3 * found), at % (3 * found) / 3);
+        let frame = at / (3 * found);
+        let joint = at % (3 * found) / 3;
         return Err(format!("{}: joint {joint} of frame {frame} is not finite", file.display()));
     }
     let joints = found.min(22);

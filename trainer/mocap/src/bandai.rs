@@ -181,7 +181,8 @@ pub fn splits<'a>(names: &[&'a str]) -> Result<BTreeMap<&'a str, Split>, String>
 /// If a name is none of the set.
 pub fn tables(all: &[&str], there: &[&str]) -> Result<Vec<(&'static str, String)>, String> {
     let splits = splits(all)?;
-    let (mut table, mut lists) = (String::from("clip,caption\n"), BTreeMap::<Split, String>::new());
+    let mut table = String::from("clip,caption\n");
+    let mut lists = BTreeMap::<Split, String>::new();
     for name in there {
         let id = name.strip_suffix(".bvh").unwrap_or(name);
         for caption in captions(name)? {

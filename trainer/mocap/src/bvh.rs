@@ -143,7 +143,8 @@ impl Bvh {
         let mut row = self.values[frame * channels..(frame + 1) * channels].iter();
         let mut pose = Vec::with_capacity(self.nodes.len());
         for node in &self.nodes {
-            let (mut offset, mut rotation) = (node.offset, quat::IDENTITY);
+            let mut offset = node.offset;
+            let mut rotation = quat::IDENTITY;
             for (channel, value) in node.channels.iter().zip(row.by_ref()) {
                 match channel {
                     Channel::Position(axis) => offset[*axis] = *value,

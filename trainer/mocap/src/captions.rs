@@ -119,7 +119,9 @@ fn of_csv(content: &str) -> Result<Vec<Row>, String> {
         return Err("1: the file is empty; expected a row of column names".into());
     };
     let column = |wanted: &[&str]| names.iter().position(|name| wanted.contains(&name.trim().to_lowercase().as_str()));
-    let (clip, caption, source) = (column(&CLIP), column(&CAPTION), column(&SOURCE));
+    let clip = column(&CLIP);
+    let caption = column(&CAPTION);
+    let source = column(&SOURCE);
     let (Some(clip), true) = (clip, caption.is_some() || source.is_some()) else {
         return Err(format!(
             "1: the columns are {}; expected one of {} and one of {}",
@@ -128,7 +130,8 @@ fn of_csv(content: &str) -> Result<Vec<Row>, String> {
             CAPTION.join(", ")
         ));
     };
-    let (from, to) = (column(&FROM), column(&TO));
+    let from = column(&FROM);
+    let to = column(&TO);
     records
         .map(|(line, fields)| {
             let fail = |what: String| format!("{line}: {what}");
@@ -168,7 +171,9 @@ fn timed(caption: Caption, from_s: f64, to_s: f64) -> Result<Caption, String> {
 fn csv_records(content: &str) -> Result<Vec<(usize, Vec<String>)>, String> {
     let mut records = vec![];
     let (mut fields, mut field): (Vec<String>, String) = (vec![], String::new());
-    let (mut quoted, mut line, mut began) = (false, 1, 1);
+    let mut quoted = false;
+    let mut line = 1;
+    let mut began = 1;
     let mut chars = content.chars().peekable();
     while let Some(c) = chars.next() {
         line += usize::from(c == '\n');
@@ -234,7 +239,8 @@ fn of_json(content: &str) -> Result<Vec<Row>, String> {
                 };
                 let clip = get(&CLIP).and_then(Value::as_str).ok_or_else(|| format!(" entry {i}: no `clip`"))?;
                 let captions = get(&CAPTION).map_or(Ok(vec![]), &sentences);
-                let (from, to) = (number(&FROM)?, number(&TO)?);
+                let from = number(&FROM)?;
+                let to = number(&TO)?;
                 let captions = captions.and_then(|all| all.into_iter().map(|c| timed(c, from, to)).collect());
                 let source = get(&SOURCE).and_then(Value::as_str).map(str::to_owned);
                 Ok(Row { clip: clip.to_owned(), captions: captions.map_err(|e| format!(" entry {i}: {e}"))?, source })

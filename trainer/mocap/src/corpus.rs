@@ -216,7 +216,8 @@ pub fn clips_of(file: &ClipFile, recipe: &Recipe) -> Result<FromFile, String> {
         return Ok(made);
     }
     for part in 0..parts {
-        let (start, end) = (frames * part / parts, frames * (part + 1) / parts);
+        let start = frames * part / parts;
+        let end = frames * (part + 1) / parts;
         // The frame after the last supplies velocities.
         let part_joints = &joints[start * width..(end + 1) * width];
         let id = if parts == 1 { file.id.clone() } else { format!("{}-{}", file.id, part + 1) };
@@ -252,7 +253,8 @@ fn captions_within(captions: &[Caption], from: f64, to: f64, cut: bool) -> Vec<C
         if !cut || caption.is_whole() {
             return Some(caption.clone());
         }
-        let (from_s, to_s) = ((caption.from_s - from).max(0.0), caption.to_s.min(to) - from);
+        let from_s = (caption.from_s - from).max(0.0);
+        let to_s = caption.to_s.min(to) - from;
         (from_s < to_s).then(|| Caption { from_s, to_s, ..caption.clone() })
     };
     captions.iter().filter_map(within).collect()
@@ -413,7 +415,8 @@ fn divide(made: &[Made], division: Division) -> Result<Vec<Option<Split>>, Strin
         .collect();
     order.sort_unstable();
     let share = |part: f64| (part * made.len() as f64).round() as usize;
-    let (val, test) = (share(val), share(test));
+    let val = share(val);
+    let test = share(test);
     let mut splits = BTreeMap::new();
     let mut given = 0;
     for (_, source) in order {

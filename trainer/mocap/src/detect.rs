@@ -80,7 +80,9 @@ pub struct Detected {
 
 /// Detects from frames of the 22 joints in the file's unit and axes.
 pub fn detect<'a>(frames: impl Iterator<Item = &'a [Vec3]>) -> Detected {
-    let (mut leg, mut way, mut count) = (0.0, [0.0; 3], 0.0_f64);
+    let mut leg = 0.0;
+    let mut way = [0.0; 3];
+    let mut count = 0.0_f64;
     for joints in frames {
         let length = |a: usize, b: usize| quat::norm(quat::sub(joints[a], joints[b]));
         leg += 0.5 * (length(1, 4) + length(4, 7) + length(2, 5) + length(5, 8));

@@ -86,7 +86,8 @@ fn side(name: &str) -> Side {
 /// # Errors
 /// If there is nothing to animate, values are not finite, or frames are too close in time.
 pub fn to_bytes(rig: &Rig, fps: f64, metres_per_unit: f64, name: &str) -> Result<Vec<u8>, GlbError> {
-    let (nodes, frames) = (rig.nodes.len(), rig.frames());
+    let nodes = rig.nodes.len();
+    let frames = rig.frames();
     if nodes == 0 || nodes > MOST_NODES || frames == 0 || nodes * frames > MOST_ROTATIONS {
         return Err(GlbError::Size { nodes, frames });
     }
@@ -194,7 +195,8 @@ fn linear(channel: u8) -> f64 {
 /// Channels and samplers of the animation.
 fn animation(rig: &Rig, times: &[f32], metres_per_unit: f64, file: &mut File) -> (Vec<Value>, Vec<Value>) {
     let input = file.floats(times, 1, "SCALAR", None);
-    let (mut channels, mut samplers) = (Vec::new(), Vec::new());
+    let mut channels = Vec::new();
+    let mut samplers = Vec::new();
     let mut channel = |node: usize, path: &str, output: usize| {
         channels.push(json!({"sampler": samplers.len(), "target": {"node": node, "path": path}}));
         samplers.push(json!({"input": input, "output": output, "interpolation": "LINEAR"}));
@@ -245,7 +247,8 @@ impl Shape {
         let waist = quat::add(a, quat::scale(along, 0.18));
         let ring = [u, v, quat::scale(u, -1.0), quat::scale(v, -1.0)].map(|r| quat::add(waist, quat::scale(r, radius)));
         for k in 0..4 {
-            let (p, q) = (ring[k], ring[(k + 1) % 4]);
+            let p = ring[k];
+            let q = ring[(k + 1) % 4];
             // Counter-clockwise from outside: the ring turns from u to v about the axis.
             self.flat([b, p, q], joint);
             self.flat([a, q, p], joint);
@@ -263,13 +266,17 @@ impl Shape {
         let mut faces: Vec<[Vec3; 3]> = Vec::new();
         for sign in 0..8 {
             let [x, y, z] = [0, 1, 2].map(|k| if sign >> k & 1 == 0 { 1.0 } else { -1.0 });
-            let (a, b, c) = ([x, 0.0, 0.0], [0.0, y, 0.0], [0.0, 0.0, z]);
+            let a = [x, 0.0, 0.0];
+            let b = [0.0, y, 0.0];
+            let c = [0.0, 0.0, z];
             faces.push(if x * y * z > 0.0 { [a, b, c] } else { [a, c, b] });
         }
         let middle = |a: Vec3, b: Vec3| quat::unit(quat::add(a, b));
         for _ in 0..2 {
             let four = |[a, b, c]: [Vec3; 3]| {
-                let (d, e, f) = (middle(a, b), middle(b, c), middle(c, a));
+                let d = middle(a, b);
+                let e = middle(b, c);
+                let f = middle(c, a);
                 [[a, d, f], [d, b, e], [f, e, c], [d, e, f]]
             };
             faces = faces.into_iter().flat_map(four).collect();

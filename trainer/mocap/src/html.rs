@@ -141,7 +141,9 @@ impl Page<'_> {
 
     fn head(&self, out: &mut impl Write) -> io::Result<()> {
         let digest = |text: &str| BASE64.encode(Digest::of(text.as_bytes()).as_bytes());
-        let (title, style, script) = (text(&self.title), style(), script());
+        let title = text(&self.title);
+        let style = style();
+        let script = script();
         write!(
             out,
             "<!DOCTYPE html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n\
@@ -167,8 +169,10 @@ impl Page<'_> {
             for panel in &section.panels {
                 // Text that is already above is not repeated.
                 let said = panel.caption == self.title || panel.caption == section.title;
-                let (caption, note) = (if said { String::new() } else { text(&panel.caption) }, text(&panel.note));
-                let (frames, fps) = (panel.joints.len() / (3 * panel.body.joints()), panel.body.fps);
+                let caption = if said { String::new() } else { text(&panel.caption) };
+                let note = text(&panel.note);
+                let frames = panel.joints.len() / (3 * panel.body.joints());
+                let fps = panel.body.fps;
                 writeln!(
                     out,
                     "<figure><figcaption id=\"c{number}\"><span dir=\"auto\">{caption}</span><small dir=\"auto\">{note}</small>\

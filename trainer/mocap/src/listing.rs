@@ -84,7 +84,8 @@ pub fn list(folder: &DataPath, table: Option<&DataPath>) -> Result<Listing, List
     let root = ["joints", "new_joints"].iter().map(|name| folder.join(name)).find(DataPath::is_folder);
     let root = root.unwrap_or_else(|| folder.clone());
     let found = root.tree().map_err(|e| fail(vec![e.to_string()]))?;
-    let (mut problems, mut clips) = (vec![], BTreeMap::new());
+    let mut problems = vec![];
+    let mut clips = BTreeMap::new();
     for path in found {
         let shown = path.shown();
         let ending = shown.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase).unwrap_or_default();

@@ -67,7 +67,8 @@ fn plant_leg(frames: &mut [Vec<Vec3>], leg: &Leg<'_>, skeleton: &Skeleton) {
             continue;
         }
         let fade = (FADE * skeleton.fps).round().max(1.0);
-        let (first, last) = (shift(&places[0]), shift(&places[places.len() - 1]));
+        let first = shift(&places[0]);
+        let last = shift(&places[places.len() - 1]);
         for (t, sum) in shifts.iter_mut().enumerate() {
             let (shift, away) = match t {
                 t if t < span.start => (first, span.start - t),
@@ -161,12 +162,14 @@ mod tests {
 
     /// Mean horizontal speed of both balls while they stand in `of`, m/s.
     fn slide(joints: &[f32], of: &[f32], skeleton: &Skeleton) -> (f64, usize) {
-        let (mut sum, mut count) = (0.0, 0);
+        let mut sum = 0.0;
+        let mut count = 0;
         for ball in [skeleton.left_foot[1], skeleton.right_foot[1]] {
             let track = |joints: &[f32]| -> Vec<Vec3> {
                 joints.chunks(66).map(|f| [0, 1, 2].map(|k| f64::from(f[3 * ball + k]))).collect()
             };
-            let (moved, given) = (track(joints), track(of));
+            let moved = track(joints);
+            let given = track(of);
             for span in standing(&given, skeleton) {
                 for pair in moved[span].windows(2) {
                     sum += (pair[1][0] - pair[0][0]).hypot(pair[1][2] - pair[0][2]) * skeleton.fps;

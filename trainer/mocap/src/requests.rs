@@ -142,7 +142,8 @@ pub fn read(file: &Path) -> Result<Vec<Request>, RequestError> {
 /// All invalid lines, or a text without lines.
 pub fn parse(name: &str, text: &str, json: bool) -> Result<Vec<Request>, RequestError> {
     let lines = text.trim_start_matches('\u{feff}').lines().enumerate().filter(|(_, line)| !line.trim().is_empty());
-    let (mut requests, mut mistakes) = (Vec::new(), Vec::new());
+    let mut requests = Vec::new();
+    let mut mistakes = Vec::new();
     for (i, line) in lines {
         let read = if json { of_json(line) } else { of_text(line.trim()) };
         let read = read.and_then(|request| match request.caption.len() {

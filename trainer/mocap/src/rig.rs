@@ -332,7 +332,8 @@ fn rest_direction(skeleton: &Skeleton, joint: usize) -> Vec3 {
 /// The frame of a joint's children in each frame of the motion.
 fn body_frames(frames: &[Vec<Vec3>], skeleton: &Skeleton, joint: usize, children: &[usize]) -> Vec<Quat> {
     let side = |side: &[usize]| children.iter().copied().find(|child| side.contains(child)).unwrap_or(joint);
-    let (left, right) = (side(skeleton.left), side(skeleton.right));
+    let left = side(skeleton.left);
+    let right = side(skeleton.right);
     let middle = children.iter().copied().find(|child| *child != left && *child != right).unwrap_or(joint);
     let mut before = quat::IDENTITY;
     frames
@@ -341,7 +342,8 @@ fn body_frames(frames: &[Vec<Vec3>], skeleton: &Skeleton, joint: usize, children
             let across = quat::sub(frame[left], frame[right]);
             let forward = quat::cross(across, quat::sub(frame[middle], frame[joint]));
             if quat::norm(across) > 1e-9 && quat::norm(forward) > 1e-9 * quat::norm(across) {
-                let (x, z) = (quat::unit(across), quat::unit(forward));
+                let x = quat::unit(across);
+                let z = quat::unit(forward);
                 before = from_columns(x, quat::cross(z, x), z);
             }
             before
@@ -367,11 +369,13 @@ fn from_columns(x: Vec3, y: Vec3, z: Vec3) -> Quat {
 /// The shortest rotation from the direction of `a` to that of `b`; for opposite directions a half turn about a
 /// perpendicular axis. `None` if one of them has no length.
 fn shortest(a: Vec3, b: Vec3) -> Option<Quat> {
-    let (la, lb) = (quat::norm(a), quat::norm(b));
+    let la = quat::norm(a);
+    let lb = quat::norm(b);
     if la < 1e-9 || lb < 1e-9 {
         return None;
     }
-    let (a, b) = (quat::scale(a, 1.0 / la), quat::scale(b, 1.0 / lb));
+    let a = quat::scale(a, 1.0 / la);
+    let b = quat::scale(b, 1.0 / lb);
     let half = quat::add(a, b);
     if quat::norm(half) < 1e-7 {
         let axis = if a[0].abs() < 0.9 { [1.0, 0.0, 0.0] } else { [0.0, 1.0, 0.0] };

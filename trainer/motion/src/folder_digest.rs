@@ -70,7 +70,8 @@ pub fn folder_fingerprint(
     hashes: &Hashes,
     go_on: &dyn Fn() -> bool,
 ) -> Result<Fingerprint, OpenError> {
-    let (mut problems, mut stamps) = (vec![], vec![]);
+    let mut problems = vec![];
+    let mut stamps = vec![];
     if !path.is_folder() {
         let what = if path.exists() { "is not a folder" } else { "no such folder" };
         let todo = "set dataset.path to the folder with new_joint_vecs/ and texts/";

@@ -53,12 +53,14 @@ fn corrections(rows: &[f32], skeleton: &Skeleton) -> Vec<[f64; 2]> {
         [row[at], 0.0, row[at + 2]].map(f64::from)
     };
     let step = |pair: &[&[f32]]| {
-        let (from, to) = (pair[0], pair[1]);
+        let from = pair[0];
+        let to = pair[1];
         // The turn feature is already the angle of the quaternion.
         let (sin, cos) = f64::from(from[layout.yaw.start]).sin_cos();
         let turn = [cos, 0.0, sin, 0.0];
         let said = [f64::from(from[layout.root_velocity.start]), f64::from(from[layout.root_velocity.start + 1])];
-        let (mut sum, mut all) = ([0.0; 2], LOOSE);
+        let mut sum = [0.0; 2];
+        let mut all = LOOSE;
         for (foot, contact) in feet.iter().zip(&from[layout.contacts.clone()]) {
             let weight = f64::from(contact.clamp(0.0, 1.0)).powi(2);
             let moved = quat::sub(place(to, *foot), quat::rotate(turn, place(from, *foot)));
@@ -83,7 +85,8 @@ mod tests {
     fn slides(rows: &[f32], skeleton: &Skeleton) -> f64 {
         let joints = features::recover_joints_wide(rows, skeleton);
         let frames: Vec<&[f64]> = joints.chunks_exact(3 * skeleton.joints).collect();
-        let (mut sum, mut count) = (0.0, 0.0);
+        let mut sum = 0.0;
+        let mut count = 0.0;
         for (row, pair) in rows.chunks_exact(skeleton.features).zip(frames.windows(2)) {
             let feet = skeleton.left_foot.iter().chain(&skeleton.right_foot);
             for (j, contact) in feet.zip(&row[skeleton.layout().contacts]) {

@@ -32,12 +32,15 @@ impl Change {
     /// over the motion, half alternates.
     pub fn draw(rows: &[f32], skeleton: &Skeleton, augment: &Augment, draw: &mut Stream) -> Self {
         let spread = augment.bend * std::f64::consts::FRAC_1_SQRT_2;
-        let (constant, alternating) = (f64::from(draw.normal()) * spread, f64::from(draw.normal()) * spread);
-        let (period, phase) = (draw.range(PERIODS.0, PERIODS.1) * skeleton.fps, draw.uniform());
+        let constant = f64::from(draw.normal()) * spread;
+        let alternating = f64::from(draw.normal()) * spread;
+        let period = draw.range(PERIODS.0, PERIODS.1) * skeleton.fps;
+        let phase = draw.uniform();
         let pace = (1.0 + f64::from(draw.normal()) * augment.stretch).clamp(PACES.0, PACES.1);
         let most = FASTEST / skeleton.fps;
         let turn = |(t, row): (usize, &[f32])| {
-            let (x, z) = (f64::from(row[1]), f64::from(row[2]));
+            let x = f64::from(row[1]);
+            let z = f64::from(row[2]);
             let way = (x * x + z * z).sqrt() * pace * skeleton.metres_per_unit;
             // A triangle wave of variance 1: equal on every machine, unlike the sine of a system's library.
             let wave = (2.0 * ((t as f64 / period + phase).fract() * 2.0 - 1.0).abs() - 1.0) * 3.0_f64.sqrt();
@@ -118,7 +121,8 @@ mod tests {
         };
         let far = |a: [f64; 2], b: [f64; 2]| (a[0] - b[0]).hypot(a[1] - b[1]);
         let length = |path: &[[f64; 2]]| path.windows(2).map(|w| far(w[0], w[1])).sum::<f64>();
-        let (before, after) = (path(&rows), path(&bent));
+        let before = path(&rows);
+        let after = path(&bent);
         assert!((length(&before) - length(&after)).abs() < 1e-3);
         assert!(far(before[79], after[79]) > 0.3, "{:?} {:?}", before[79], after[79]);
         // Poses in the heading frame, contacts and heights are the same.

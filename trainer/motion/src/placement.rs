@@ -117,7 +117,8 @@ mod tests {
     #[test]
     fn a_clip_cut_in_two_and_placed_again_is_whole() {
         let skeleton = Skeleton::of(DataFormat::Humanml3d);
-        let (rows, at) = (rows(12), 5);
+        let rows = rows(12);
+        let at = 5;
         let whole = recover_joints_wide(&rows, skeleton);
         let (heading, root) = root_path(&rows, skeleton)[at];
         let place = Placement::default().of_frame(heading, root);

@@ -345,7 +345,8 @@ pub fn generate_while(settings: &DataSynthetic, seed: Seed, go_on: &dyn Fn(usize
     let skeleton = Skeleton::of(DataFormat::Humanml3d);
     let count = settings.clips;
     let share = |part: f64| (part.clamp(0.0, 1.0) * count as f64).round() as usize;
-    let (val, test) = (share(settings.val), share(settings.test));
+    let val = share(settings.val);
+    let test = share(settings.test);
     let mut splits = vec![Split::Train; count];
     for (rank, index) in permutation(seed, "synthetic/split", 0, count).into_iter().enumerate() {
         splits[index as usize] = match rank {

@@ -47,7 +47,8 @@ impl Header {
                 return Ok(Err(format!("has an invalid header: {mistake}; expected a safetensors file")));
             }
         };
-        let (declared, has) = (metadata.data_len(), after_length - length);
+        let declared = metadata.data_len();
+        let has = after_length - length;
         if declared as u64 != has {
             return Ok(Err(format!(
                 "declares tensors of {declared} bytes, but has {has}; expected a safetensors file"
@@ -100,7 +101,8 @@ mod tests {
 
     #[test]
     fn a_header_is_that_of_the_safetensors_crate() {
-        let (count, values) = (3_i64.to_le_bytes(), [1.0_f32, -2.0].map(f32::to_le_bytes).concat());
+        let count = 3_i64.to_le_bytes();
+        let values = [1.0_f32, -2.0].map(f32::to_le_bytes).concat();
         let ours = [
             header([("z".to_owned(), Dtype::I64, vec![1]), ("a".to_owned(), Dtype::F32, vec![2, 1])]),
             count.to_vec(),

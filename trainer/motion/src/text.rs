@@ -127,7 +127,8 @@ pub struct Texts {
 /// Reads a text file: every line that is not blank. The error lists the lines that do not parse, at most
 /// [`limits::MISTAKES`] of them.
 pub fn parse_file(file: &Path, content: &str) -> Result<Texts, Vec<TextError>> {
-    let (mut texts, mut errors) = (Texts::default(), vec![]);
+    let mut texts = Texts::default();
+    let mut errors = vec![];
     for (i, line) in content.lines().enumerate().filter(|(_, line)| !line.trim().is_empty()) {
         let caption = match Caption::parse(line) {
             Ok(caption) => caption,
@@ -305,7 +306,8 @@ mod tests {
     #[test]
     fn word_vectors_are_apart_but_for_related_forms() {
         let cosine = |a: &str, b: &str| {
-            let (a, b) = (hashed_word(a), hashed_word(b));
+            let a = hashed_word(a);
+            let b = hashed_word(b);
             a.iter().zip(&b).map(|(a, b)| f64::from(a * b)).sum::<f64>() / 36.0
         };
         assert!((cosine("walk", "walk") - 1.0).abs() < 1e-5);

@@ -106,7 +106,8 @@ pub fn check_start(waypoints: &[Waypoint], skeleton: &Skeleton, start: [f64; 3])
     let far = far[0].hypot(far[1]);
     let speed = far * skeleton.fps / first.frame.max(1) as f64;
     if speed > FASTEST {
-        let (name, seconds) = (skeleton.names[0], first.frame as f64 / skeleton.fps);
+        let name = skeleton.names[0];
+        let seconds = first.frame as f64 / skeleton.fps;
         return Err(format!(
             "`{name}` starts at x = {:.2}, z = {:.2} and would need {speed:.1} m/s to be {far:.2} m away at \
              {seconds:.2} s; expected at most {FASTEST} m/s",
@@ -135,7 +136,8 @@ fn number(name: &str, skeleton: &Skeleton) -> Result<usize, String> {
 /// Waypoints from the joints of a motion, in every frame.
 fn motion(file: &Path, bytes: &[u8], skeleton: &Skeleton, told: &[usize]) -> Result<Vec<Waypoint>, String> {
     let array = npy::parse(file, bytes, true).map_err(|error| error.to_string())?;
-    let (joints, features) = (skeleton.joints, skeleton.features);
+    let joints = skeleton.joints;
+    let features = skeleton.features;
     let rows = match array.shape[..] {
         [_, count, 3] if count == joints => array.data,
         [_, width] if width == features => recover_joints(&array.data, skeleton),
@@ -186,7 +188,8 @@ fn csv(text: &str) -> Result<Vec<Line>, String> {
                 cell.parse::<f64>()
                     .map_err(|_| format!("{place}: `{}` in column `{}` is not a number", excerpt(cell), columns[k]))
             };
-            let (seconds, position) = (value(t)?, [value(x)?, value(y)?, value(z)?]);
+            let seconds = value(t)?;
+            let position = [value(x)?, value(y)?, value(z)?];
             Ok(Line { place, seconds, joint: joint.map(|k| cells[k].to_owned()), position })
         })
         .collect()

@@ -95,7 +95,8 @@ mod tests {
             project: project.map(str::to_owned),
             ..Owner::default()
         };
-        let (alice, bob) = (owner("alice", Some("motion")), owner("bob", Some("motion")));
+        let alice = owner("alice", Some("motion"));
+        let bob = owner("bob", Some("motion"));
         assert!(alice.controls(&bob.group()) && bob.controls(&alice.group()));
         let alone = owner("alice", None);
         assert!(!alone.controls(&alice.group()) && !alice.controls(&alone.group()), "her other token");

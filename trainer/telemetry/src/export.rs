@@ -56,10 +56,12 @@ fn provider(service: &'static str) -> Option<SdkTracerProvider> {
 /// Bytes that follow from a run alone, so that all workers agree on them.
 pub(crate) fn join_run(span: &tracing::Span, run: &str) {
     let digest: [u8; 32] = Sha256::digest(run.as_bytes()).into();
-    let (mut trace, mut parent) = ([0; 16], [0; 8]);
+    let mut trace = [0; 16];
+    let mut parent = [0; 8];
     trace.copy_from_slice(&digest[..16]);
     parent.copy_from_slice(&digest[16..24]);
-    let (trace, parent) = (TraceId::from_bytes(trace), SpanId::from_bytes(parent));
+    let trace = TraceId::from_bytes(trace);
+    let parent = SpanId::from_bytes(parent);
     let context = SpanContext::new(trace, parent, TraceFlags::SAMPLED, true, TraceState::default());
     // An error means that this span is not sent.
     let _ = span.set_parent(Context::new().with_remote_span_context(context));

@@ -91,7 +91,8 @@ impl Inner {
     }
 
     fn head(&self, digest: Digest) -> Result<Option<ObjectMeta>, BlobError> {
-        let (store, path) = (self.store(), self.remote.blob(digest));
+        let store = self.store();
+        let path = self.remote.blob(digest);
         let wanted = path.clone();
         match self.remote.wait(async move { store.head(&wanted).await }) {
             Ok(meta) => Ok(Some(meta)),
@@ -119,7 +120,8 @@ impl Inner {
     }
 
     fn list(&self, folder: &str) -> Result<Vec<ObjectMeta>, BlobError> {
-        let (store, path) = (self.store(), self.remote.path(folder));
+        let store = self.store();
+        let path = self.remote.path(folder);
         let wanted = path.clone();
         let listed = self.remote.wait(async move { store.list(Some(&wanted)).try_collect().await });
         listed.map_err(|e| self.remote.error("list", &path, &e))
@@ -127,7 +129,9 @@ impl Inner {
 
     /// Sends `bytes` bytes, in one request if they are few. Returns `false` if the name was taken.
     fn send(&self, path: &Path, bytes: u64, mut source: impl Read + Send + 'static) -> Result<bool, Error> {
-        let (store, path, parts) = (self.store(), path.clone(), Arc::clone(&self.parts));
+        let store = self.store();
+        let path = path.clone();
+        let parts = Arc::clone(&self.parts);
         if bytes > PART_BYTES as u64 {
             let multipart = self.multipart.clone();
             return self.remote.wait_long(async move { multipart.send(path, source).await.map(|()| true) });
@@ -152,7 +156,8 @@ impl Inner {
 
     /// Reads the current marker with its version.
     fn read_marker(&self) -> Result<Option<(String, UpdateVersion)>, BlobError> {
-        let (store, path) = (self.store(), self.remote.path("IDENTITY"));
+        let store = self.store();
+        let path = self.remote.path("IDENTITY");
         let wanted = path.clone();
         let got = self.remote.wait(async move {
             let got = store.get(&wanted).await?;
@@ -218,7 +223,8 @@ impl Backend for Objects {
     }
 
     fn remove(&self, digest: Digest) -> Result<(), BlobError> {
-        let (store, path) = (self.0.store(), self.0.remote.blob(digest));
+        let store = self.0.store();
+        let path = self.0.remote.blob(digest);
         let wanted = path.clone();
         let removing = async move {
             let late =
@@ -252,7 +258,8 @@ impl Backend for Objects {
     }
 
     fn is_empty(&self) -> Result<bool, BlobError> {
-        let (store, path) = (self.0.store(), self.0.remote.path("sha256"));
+        let store = self.0.store();
+        let path = self.0.remote.path("sha256");
         let wanted = path.clone();
         let first = self.0.remote.wait(async move { store.list(Some(&wanted)).try_next().await });
         first.map(|first| first.is_none()).map_err(|e| self.0.remote.error("list", &path, &e))
@@ -306,7 +313,9 @@ impl Backend for Objects {
         if self.0.create_marker(&text)? {
             return Err(self.0.remote.no_conditions(&path));
         }
-        let (store, wanted, marker) = (self.0.store(), path.clone(), marker.to_owned());
+        let store = self.0.store();
+        let wanted = path.clone();
+        let marker = marker.to_owned();
         let put = self.0.remote.wait(async move {
             store.put_opts(&wanted, marker.into_bytes().into(), PutOptions::from(PutMode::Update(version))).await
         });
@@ -370,7 +379,9 @@ impl Read for Ranges {
         let length = self.next.max(out.len()).min(READ_BYTES);
         self.next = length.saturating_mul(2);
         let range = self.at..self.end.min(self.at + length as u64);
-        let (store, path, wanted) = (Arc::clone(&self.remote.store), self.path.clone(), range.clone());
+        let store = Arc::clone(&self.remote.store);
+        let path = self.path.clone();
+        let wanted = range.clone();
         let part = self.remote.wait_long(async move { store.get_range(&path, wanted).await });
         let part = part.map_err(|e| match self.remote.error("read", &self.path, &e) {
             BlobError::Unreachable(message) => io::Error::new(io::ErrorKind::HostUnreachable, message),

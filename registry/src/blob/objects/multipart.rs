@@ -117,7 +117,9 @@ impl Multipart {
             if part.is_empty() {
                 break;
             }
-            let (store, object, upload) = (Arc::clone(&self.remote.store), object.clone(), upload.to_owned());
+            let store = Arc::clone(&self.remote.store);
+            let object = object.clone();
+            let upload = upload.to_owned();
             under_way.spawn(async move {
                 let put = store.put_part(&object, &upload, number, PutPayload::from(part)).await;
                 drop(room);
@@ -137,8 +139,10 @@ impl Multipart {
 
     /// Reads the records that belong to no upload of this process.
     fn left(&self) -> Result<Vec<(Path, Option<Unfinished>)>, BlobError> {
-        let (store, folder) = (Arc::clone(&self.remote.store), self.remote.path("uploads"));
-        let (wanted, own) = (folder.clone(), Arc::clone(&self.own));
+        let store = Arc::clone(&self.remote.store);
+        let folder = self.remote.path("uploads");
+        let wanted = folder.clone();
+        let own = Arc::clone(&self.own);
         let read = self.remote.wait(async move {
             let listed: Vec<_> = store.list(Some(&wanted)).try_collect().await?;
             let mut left = Vec::new();
@@ -162,7 +166,8 @@ impl Multipart {
     pub(super) fn unfinished(&self) -> Result<Vec<String>, BlobError> {
         let describe = |(record, content): (Path, Option<Unfinished>)| match content {
             Some(content) => {
-                let (object, begun) = (Path::from(content.object), clock::format_ms(content.begun_ms));
+                let object = Path::from(content.object);
+                let begun = clock::format_ms(content.begun_ms);
                 format!("an upload in parts to `{}` began at {begun} and has not ended", self.remote.shown(&object))
             }
             None => format!("`{}` is not the record of an upload and is left alone", self.remote.shown(&record)),
@@ -175,8 +180,10 @@ impl Multipart {
         let mut ended = 0;
         for (record, content) in self.left()? {
             let Some(Unfinished { object, upload, .. }) = content else { continue };
-            let (store, object) = (Arc::clone(&self.remote.store), Path::from(object));
-            let (of, at) = (object.clone(), record.clone());
+            let store = Arc::clone(&self.remote.store);
+            let object = Path::from(object);
+            let of = object.clone();
+            let at = record.clone();
             let done = self.remote.wait(async move { end(&*store, &of, &upload, &at).await });
             done.map_err(|e| self.remote.error("end the upload of", &object, &e))?;
             ended += 1;

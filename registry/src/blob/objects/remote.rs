@@ -133,7 +133,8 @@ impl Remote {
             max_retries: RETRIES,
             retry_timeout: RETRY,
         };
-        let (connect, request) = (ClientConfigKey::ConnectTimeout, ClientConfigKey::Timeout);
+        let connect = ClientConfigKey::ConnectTimeout;
+        let request = ClientConfigKey::Timeout;
         let store: Arc<dyn Bucket> = match kind.scheme {
             "s3" => Arc::new(
                 AmazonS3Builder::from_env()
@@ -259,7 +260,9 @@ impl Remote {
 
     /// Translates a failed request into a message with a remedy; `did` names the operation on the object at `path`.
     pub(super) fn error(&self, did: &str, path: &Path, e: &Error) -> BlobError {
-        let (text, kind, bucket) = (innermost(e), self.kind, &self.bucket);
+        let text = innermost(e);
+        let kind = self.kind;
+        let bucket = &self.bucket;
         let what = format!("failed to {did} `{}`", self.shown(path));
         let mentions = |words: &[&str]| words.iter().any(|word| text.contains(word));
         if mentions(&["NoSuchBucket", "ContainerNotFound", "bucket does not exist"]) {
@@ -271,7 +274,8 @@ impl Remote {
             return BlobError::Storage(format!("{what}: there are no credentials in the environment; set {set}"));
         }
         if mentions(&["URL scheme is not allowed"]) {
-            let (endpoint, http) = (kind.endpoint, kind.http);
+            let endpoint = kind.endpoint;
+            let http = kind.http;
             return BlobError::Storage(format!("{what}: {endpoint} is not https; use https, or set {http}"));
         }
         // A refused listing arrives as a generic error.

@@ -57,7 +57,8 @@ pub(crate) fn start(
     allowances: Allowances,
 ) -> (Arc<ActorHandle>, JoinHandle<()>) {
     let Recovered { snapshot, state } = recovered;
-    let (now, snapshot_at) = (state.now, state.seq);
+    let now = state.now;
+    let snapshot_at = state.seq;
     let batches = Batches::new(state);
     let front = Arc::clone(batches.front());
     let (actor_handle, queue) = ActorHandle::new(store, secrets, now, front, tokens, snapshot, allowances);
@@ -143,7 +144,8 @@ impl Actor {
         let is_over = self.snapshot.as_ref().is_none_or(JoinHandle::is_finished);
         if is_over && state.seq >= self.snapshot_at + state.policy.snapshot_every {
             self.snapshot_at = state.seq;
-            let (actor_handle, state) = (Arc::clone(&self.actor_handle), Arc::clone(state));
+            let actor_handle = Arc::clone(&self.actor_handle);
+            let state = Arc::clone(state);
             let storing = async move { snapshot(&actor_handle, &state).await };
             self.snapshot = Some(self.actor_handle.spawn("a snapshot task", storing));
         }
@@ -168,12 +170,14 @@ pub(crate) async fn snapshot(actor_handle: &ActorHandle, state: &Arc<State>) {
 
 async fn store_snapshot(store: &Store, before: &Arc<State>, state: &Arc<State>) -> Result<(), WriteError> {
     let seq = state.seq;
-    let (old, new) = (Arc::clone(before), Arc::clone(state));
+    let old = Arc::clone(before);
+    let new = Arc::clone(state);
     let mut changed = blocking(move || journal::changed_parts(&old, &new)).await.into_iter();
     // Other writes can run between these transactions.
     loop {
         let (parts, rest) = blocking(move || {
-            let (mut parts, mut bytes) = (Vec::new(), 0);
+            let mut parts = Vec::new();
+            let mut bytes = 0;
             while bytes < SNAPSHOT_BYTES
                 && let Some(part) = changed.next()
             {

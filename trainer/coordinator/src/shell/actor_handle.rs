@@ -382,7 +382,8 @@ impl ActorHandle {
 
     /// Current records as group `sees` sees them, or all of them.
     pub(crate) fn records_for(&self, sees: Option<Group>) -> Records {
-        let (state, now) = (self.state(), self.now());
+        let state = self.state();
+        let now = self.now();
         Records::new(self.seen_store(sees.as_ref()), state, now, sees)
     }
 

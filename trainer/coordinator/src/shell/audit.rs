@@ -227,7 +227,8 @@ mod tests {
     #[test]
     fn a_crowd_of_addresses_is_bounded_and_every_call_is_counted() {
         let audit = Audit::default();
-        let (mut lines, calls) = (Vec::new(), 20_000);
+        let mut lines = Vec::new();
+        let calls = 20_000;
         for i in 0..calls {
             refused(&audit, i);
             if i % 500 == 0 {

@@ -157,7 +157,8 @@ fn drawing(draw: &Draw) -> Result<Pipeline, Failure> {
         _ => draw.models.iter().map(|model| (model.as_str(), model.clone())).collect::<Vec<_>>(),
     };
     if !(1..=limits::DRAW_SENTENCES).contains(&draw.sentences.len()) {
-        let (count, most) = (draw.sentences.len(), limits::DRAW_SENTENCES);
+        let count = draw.sentences.len();
+        let most = limits::DRAW_SENTENCES;
         return Err(Failure::invalid(format!("{count} `sentences`; expected 1 to {most}")));
     }
     if !(1..=limits::DRAW_COUNT).contains(&draw.count) {

@@ -96,7 +96,8 @@ async fn looked_up(actor_handle: &ActorHandle, key: Digest) -> Result<Event, Que
 /// recomputed, which repairs it.
 async fn known(actor_handle: &ActorHandle, key: Digest) -> Result<Option<(Known, (RunId, StageName))>, QueryError> {
     let Some(row) = actor_handle.store.stage_result(key).await? else { return Ok(None) };
-    let (blobs, outputs) = (actor_handle.store.blobs().clone(), row.outputs.clone());
+    let blobs = actor_handle.store.blobs().clone();
+    let outputs = row.outputs.clone();
     let look = move || outputs.values().find_map(|output| blobs.flaw(*output).transpose()).transpose();
     let flaw = actor_handle.store.ask_blobs(look).await.map_err(|e| QueryError::Blob(e.to_string()))?;
     if let Some(flaw) = &flaw {
@@ -133,7 +134,8 @@ async fn register(
 }
 
 async fn try_to_register(actor_handle: &ActorHandle, key: Digest, candidates: &[Candidate]) -> Result<(), Unbundled> {
-    let (blobs, candidates) = (actor_handle.store.blobs().clone(), candidates.to_vec());
+    let blobs = actor_handle.store.blobs().clone();
+    let candidates = candidates.to_vec();
     let event = match actor_handle.store.ask_blobs(move || bundles(&blobs, &candidates)).await {
         Ok((bundles, protected)) => {
             tell(actor_handle, Event::Bundled { key, bundles }).await;
@@ -197,7 +199,8 @@ pub(crate) async fn let_go(actor_handle: &ActorHandle) {
 pub(crate) async fn tick(actor_handle: Arc<ActorHandle>, every_ms: u64, mut stopped: watch::Receiver<bool>) {
     let every = Duration::from_millis(every_ms.max(1));
     let mut collected = tokio::time::Instant::now();
-    let (mut overslept, mut pending) = (Duration::ZERO, None::<tokio::task::JoinHandle<()>>);
+    let mut overslept = Duration::ZERO;
+    let mut pending = None::<tokio::task::JoinHandle<()>>;
     loop {
         let begun = tokio::time::Instant::now();
         tokio::select! {

@@ -52,7 +52,9 @@ impl Failure {
     /// Formats the refusal as a whole HTTP answer, for a request that is not read.
     pub(crate) fn to_http(&self) -> Vec<u8> {
         let body = self.body();
-        let (status, length, kind) = (self.status, body.len(), Problem::CONTENT_TYPE);
+        let status = self.status;
+        let length = body.len();
+        let kind = Problem::CONTENT_TYPE;
         let head =
             format!("HTTP/1.1 {status}\r\ncontent-type: {kind}\r\nconnection: close\r\ncontent-length: {length}");
         format!("{head}\r\n\r\n{body}").into_bytes()

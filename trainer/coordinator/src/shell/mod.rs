@@ -195,7 +195,8 @@ impl Coordinator {
             .await
             .map_err(listen(config.listen))?;
         let address = main.address().map_err(listen(config.listen))?;
-        let (mut listeners, mut local) = (vec![main], address);
+        let mut listeners = vec![main];
+        let mut local = address;
         if config.tls.is_some() || !config.listen.ip().is_loopback() {
             // For commands on this machine, which do not know the server's names or its certificate.
             let here = SocketAddr::from((Ipv4Addr::LOCALHOST, 0));
@@ -213,7 +214,8 @@ impl Coordinator {
 
         let log = AuditLog::of(store.dir());
         let key = store.server_key().map_err(StartError::Key)?;
-        let (secrets, sessions) = (Secrets::new(key), Arc::new(Sessions::new(Secrets::new(key))));
+        let secrets = Secrets::new(key);
+        let sessions = Arc::new(Sessions::new(Secrets::new(key)));
         let (actor_handle, actor) =
             actor::start(store, recovered, secrets, Arc::clone(&tokens), config.allowances.clone());
         actor_handle.decide(Event::Started { alone: config.alone, park: config.park }).await?;

@@ -59,7 +59,8 @@ pub(super) async fn watch(actor_handle: Arc<ActorHandle>, quiet: Duration) {
     let mut standing: BTreeMap<Digest, Standing> = BTreeMap::new();
     // An error means that the coordinator has ended.
     while timeout(LOOK.min(quiet / 10), stopped.wait_for(|stop| *stop)).await.is_err() {
-        let (state, now) = (actor_handle.state(), Instant::now());
+        let state = actor_handle.state();
+        let now = Instant::now();
         let mut seen = BTreeMap::new();
         for (key, execution) in state.executions.iter() {
             let Some(pace) = Pace::of(&state, execution) else { continue };

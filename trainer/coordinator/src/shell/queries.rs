@@ -287,7 +287,8 @@ pub(crate) async fn logs(
     Query(query): Query<LogQuery>,
 ) -> Result<Json<Vec<LogRow>>, Failure> {
     let _turn = turn(&actor_handle).await?;
-    let (records, stage) = (actor_handle.records_for(caller.sees()), query.stage.as_ref());
+    let records = actor_handle.records_for(caller.sees());
+    let stage = query.stage.as_ref();
     Ok(Json(match query.last {
         Some(limit) => records.last_logs(&run, stage, limit).await?,
         None => records.logs(&run, stage, query.after, query.limit).await?,

@@ -52,7 +52,8 @@ mod tests {
 
     #[test]
     fn a_token_makes_its_calls_a_second_and_no_other_waits_for_it() {
-        let (rates, begun) = (Rates::new(5), Instant::now());
+        let rates = Rates::new(5);
+        let begun = Instant::now();
         let made = |caller, now| (0..1000).take_while(|_| rates.take(caller, now).is_ok()).count();
         assert_eq!(made("a", begun), 50, "what was saved up");
         assert_eq!(made("b", begun), 50, "another's");

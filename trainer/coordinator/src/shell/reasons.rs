@@ -96,14 +96,16 @@ fn value_in_words(value: &Value) -> String {
 
 /// Settings that differ, by path.
 fn changes(before: &Value, after: &Value) -> Vec<SettingChange> {
-    let (mut old, mut new) = (BTreeMap::new(), BTreeMap::new());
+    let mut old = BTreeMap::new();
+    let mut new = BTreeMap::new();
     flatten(before, String::new(), &mut old);
     flatten(after, String::new(), &mut new);
     let paths: BTreeSet<&String> = old.keys().chain(new.keys()).collect();
     let mut changes = Vec::new();
     for path in paths {
         let value = |settings: &BTreeMap<String, &Value>| settings.get(path).copied().cloned().unwrap_or(Value::Null);
-        let (from, to) = (value(&old), value(&new));
+        let from = value(&old);
+        let to = value(&new);
         // `1` and `1.0` are the same setting.
         if value_in_words(&from) != value_in_words(&to) {
             changes.push(SettingChange { path: path.clone(), from, to });

@@ -180,7 +180,8 @@ impl Records {
         after: i64,
         limit: u32,
     ) -> Result<Vec<LogRow>, Refused> {
-        let (mut rows, limit) = (Vec::new(), limit.min(limits::LINES_READ));
+        let mut rows = Vec::new();
+        let limit = limit.min(limits::LINES_READ);
         for (_, (run, stage)) in self.sources(run, stage).await? {
             rows.extend(self.store.logs(&run, Some(&stage), after, limit).await.map_err(WriteError::from)?);
         }
@@ -194,7 +195,8 @@ impl Records {
     /// # Errors
     /// If there is no such run or stage, or the tables do not read.
     pub async fn last_logs(&self, run: &RunId, stage: Option<&StageName>, limit: u32) -> Result<Vec<LogRow>, Refused> {
-        let (mut rows, limit) = (Vec::new(), limit.min(limits::LINES_READ));
+        let mut rows = Vec::new();
+        let limit = limit.min(limits::LINES_READ);
         for (_, (run, stage)) in self.sources(run, stage).await? {
             rows.extend(self.store.last_logs(&run, Some(&stage), limit).await.map_err(WriteError::from)?);
         }

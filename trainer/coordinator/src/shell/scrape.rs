@@ -53,7 +53,8 @@ fn plain(open: &str) -> String {
 }
 
 fn registry(actor_handle: &ActorHandle) -> Registry {
-    let (state, meters) = (actor_handle.state(), &actor_handle.meters);
+    let state = actor_handle.state();
+    let meters = &actor_handle.meters;
     let mut registry = Registry::with_prefix("stride");
     registry.register("answers", "Answers to calls by class of status", meters.answers.clone());
     let help = "Time until a transaction of decisions is on disk";

@@ -88,7 +88,8 @@ async fn as_submitted(records: &Records, run: &RunId, view: &RunView) -> Result<
         why: None,
     });
     let stages = stages.collect();
-    let (previous, missing) = (None, Vec::new());
+    let previous = None;
+    let missing = Vec::new();
     Ok(RunSettings { run: run.clone(), previous, missing, seed: pipeline.seed, source: row.source, stages })
 }
 

@@ -23,7 +23,8 @@ pub(crate) async fn request(request: Request, next: Next) -> Response {
 }
 
 fn span(request: &Request) -> Span {
-    let (method, path) = (request.method(), request.extensions().get::<MatchedPath>());
+    let method = request.method();
+    let path = request.extensions().get::<MatchedPath>();
     // Without a path of the table, as for a page's file, the name must not be of the client's making.
     let path = path.map_or("/", MatchedPath::as_str);
     tracing::trace_span!(

@@ -14,7 +14,8 @@ pub(crate) struct Streams(Mutex<HashMap<String, usize>>);
 impl Streams {
     pub(super) fn enter(&self, name: &str) -> Result<(), Failure> {
         let mut open = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        let (all, own) = (open.values().sum::<usize>(), open.get(name).copied().unwrap_or_default());
+        let all = open.values().sum::<usize>();
+        let own = open.get(name).copied().unwrap_or_default();
         let full = |whose: &str, most| Failure::busy(format!("{most} streams of events of {whose} are open"));
         if own >= limits::STREAMS_OF_TOKEN {
             let failure = full(&format!("the token of `{name}`"), limits::STREAMS_OF_TOKEN);

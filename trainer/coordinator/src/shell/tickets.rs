@@ -123,7 +123,8 @@ impl Tickets {
         else {
             return None;
         };
-        let (until_ms, now_ms) = (until.parse().ok()?, wall_clock().0);
+        let until_ms = until.parse().ok()?;
+        let now_ms = wall_clock().0;
         // A clock far ahead would make tickets that are good for long.
         if now_ms >= until_ms || until_ms > now_ms.saturating_add(2 * LASTS_MS) {
             return None;

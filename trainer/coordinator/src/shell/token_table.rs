@@ -131,12 +131,14 @@ mod tests {
 
     #[tokio::test]
     async fn a_call_ends_with_its_token_and_with_no_other() {
-        let (a, b) = ("0123456789abcdef", "fedcba9876543210");
+        let a = "0123456789abcdef";
+        let b = "fedcba9876543210";
         let read = Scopes::of(&[Scope::Read]);
         let tokens = Arc::new(TokenTable::new(table(&[("a", read, a), ("b", read, b)]), Vec::new()));
         let find = |token| tokens.find(digest_of(token));
         let standing = |token| Standing::new(Arc::clone(&tokens), digest_of(token), find(token).unwrap());
-        let (mut first, second) = (standing(a), standing(b));
+        let mut first = standing(a);
+        let second = standing(b);
         assert!(first.still_holds());
         let lost = tokio::spawn(second.lost());
         tokens.replace(table(&[("a", read, a)]));

@@ -66,7 +66,8 @@ pub(crate) async fn metrics(
 ) -> Result<Json<()>, Failure> {
     proof.of_grant(&actor_handle.secrets, &batch.grant)?;
     actor_handle.state().check_telemetry(&batch.grant)?;
-    let (run, most) = (run_of(&batch.grant), actor_handle.allowances.values);
+    let run = run_of(&batch.grant);
+    let most = actor_handle.allowances.values;
     if actor_handle.store.usage(&run).await?.values + batch.rows.len() as u64 > most {
         return Err(used_up(format!("run `{run}` has recorded {most} values, which is its limit"), "--max-values"));
     }
@@ -83,7 +84,8 @@ pub(crate) async fn logs(
 ) -> Result<Json<()>, Failure> {
     proof.of_grant(&actor_handle.secrets, &batch.grant)?;
     actor_handle.state().check_telemetry(&batch.grant)?;
-    let (run, most) = (run_of(&batch.grant), actor_handle.allowances.log_bytes);
+    let run = run_of(&batch.grant);
+    let most = actor_handle.allowances.log_bytes;
     let bytes: usize = batch.lines.iter().map(String::len).sum();
     if actor_handle.store.usage(&run).await?.log_bytes + bytes as u64 > most {
         let message = format!("run `{run}` has written {most} bytes of log lines, which is its limit");
@@ -136,7 +138,8 @@ async fn check_blobs(
     let caller = &proof.caller.name;
     let is_own = |(digest, shown): &(&Digest, &String)| actor_handle.secrets.is_receipt(caller, grant, **digest, shown);
     let own: BTreeSet<Digest> = receipts.iter().filter(is_own).map(|(digest, _)| *digest).collect();
-    let (blobs, reach) = (actor_handle.store.blobs().clone(), Arc::clone(&actor_handle.reach));
+    let blobs = actor_handle.store.blobs().clone();
+    let reach = Arc::clone(&actor_handle.reach);
     let looking = move || reach.foreign(&blobs, &roots, |digest| own.contains(&digest), manifest);
     match ask(&actor_handle.store, looking).await? {
         None => Ok(()),
@@ -183,9 +186,11 @@ pub(crate) async fn staged(
     let receipt = headers.get(RECEIPT_HEADER).and_then(|shown| shown.to_str().ok()).map(str::to_owned);
     let receipt = receipt.filter(|shown| actor_handle.secrets.is_receipt(&proof.caller.name, &grant, digest, shown));
     let roots = actor_handle.state().read_by(&grant.task)?;
-    let (blobs, reach) = (actor_handle.store.blobs().clone(), Arc::clone(&actor_handle.reach));
+    let blobs = actor_handle.store.blobs().clone();
+    let reach = Arc::clone(&actor_handle.reach);
     let has_receipt = receipt.is_some();
-    let (store, looked) = (&actor_handle.store, blobs.clone());
+    let store = &actor_handle.store;
+    let looked = blobs.clone();
     // The existence of other blobs is not revealed: the worker either has their bytes or has no use for them.
     let is_known = has_receipt || ask(store, move || reach.includes(&looked, &roots, digest)).await?;
     if is_known {
@@ -221,7 +226,8 @@ pub(crate) async fn put_blob(
         let failure = Failure::new(StatusCode::PAYLOAD_TOO_LARGE, "too-large", message);
         return Err(failure.hint("train a smaller network: its state is one file"));
     }
-    let (store, blobs) = (&actor_handle.store, actor_handle.store.blobs().clone());
+    let store = &actor_handle.store;
+    let blobs = actor_handle.store.blobs().clone();
     let receipt = actor_handle.secrets.receipt(&proof.caller.name, &grant, digest);
     let stored = async {
         let task = grant.task.clone();
@@ -256,7 +262,8 @@ async fn receive(store: &Store, mut arriving: Arriving, body: Body) -> Result<Ar
     let mut ended = false;
     while !ended {
         // A slow sender occupies no thread, and no more memory than one part.
-        let (mut parts, mut length) = (Vec::new(), 0);
+        let mut parts = Vec::new();
+        let mut length = 0;
         while length < PART_BYTES {
             match tokio::time::timeout(BODY_IDLE, body.next()).await {
                 Ok(Some(Ok(part))) => {
@@ -390,7 +397,8 @@ async fn check_read(
         return Ok(());
     }
     let roots = state.readable_by(&process.worker);
-    let (blobs, reach) = (actor_handle.store.blobs().clone(), Arc::clone(&actor_handle.reach));
+    let blobs = actor_handle.store.blobs().clone();
+    let reach = Arc::clone(&actor_handle.reach);
     if ask(&actor_handle.store, move || reach.includes(&blobs, &roots, digest)).await? {
         return Ok(());
     }

@@ -51,7 +51,8 @@ impl Reach {
     }
 
     fn explore(&self, blobs: &BlobStore, root: Digest) -> Result<Arc<Known>, BlobError> {
-        let (mut found, mut queue) = (Known::default(), vec![root]);
+        let mut found = Known::default();
+        let mut queue = vec![root];
         let mut opened = BTreeSet::from([root]);
         while let Some(digest) = queue.pop() {
             found.blobs.insert(digest);
@@ -88,7 +89,8 @@ impl Reach {
         is_uploaded: impl Fn(Digest) -> bool,
         digest: Digest,
     ) -> Result<Option<Digest>, BlobError> {
-        let (mut seen, mut queue) = (BTreeSet::from([digest]), vec![digest]);
+        let mut seen = BTreeSet::from([digest]);
+        let mut queue = vec![digest];
         while let Some(next) = queue.pop() {
             if !is_uploaded(next) {
                 if self.includes(blobs, roots, next)? {

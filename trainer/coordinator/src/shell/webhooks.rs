@@ -130,13 +130,15 @@ impl Sender {
 
     /// Sends a message until it is delivered or given up.
     async fn send(&self, message: &Message) {
-        let (mut wait, meters) = (self.retry, &self.actor_handle.meters);
+        let mut wait = self.retry;
+        let meters = &self.actor_handle.meters;
         for left in (0..TRIES).rev() {
             let now_s = wall_clock().0 / 1000;
             let Err(Undelivered(why)) = self.client.post(&self.hook, message, now_s).await else {
                 return meters.sent("delivered");
             };
-            let (hook, id) = (&self.hook.name, &message.id);
+            let hook = &self.hook.name;
+            let id = &message.id;
             if left == 0 {
                 tracing::warn!(hook, id, "a message was not delivered and is given up: {why}");
                 return meters.sent("given up");

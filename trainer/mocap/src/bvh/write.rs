@@ -61,8 +61,8 @@ fn decimals(value: f64) -> String {
 }
 
 /// The three angles of [`ROTATIONS`] in degrees. `before` are those of the frame before: of all equivalent triples the
-/// nearest to it is returned, so that curves do not jump. With x at 90 degrees up or down only the sum of the other two
-/// is determined; then z keeps its value.
+/// nearest to it is returned, so that curves do not jump. If x is 90 degrees up or down, only the sum of the other two is
+/// determined, and z keeps its value.
 pub fn angles(rotation: Quat, before: [f64; 3]) -> [f64; 3] {
     let m = quat::to_matrix(rotation);
     // R = Rz Rx Ry. Row 2 is (-cos x sin y, sin x, cos x cos y); column 1 is (-sin z cos x, cos z cos x, sin x).

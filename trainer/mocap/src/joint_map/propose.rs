@@ -168,7 +168,8 @@ impl<'a> Shape<'a> {
                         .map(|(c, p)| quat::norm(quat::sub(self.at[*c], self.at[*p])))
                         .collect()
                 };
-                let (one, two) = (lengths(*a), lengths(*b));
+                let one = lengths(*a);
+                let two = lengths(*b);
                 let apart = one.iter().zip(&two).map(|(a, b)| (a - b).abs()).sum::<f64>()
                     / (one.iter().sum::<f64>() + two.iter().sum::<f64>());
                 if best.is_none_or(|(least, _)| apart < least) {

@@ -203,7 +203,8 @@ impl Dataset {
             }
         }
         let narrow = |values: &[f64]| values.iter().map(|v| *v as f32).collect::<Vec<_>>();
-        let (mean, std) = (narrow(&index.mean), narrow(&index.std));
+        let mean = narrow(&index.mean);
+        let std = narrow(&index.std);
         if mean.len() != width || std.len() != width {
             return Err(bad(
                 INDEX,

@@ -28,14 +28,16 @@ impl Floor {
         let bounds = [0, 1].map(|axis| {
             let range = |(low, high): (f64, f64), p: [f64; 2]| (low.min(p[axis]), high.max(p[axis]));
             let (low, high) = places.clone().fold((f64::MAX, f64::MIN), range);
-            let (middle, half) = ((low + high) / 2.0, ((high - low) / 2.0).max(LEAST / 2.0));
+            let middle = (low + high) / 2.0;
+            let half = ((high - low) / 2.0).max(LEAST / 2.0);
             [middle - half, middle + half]
         });
         let extent = |axis: usize| bounds[axis][1] - bounds[axis][0];
         let scale = (size[0] / extent(0)).min(size[1] / extent(1));
         // The floor fills the box.
         let bounds = [0, 1].map(|axis| {
-            let (middle, half) = ((bounds[axis][0] + bounds[axis][1]) / 2.0, size[axis] / scale / 2.0);
+            let middle = (bounds[axis][0] + bounds[axis][1]) / 2.0;
+            let half = size[axis] / scale / 2.0;
             [middle - half, middle + half]
         });
         Self { bounds, centre, scale }
@@ -50,7 +52,8 @@ impl Floor {
     fn grid(&self, canvas: &mut Canvas) -> f64 {
         let step = [0.5, 1.0, 2.0, 5.0].into_iter().find(|step| step * self.scale >= 14.0).unwrap_or(10.0);
         for (axis, [low, high]) in self.bounds.into_iter().enumerate() {
-            let (first, last) = ((low / step).ceil() as i64, (high / step).floor() as i64);
+            let first = (low / step).ceil() as i64;
+            let last = (high / step).floor() as i64;
             for k in first..=last {
                 let value = k as f64 * step;
                 let along = |other: f64| if axis == 0 { [value, other] } else { [other, value] };

@@ -8,7 +8,9 @@ use crate::skeleton::Skeleton;
 /// The turn feature is half the yaw angle, so its sum is the angle of the quaternion itself. Turn and velocity of a row
 /// lead to the next frame; those of the last row are not used.
 pub fn root_path(features: &[f32], skeleton: &Skeleton) -> Vec<(Quat, Vec3)> {
-    let (mut angle, mut x, mut z) = (0.0_f64, 0.0, 0.0);
+    let mut angle = 0.0_f64;
+    let mut x = 0.0;
+    let mut z = 0.0;
     let mut before: Option<&[f32]> = None;
     let mut path = Vec::with_capacity(features.len() / skeleton.features);
     for row in features.chunks_exact(skeleton.features) {

@@ -179,7 +179,8 @@ pub(super) fn joints(pose: &Pose, skeleton: &Skeleton) -> [f64; 66] {
 
     for side in 0..2 {
         let hip = hip(pelvis, side);
-        let (thigh, shank) = (lengths[4 + side], lengths[7 + side]);
+        let thigh = lengths[4 + side];
+        let shank = lengths[7 + side];
         let (knee, ankle, toe) = match pose.legs[side] {
             Leg::Foot { toe, yaw, pitch } => {
                 let target = ankle_of(toe, yaw, pitch, bone(10 + side));
@@ -251,7 +252,8 @@ fn arm(
     let shrug = turn_z(outward * 0.35 * (arm.upper[1] + 0.2).clamp(0.0, 1.0));
     let collar = quat::add(at, quat::rotate(turn, bone(13 + side)));
     let shoulder = quat::add(collar, quat::rotate(quat::mul(turn, shrug), bone(16 + side)));
-    let (upper, fore) = (lengths[18 + side], lengths[20 + side]);
+    let upper = lengths[18 + side];
+    let fore = lengths[20 + side];
     let (elbow, wrist) = match arm.reach {
         Some(target) => two_bones(shoulder, target, [upper, fore], in_chest([0.6, -0.3, -0.6])),
         None => {

@@ -109,7 +109,8 @@ impl Walk {
     /// Follows `gait` for `seconds`, turning to the left by `turn(t)` radians per second.
     pub(super) fn new(gait: Gait, seconds: f64, phase: f64, turn: impl Fn(f64) -> f64) -> Self {
         let steps = ((seconds + 2.0 * MARGIN) / DT) as usize;
-        let (starting, stopping) = (gait.start, gait.stop);
+        let starting = gait.start;
+        let stopping = gait.stop;
         let pace = move |t: f64| {
             let up = if starting > 0.0 { smooth(t / starting) } else { 1.0 };
             let down = if stopping > 0.0 { smooth((seconds - 0.15 - t) / stopping) } else { 1.0 };
@@ -117,7 +118,8 @@ impl Walk {
         };
         // A body that stands before or after has both feet down: a whole number of steps, just landed.
         let strides = |cadence: f64| {
-            let (mut first, mut sum) = (0.0, 0.0);
+            let mut first = 0.0;
+            let mut sum = 0.0;
             for i in 0..steps {
                 let t = i as f64 * DT - MARGIN;
                 sum += cadence * pace(t).sqrt() * DT;
@@ -155,7 +157,9 @@ impl Walk {
 
     fn at(&self, t: f64) -> Point {
         let x = ((t + MARGIN) / DT).clamp(0.0, (self.points.len() - 2) as f64);
-        let (a, b, s) = (self.points[x as usize], self.points[x as usize + 1], x.fract());
+        let a = self.points[x as usize];
+        let b = self.points[x as usize + 1];
+        let s = x.fract();
         Point {
             at: [mix(a.at[0], b.at[0], s), mix(a.at[1], b.at[1], s)],
             yaw: mix(a.yaw, b.yaw, s),

@@ -137,7 +137,8 @@ impl DataFormat {
             ("twelve", Self::Humanml3d) => Ok(TWELVE.to_vec()),
             ("twelve", Self::Kit) => Ok(TWELVE_KIT.to_vec()),
             (name, _) => names.iter().position(|known| *known == name).map(|joint| vec![joint]).ok_or_else(|| {
-                let (skeleton, names) = (self.skeleton(), names.join(", "));
+                let skeleton = self.skeleton();
+                let names = names.join(", ");
                 format!("a skeleton of {skeleton} has no joint `{word}`; its joints are {names}")
             }),
         }

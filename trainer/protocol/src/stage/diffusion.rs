@@ -62,7 +62,8 @@ impl Default for Diffusion {
 
 impl Diffusion {
     pub(super) fn check(&self, p: &mut Problems) {
-        let (first, last) = (self.beta_first, self.beta_last);
+        let first = self.beta_first;
+        let last = self.beta_last;
         if !(first > 0.0 && first <= last && last < 1.0) {
             let message = format!("the betas of `diffusion` are {first} to {last}; expected 0 < first <= last < 1");
             p.add("diffusion.beta_first", message, "published: .00085 to .012 (MLD), .0001 to .02 (StableMoFusion)");

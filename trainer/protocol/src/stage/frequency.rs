@@ -60,7 +60,8 @@ pub struct LowFrequency {
 
 impl Default for LowFrequency {
     fn default() -> Self {
-        let (distance, over) = (Norm::default(), Over::default());
+        let distance = Norm::default();
+        let over = Over::default();
         Self { weight: 0.0, keep: 8, distance, from: 0.6, to: 1.0, masked: true, over }
     }
 }
@@ -119,7 +120,8 @@ impl FrequencyLosses {
     }
 
     pub(super) fn check(&self, p: &mut Problems) {
-        let (low, semantic) = (&self.low_frequency, &self.semantic);
+        let low = &self.low_frequency;
+        let semantic = &self.semantic;
         for (name, from, to) in [("low_frequency", low.from, low.to), ("semantic", semantic.from, semantic.to)] {
             if from > to {
                 let message =

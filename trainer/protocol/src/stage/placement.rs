@@ -193,7 +193,8 @@ mod tests {
                 })
                 .collect();
             let mode = if dice(&mut state).is_multiple_of(2) { Mode::Min } else { Mode::Max };
-            let (latest, best) = (dice(&mut state) as usize % 4, dice(&mut state) as usize % 4);
+            let latest = dice(&mut state) as usize % 4;
+            let best = dice(&mut state) as usize % 4;
             let ended = dice(&mut state) as usize % 3;
             let keep = Keep { latest, ended, best, metric: "joint".into(), mode };
             let is_over = dice(&mut state).is_multiple_of(2);

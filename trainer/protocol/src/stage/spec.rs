@@ -187,7 +187,8 @@ impl<'a> Ref<'a> {
 
     /// Reference to a dataset's folder.
     pub fn dataset(field: &'static str, path: &'a mut String, format: DataFormat) -> Self {
-        let (read, target) = (!path.is_empty(), Target::Dataset(format));
+        let read = !path.is_empty();
+        let target = Target::Dataset(format);
         let origin = match format {
             DataFormat::Humanml3d => "HumanML3D, built from AMASS as described in github.com/EricGuo5513/HumanML3D",
             DataFormat::Kit => "KIT-ML, linked in github.com/EricGuo5513/HumanML3D",

@@ -12,7 +12,8 @@ pub(in crate::synthetic) fn kick(d: &Draw) -> Motion {
     let period = d.seconds / count;
     Box::new(move |t| {
         let u = (t % period - 0.5 * (period - length)) / length;
-        let (foot, other) = (d.side, 1 - d.side);
+        let foot = d.side;
+        let other = 1 - d.side;
         let x = 0.11 * outward(foot);
         let high = 0.55 * d.size;
         let [side, y, z, pitch] = course(

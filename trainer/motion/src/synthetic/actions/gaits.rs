@@ -48,7 +48,8 @@ pub(in crate::synthetic) fn run(d: &Draw) -> Motion {
 
 pub(in crate::synthetic) fn walk_and_turn(d: &Draw) -> Motion {
     let angle = outward(d.side) * mix(1.2, 1.9, d.free[4]);
-    let (from, to) = (0.30 * d.seconds, 0.70 * d.seconds);
+    let from = 0.30 * d.seconds;
+    let to = 0.70 * d.seconds;
     let middle = 0.5 * (from + to);
     let rate = angle / (middle - from);
     let path = gait(d, walking(d), move |t| rate * ramp(t, from, middle) * (1.0 - ramp(t, middle, to)));

@@ -150,7 +150,8 @@ pub(in crate::synthetic) fn pick_up(d: &Draw) -> Motion {
     let time = 1.25 / d.tempo;
     Box::new(move |t| {
         let mut pose = standing(&d, t);
-        let (from, back) = (0.35, d.seconds - 0.5 - time);
+        let from = 0.35;
+        let back = d.seconds - 0.5 - time;
         let down = hold(t, from, from + time, back.max(from + time + 0.1), back.max(from + time + 0.1) + time);
         crouch(&mut pose, 0.40 * down);
         pose.pitch += 0.22 * down;
@@ -174,7 +175,8 @@ pub(in crate::synthetic) fn throw(d: &Draw) -> Motion {
     let start = 0.45 * (d.seconds - length);
     Box::new(move |t| {
         let u = (t - start) / length;
-        let (arm, other) = (d.side, 1 - d.side);
+        let arm = d.side;
+        let other = 1 - d.side;
         let mut pose = standing(&d, t);
         let stance = hold(u, -0.1, 0.3, 0.9, 1.2);
         pose.legs[arm] = pose.legs[arm].moved([0.0, 0.0, -0.14]);
@@ -209,7 +211,8 @@ pub(in crate::synthetic) fn balance(d: &Draw) -> Motion {
     let time = 1.0 / d.tempo;
     Box::new(move |t| {
         let mut pose = standing(&d, t);
-        let (up, on) = (d.side, 1 - d.side);
+        let up = d.side;
+        let on = 1 - d.side;
         let off = hold(t, 0.2, 0.2 + 0.8 * time, d.seconds - 0.9 * time, d.seconds - 0.15);
         let raised = hold(t, 0.5, 0.5 + time, d.seconds - 0.4 - time, d.seconds - 0.4);
         let wobble = raised * (TAU * 0.9 * t).sin();

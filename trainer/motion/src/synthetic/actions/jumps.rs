@@ -50,7 +50,8 @@ pub(in crate::synthetic) fn jump(d: &Draw) -> Motion {
 pub(in crate::synthetic) fn jump_forward(d: &Draw) -> Motion {
     let (d, period) = (d.clone(), jump_period(d).max(1.4));
     Box::new(move |t| {
-        let (n, u) = ((t / period).floor(), (t / period).fract());
+        let n = (t / period).floor();
+        let u = (t / period).fract();
         let (down, up) = jump_cycle(u, 0.28, d.size * ballistic(0.28 * period).min(0.22), JUMP_AIR);
         let mut pose = standing(&d, t);
         crouch(&mut pose, down);
@@ -69,10 +70,12 @@ pub(in crate::synthetic) fn hop(d: &Draw) -> Motion {
     let count = (d.seconds / (0.75 / d.tempo)).round().max(1.0);
     let period = d.seconds / count;
     Box::new(move |t| {
-        let (n, u) = ((t / period).floor(), (t / period).fract());
+        let n = (t / period).floor();
+        let u = (t / period).fract();
         let (down, up) = jump_cycle(u, 0.10, d.size * ballistic(0.42 * period), HOP_AIR);
         let mut pose = standing(&d, t);
-        let (on, off) = (d.side, 1 - d.side);
+        let on = d.side;
+        let off = 1 - d.side;
         pose.pelvis[0] += 0.085 * outward(on);
         pose.roll = 0.06 * outward(on);
         crouch(&mut pose, 0.03 + down);
