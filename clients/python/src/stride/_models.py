@@ -54,7 +54,7 @@ class HistoryRow(Answer):
     step: int | None = None
     task: str | None = None
     why: str | None = None
-    """The reason."""
+    """Reason that the actor gave."""
     worker: str | None = None
 
 
