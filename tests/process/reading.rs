@@ -165,7 +165,7 @@ fn a_plan_says_what_is_missing_and_what_a_run_would_take() {
         }
     }
     let table = bench.run(&["plan", &smoke]).expect_code(0).stdout;
-    assert!(table.contains("with one worker") && table.contains("clips per stage"), "{table}");
+    assert!(table.contains("with one worker") && table.contains("updates per stage"), "{table}");
 
     // Settings that would otherwise fail hours later.
     let kit = bench.path().join("kit");

@@ -48,6 +48,16 @@ pub(crate) struct Plan {
     pub(crate) device: String,
     /// Default number of worker processes of `run`.
     pub(crate) workers: usize,
+    /// An earlier run whose times are those that this one needs, if the store has one.
+    before: Option<Before>,
+}
+
+/// The work of an earlier run on the stages that would run now.
+#[derive(Debug, PartialEq, Serialize)]
+struct Before {
+    run: RunId,
+    /// Seconds on its stages, one after the other, at the present number of steps.
+    seconds: f64,
 }
 
 impl Plan {
@@ -99,22 +109,23 @@ impl Plan {
         let (mut seconds, mut untried) = (0.0, 0);
         for step in runs {
             seconds += step.seconds.unwrap_or(0.0);
-            // Stages of other kinds take negligible time.
-            let long = ["train.", "distill.", "encode.", "evaluate."].iter().any(|kind| step.kind.starts_with(kind));
-            untried += usize::from(step.seconds.is_none() && long);
+            untried += usize::from(step.seconds.is_none() && takes_long(step.kind));
+        }
+        let mut text = String::new();
+        if let Some(Before { run, seconds }) = &self.before {
+            text.push_str(&format!("\nrun {run} worked {} on these stages\n", long(*seconds)));
         }
         if seconds == 0.0 {
-            return String::new();
+            return text;
         }
         let wall = seconds / self.workers.max(1) as f64;
-        let mut text = format!(
-            "\nabout {} with one worker, at best {} with {}; estimated by {} updates on {} clips per stage\n",
+        text.push_str(&format!(
+            "\nabout {} with one worker on an idle machine, at best {} with {}; estimated by {} updates per stage\n",
             long(seconds),
             long(wall),
             self.workers,
             stages::run::estimate::STEPS - 1,
-            stages::run::estimate::EXAMPLES,
-        );
+        ));
         if untried > 0 {
             text.push_str(&format!(
                 "without {} that could not be estimated within the time limit of a plan\n",
@@ -123,6 +134,11 @@ impl Plan {
         }
         text
     }
+}
+
+/// Returns false for stages whose kind takes negligible time.
+fn takes_long(kind: &str) -> bool {
+    ["train.", "distill.", "encode.", "evaluate."].iter().any(|of| kind.starts_with(of))
 }
 
 /// Width of a screen.
@@ -239,10 +255,12 @@ pub(crate) async fn plan(pipeline: &Pipeline, store: Option<&ReadStore>) -> Resu
     let now = known(pipeline, store).await?;
     let mut resumable = BTreeMap::new();
     let mut earlier = Vec::new();
+    let mut finished = None;
     if let Some(store) = store {
         let runs = store.runs().await?;
         resumable = checkpoints(pipeline, &now, store, &runs).await?;
         earlier = earlier_runs(&pipeline.name, runs);
+        finished = worked(&earlier, store).await?;
     }
     let mut running: BTreeSet<&StageName> = BTreeSet::new();
     let mut stages = Vec::new();
@@ -284,6 +302,7 @@ pub(crate) async fn plan(pipeline: &Pipeline, store: Option<&ReadStore>) -> Resu
     let device = models::device::available().into_iter().find(|device| device.backend == backend);
     // The part of a note before its first comma, such as `CPU`.
     let device = device.and_then(|device| device.note.split(',').next().map(str::to_owned)).unwrap_or_default();
+    let before = finished.and_then(|(run, worked)| Some(Before { run, seconds: needed(&stages, &worked)? }));
     Ok(Plan {
         schema_version: 1,
         pipeline: pipeline.name.clone(),
@@ -291,6 +310,7 @@ pub(crate) async fn plan(pipeline: &Pipeline, store: Option<&ReadStore>) -> Resu
         missing: Vec::new(),
         device: format!("{} ({device})", backend.name()),
         workers: fleet::default_size(backend),
+        before,
     })
 }
 
@@ -342,16 +362,54 @@ fn has_ended(row: &RunRow) -> bool {
     serde_json::from_value(Value::String(row.state.clone())).is_ok_and(RunState::is_final)
 }
 
-/// The pipelines of earlier runs of this name, newest first. Skips runs of another build that do not parse.
-fn earlier_runs(name: &str, mut rows: Vec<RunRow>) -> Vec<Pipeline> {
+/// Earlier runs of this name with their pipelines, newest first. Skips runs of another build that do not parse.
+fn earlier_runs(name: &str, mut rows: Vec<RunRow>) -> Vec<(RunRow, Pipeline)> {
     rows.retain(|row| row.pipeline.get("name").and_then(Value::as_str) == Some(name));
     rows.sort_by_key(|row| std::cmp::Reverse(row.created_ms));
-    rows.into_iter().filter_map(|row| serde_json::from_value(row.pipeline).ok()).collect()
+    let parsed = |row: RunRow| serde_json::from_value(row.pipeline.clone()).ok().map(|pipeline| (row, pipeline));
+    rows.into_iter().filter_map(parsed).collect()
+}
+
+/// The work on a stage of an earlier run.
+#[derive(Debug)]
+struct Work {
+    kind: &'static str,
+    steps: Option<u64>,
+    seconds: f64,
+}
+
+/// The newest of these runs that finished, with the work on its stages.
+async fn worked(
+    earlier: &[(RunRow, Pipeline)],
+    store: &ReadStore,
+) -> Result<Option<(RunId, BTreeMap<StageName, Work>)>> {
+    let finished = earlier.iter().find(|(row, _)| row.state == RunState::Finished.name());
+    let Some((row, pipeline)) = finished else { return Ok(None) };
+    let keys = known(pipeline, Some(store)).await?.keys;
+    let mut found = BTreeMap::new();
+    for stage in &pipeline.stages {
+        let Some(key) = keys.get(&stage.name) else { continue };
+        let Some(result) = store.stage_result(*key).await? else { continue };
+        let steps = stage.settings.steps().map(|steps| steps.0);
+        found.insert(stage.name.clone(), Work { kind: stage.settings.kind(), steps, seconds: result.wall_s });
+    }
+    Ok(Some((row.run.clone(), found)))
+}
+
+/// Seconds that the stages of a plan need by the pace of an earlier run; `None` if it lacks one that takes long.
+fn needed(stages: &[Step], worked: &BTreeMap<StageName, Work>) -> Option<f64> {
+    let mut seconds = 0.0;
+    for step in stages.iter().filter(|step| step.action != "cached" && takes_long(step.kind)) {
+        let work = worked.get(&step.stage).filter(|work| work.kind == step.kind)?;
+        let more = step.steps.zip(work.steps).map_or(1.0, |(now, then)| now as f64 / then.max(1) as f64);
+        seconds += work.seconds * more;
+    }
+    (seconds > 0.0).then_some(seconds)
 }
 
 /// Describes the differences of a stage from the same stage in the newest run of that name.
-fn difference(pipeline: &Pipeline, stage: &PipelineStage, earlier: &[Pipeline]) -> String {
-    let before = earlier.iter().find_map(|other| Some((other, other.stage(&stage.name)?)));
+fn difference(pipeline: &Pipeline, stage: &PipelineStage, earlier: &[(RunRow, Pipeline)]) -> String {
+    let before = earlier.iter().find_map(|(_, other)| Some((other, other.stage(&stage.name)?)));
     let Some((other, before)) = before else { return "never run".into() };
     if before.settings.kind() != stage.settings.kind() {
         return format!("kind changed: {} -> {}", before.settings.kind(), stage.settings.kind());
@@ -432,6 +490,32 @@ mod tests {
         assert_eq!(why(&["name=q"]), "never run");
     }
 
+    #[test]
+    fn an_earlier_run_tells_what_a_longer_one_needs() {
+        let step = |stage: &str, kind, action, steps| Step {
+            stage: stage.into(),
+            kind,
+            action,
+            why: String::new(),
+            key: None,
+            steps,
+            parameters: None,
+            seconds: None,
+        };
+        let now = [
+            step("dataset", "data.synthetic", "cached", None),
+            step("vae", "train.vae", "run", Some(300)),
+            step("fid", "evaluate.latent_fid", "run", None),
+        ];
+        let work = |kind, steps, seconds| Work { kind, steps, seconds };
+        let vae = || ("vae".into(), work("train.vae", Some(100), 20.0));
+        let fid = |kind| ("fid".into(), work(kind, None, 5.0));
+        assert_eq!(needed(&now, &BTreeMap::from([vae(), fid("evaluate.latent_fid")])), Some(65.0));
+        assert_eq!(needed(&now, &BTreeMap::from([vae(), fid("evaluate.recognition")])), None, "of another kind");
+        assert_eq!(needed(&now, &BTreeMap::from([vae()])), None, "it lacks a stage");
+        assert_eq!(needed(&now[..1], &BTreeMap::from([vae()])), None, "nothing runs");
+    }
+
     #[tokio::test]
     async fn a_recipe_without_its_data_is_one_screen() {
         let file = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../configs/motionpcm.yaml");
@@ -455,7 +539,7 @@ mod tests {
             "Sentence-T5, such as huggingface.co/",
             "flex (CPU",
             "1,150,000  18.06M      139 days",
-            "about 139 days with one worker",
+            "about 139 days with one worker on an idle machine",
             "that could not be estimated",
         ] {
             assert!(screen.contains(part), "`{part}` is missing");

@@ -24,6 +24,14 @@ pub enum Backend {
 }
 
 impl Backend {
+    /// Returns true if it computes on the processor, in the threads that call it.
+    pub fn is_cpu(self) -> bool {
+        match self {
+            Self::Flex | Self::Ndarray => true,
+            Self::Wgpu | Self::Cuda => false,
+        }
+    }
+
     /// Name in YAML and on the command line.
     pub fn name(self) -> &'static str {
         match self {

@@ -2,9 +2,10 @@
 //! timed.
 //!
 //! It reads only the pipeline and keeps nothing, so a pipeline has an estimate before its data exists. A training stage
-//! makes a few updates of a slice of two examples; the time of an update is that of its batch at this pace. An
-//! evaluation draws a few motions. Both are paces of small batches, which a large one may exceed, of clips with
-//! HumanML3D's mean length, on one thread. Published text encoders are not run: the built-in one replaces them, with
+//! makes a few updates of a slice of two examples, or of more if they take little time. The time of an update is that of
+//! its batch at this pace. An evaluation draws a few motions. Both are paces of small batches, which a large one may
+//! exceed, of clips with HumanML3D's mean length, on one thread. On a processor they are the thread's own time, so an
+//! estimate is that of an idle machine even if this one is loaded. Published text encoders are not run: the built-in one replaces them, with
 //! vectors of its own width. The teacher's samples for `match` are left out.
 //!
 //! Not a stage: it reads the clock.
@@ -21,6 +22,7 @@ use protocol::stage::{CheckpointPolicy, Sampler, Shape, Split, StageSettings};
 use protocol::{ArtifactKind, Digest, Manifest, RunId, StageName, Steps};
 use serde_json::{Value, json};
 
+use super::clock::Clock;
 use super::solo::{Overlay, Solo};
 use crate::artifacts::MODEL_FILE;
 use crate::context::{AttemptContext, Outcome, Part, StageError};
@@ -29,7 +31,12 @@ use crate::kinds;
 /// Number of updates made; the first is not timed.
 pub const STEPS: u64 = 4;
 /// Number of examples in each update.
-pub const EXAMPLES: usize = 2;
+const EXAMPLES: usize = 2;
+/// Number of examples in each update of a stage that updates quickly. A small network takes less time per example in a
+/// larger slice.
+const MANY: usize = 16;
+/// Time of an update of [`EXAMPLES`] up to which a stage is tried again with [`MANY`].
+const QUICK: f64 = 0.1;
 /// Samplers with more steps are timed with this many and with half of them.
 const SAMPLED: usize = 4;
 
@@ -116,10 +123,19 @@ impl Tries<'_> {
         let inputs = self.inputs(stage)?;
         let tried = |settings: StageSettings| self.run(stage, settings, inputs.clone());
         let (output, seconds) = if settings.training().is_some() {
-            let (reduced, share) = reduced_training(settings)?;
-            let tried = tried(reduced)?;
+            let update = |examples| -> Result<Tried, StageError> {
+                let (reduced, share) = reduced_training(settings, examples)?;
+                let found = tried(reduced)?;
+                Ok(Tried { pace: found.pace.map(|pace| pace * share), ..found })
+            };
+            let few = update(EXAMPLES)?;
+            let global = settings.training().map_or(0, |training| training.batch.global);
+            let is_quick = few.pace.is_some_and(|pace| pace * EXAMPLES as f64 <= QUICK * global as f64);
+            // If more examples cannot be tried, the few have to do.
+            let many = (is_quick && global > EXAMPLES).then(|| update(MANY).ok()).flatten();
+            let pace = many.and_then(|many| many.pace).or(few.pace);
             let steps = settings.steps().map_or(0, |steps| steps.0) as f64;
-            (tried.output, tried.pace.map(|pace| pace * share * steps * trainings(stage)))
+            (few.output, pace.map(|pace| pace * steps * trainings(stage)))
         } else {
             match settings.sampler() {
                 // The time of longer samplers is extrapolated linearly in the steps.
@@ -175,6 +191,7 @@ impl Tries<'_> {
     ) -> Result<Tried, StageError> {
         let shape = settings.shape();
         let mut cx = self.solo(stage, settings, inputs);
+        cx.clock = Clock::of(self.pipeline.backend);
         let given = |outcome| match outcome {
             Outcome::Finished { output, .. } => Ok(output),
             Outcome::Yielded { at } => Err(StageError::Fault(format!("the stage stopped after {at} steps"))),
@@ -191,7 +208,7 @@ impl Tries<'_> {
                 }
             }
         };
-        let between = cx.progressed.windows(2).map(|pair| (pair[1] - pair[0]).as_secs_f64());
+        let between = cx.progressed.windows(2).map(|pair| pair[1].saturating_sub(pair[0]).as_secs_f64());
         let paces: Vec<f64> = between.collect();
         let pace = (!paces.is_empty()).then(|| paces.iter().sum::<f64>() / paces.len() as f64);
         Ok(Tried { output, pace })
@@ -249,10 +266,10 @@ fn trainings(stage: &PipelineStage) -> f64 {
     steps as f64 / budget as f64
 }
 
-/// The settings with one slice of few examples and few steps, and the number of such slices in a batch.
-fn reduced_training(settings: &StageSettings) -> Result<(StageSettings, f64), StageError> {
+/// The settings with one slice of at most `examples` and few steps, and the number of such slices in a batch.
+fn reduced_training(settings: &StageSettings, examples: usize) -> Result<(StageSettings, f64), StageError> {
     let Some(training) = settings.training() else { return Err(StageError::Fault("the stage does not train".into())) };
-    let examples = training.batch.global.clamp(1, EXAMPLES);
+    let examples = training.batch.global.clamp(1, examples);
     let share = training.batch.global as f64 / examples as f64;
     let mut json = to_json(settings)?;
     json["steps"] = json!(STEPS);

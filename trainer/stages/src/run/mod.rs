@@ -1,5 +1,6 @@
 //! Running stages outside a worker: to verify a result, and to estimate the cost of a pipeline.
 
+mod clock;
 pub mod estimate;
 mod solo;
 pub mod verify;

@@ -3,13 +3,14 @@
 use std::collections::{BTreeMap, HashMap};
 use std::ops::Range;
 use std::sync::{Arc, Mutex, PoisonError};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use burn::tensor::Device;
 use checkpoint::{BlobError, Blobs};
 use protocol::message::StageTask;
 use protocol::{Digest, Manifest};
 
+use super::clock::Clock;
 use crate::context::{Adopted, AttemptContext, ContextError, Exchange, GangContext, Rendezvous};
 use crate::external::DataAccess;
 use crate::train::{STATE_FILE, tree_sum};
@@ -61,8 +62,10 @@ pub(crate) struct Solo {
     pub(crate) values: BTreeMap<(u64, String), f64>,
     /// Digest of the training state by step, for each saved one.
     pub(crate) states: BTreeMap<u64, Digest>,
-    /// Times of the progress reports.
-    pub(crate) progressed: Vec<Instant>,
+    /// The clock of the progress reports.
+    pub(crate) clock: Clock,
+    /// Readings of the clock at the progress reports.
+    pub(crate) progressed: Vec<Duration>,
 }
 
 impl Solo {
@@ -77,7 +80,8 @@ impl Solo {
     ) -> Self {
         let values = BTreeMap::new();
         let states = BTreeMap::new();
-        Self { task, device, blobs, checkpoint, until, values, states, progressed: Vec::new() }
+        let clock = Clock::Wall(Instant::now());
+        Self { task, device, blobs, checkpoint, until, values, states, clock, progressed: Vec::new() }
     }
 }
 
@@ -104,7 +108,7 @@ impl AttemptContext for Solo {
         self.blobs.put(manifest.to_bytes()).map_err(|e| ContextError::Storage(e.to_string()))
     }
     fn progress(&mut self, _: u64, _: u64, _: &str, _: &[(&str, f64)]) {
-        self.progressed.push(Instant::now());
+        self.progressed.push(self.clock.read());
     }
     fn record(&mut self, step: u64, metrics: &[(&str, f64)]) {
         self.values.extend(metrics.iter().map(|(name, value)| ((step, (*name).to_owned()), *value)));
