@@ -19,6 +19,8 @@ use crate::report::print;
 const BETWEEN_LINES: Duration = Duration::from_secs(60);
 /// Time without a worker after which a stage reports it; before that, workers are starting or about to be free.
 const PATIENCE: Duration = Duration::from_secs(15);
+/// The same while other stages of the run are computed, which then free their workers.
+const PATIENCE_IN_A_QUEUE: Duration = Duration::from_secs(600);
 
 /// Last displayed state of a stage.
 #[derive(Debug)]
@@ -41,6 +43,8 @@ pub(crate) struct Progress {
     changes: BTreeMap<StageName, Vec<LossChange>>,
     /// Advice for a stage without a worker.
     for_workers: &'static str,
+    /// Time after which such a stage is mentioned.
+    patience: Duration,
 }
 
 impl Progress {
@@ -52,6 +56,7 @@ impl Progress {
             stages: BTreeMap::new(),
             changes: changes.filter(|(_, changes)| !changes.is_empty()).collect(),
             for_workers,
+            patience: PATIENCE,
         }
     }
 
@@ -79,11 +84,13 @@ impl Progress {
 
     /// Displays the changes of a run.
     pub(crate) fn update(&mut self, run: &RunView) {
-        self.update_at(run, Instant::now());
+        self.update_at(&run.stages, Instant::now());
     }
 
-    fn update_at(&mut self, run: &RunView, now: Instant) {
-        for stage in &run.stages {
+    fn update_at(&mut self, stages: &[StageView], now: Instant) {
+        let is_busy = stages.iter().any(|stage| stage.state == StageState::Running);
+        self.patience = if is_busy { PATIENCE_IN_A_QUEUE } else { PATIENCE };
+        for stage in stages {
             for line in self.stage(stage, now) {
                 self.note(&line);
             }
@@ -128,7 +135,7 @@ impl Progress {
         }
         shown.lacks = stage.wants_workers.map(|_| shown.lacks.unwrap_or((now, false)));
         if let Some((since, said @ false)) = &mut shown.lacks
-            && now - *since >= PATIENCE
+            && now - *since >= self.patience
         {
             *said = true;
             let (name, message) = (stage.name.as_str(), stage.message.as_deref().unwrap_or_default());
@@ -325,6 +332,20 @@ mod tests {
         assert_eq!(said(14), [""; 0]);
         assert_eq!(said(15), ["           vae  waits for 1 idle `flex` worker; `--workers N` starts more"]);
         assert_eq!(said(16), [""; 0]);
+    }
+
+    #[test]
+    fn a_stage_behind_others_of_its_run_waits_without_a_word() {
+        let (mut progress, start) = (progress(), Instant::now());
+        let waits = StageView { wants_workers: Some(1), ..stage(StageState::Ready, 0) };
+        let other = StageView { name: "mld".into(), ..stage(StageState::Running, 1) };
+        let mut said = |stages: &[StageView], second| {
+            progress.update_at(stages, start + Duration::from_secs(second));
+            progress.stages[&StageName::from("vae")].lacks.is_some_and(|(_, said)| said)
+        };
+        assert!(!said(&[waits.clone(), other.clone()], 0));
+        assert!(!said(&[waits.clone(), other], 500), "the other stage frees its worker");
+        assert!(said(&[waits], 501), "nothing of the run is computed");
     }
 
     #[test]
