@@ -239,7 +239,7 @@ async fn serve(args: &DemoArgs, folder: &Path) -> Result<u8> {
             },
         }
     };
-    fleet.kill().await;
+    fleet.kill(&handle).await;
     drop(announced);
     handle.shutdown().await;
     outcome

@@ -154,8 +154,8 @@ impl Fleet {
         self.members.iter().any(|member| member.child.is_some())
     }
 
-    /// Kills all workers. Only for the case that their results are no longer needed.
-    pub(crate) async fn kill(&mut self) {
+    /// Kills all workers and tells the coordinator. Only for the case that their results are no longer needed.
+    pub(crate) async fn kill(&mut self, coordinator: &Handle) {
         for child in self.members.iter_mut().filter_map(|member| member.child.as_mut()) {
             // It may have ended already.
             let _ = child.start_kill();
@@ -164,6 +164,10 @@ impl Fleet {
             if let Some(mut child) = member.child.take() {
                 let _ = child.wait().await;
             }
+        }
+        for member in &self.members {
+            // One that never joined is unknown. The store otherwise lists the others as idle until their leases end.
+            let _ = coordinator.worker_gone(&member.name).await;
         }
     }
 }
@@ -182,10 +186,10 @@ fn last_lines(text: &str, count: usize) -> String {
 
 /// Default number of workers of a backend: one per core on CPU, one per device on GPU.
 pub(crate) fn default_size(backend: Backend) -> usize {
-    match backend {
-        Backend::Flex | Backend::Ndarray => std::thread::available_parallelism().map_or(1, usize::from),
-        Backend::Wgpu | Backend::Cuda => device_count(backend),
+    if backend.is_cpu() {
+        return std::thread::available_parallelism().map_or(1, usize::from);
     }
+    device_count(backend)
 }
 
 /// Devices of a backend, at least 1. A worker that opens a backend without devices reports the error.

@@ -117,7 +117,7 @@ pub(crate) async fn run(request: Request, options: Options) -> Result<u8> {
     // A store that fails gives no reasons; the report is printed without them.
     let whys = handle.settings(&run).await.map(summary::whys).unwrap_or_default();
     if let Some(fleet) = &mut fleet {
-        fleet.kill().await;
+        fleet.kill(&handle).await;
     }
     handle.shutdown().await;
     let end = watched?;
