@@ -77,7 +77,10 @@ impl TryFrom<JoinArgs> for Options {
 
     fn try_from(args: JoinArgs) -> Result<Self, JoinError> {
         let unusable = |error: &dyn std::fmt::Display| JoinError::Usage(error.to_string());
-        let server = args.connection.connect(&args.url).map_err(|error| unusable(&error))?;
+        let server = args.connection.connect(&args.url).map_err(|error| match error.advice() {
+            Some(advice) => JoinError::Usage(format!("{error}; {advice}")),
+            None => unusable(&error),
+        })?;
         let mut limits = StageLimits::default();
         if let Some(gib) = args.stage_memory {
             limits.memory = Some((gib * f64::from(1 << 30)) as u64);

@@ -17,6 +17,7 @@ use std::collections::BTreeMap;
 use checkpoint::model::{self, Model as ModelMeta, Parts};
 use protocol::artifact::Role;
 use protocol::message::ApiError;
+use protocol::stage::{DataOpen, StageSpec};
 use protocol::{Alias, Digest, Manifest, ModelName, RunId};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -380,12 +381,29 @@ async fn format_of(store: &ReadStore, version: &Version) -> Option<String> {
     ModelMeta::read(&manifest).ok().map(|model| model.format.name().to_owned())
 }
 
+/// Kind of the artifacts with clips.
+const DATASET: &str = "dataset";
+
+/// Returns true if the version learned from clips that no published table was measured on: procedural ones or recordings.
+async fn is_of_other_data(store: &ReadStore, version: &Version) -> Result<bool, Refused> {
+    let nodes = store.lineage(version.artifact).await?;
+    let datasets = nodes.iter().filter(|node| node.kind.as_deref() == Some(DATASET));
+    for key in datasets.filter_map(|node| node.key.as_ref()?.parse::<Digest>().ok()) {
+        let made_by = store.stage_result(key).await?;
+        if made_by.is_some_and(|made_by| made_by.kind != DataOpen::KIND) {
+            return Ok(true);
+        }
+    }
+    Ok(false)
+}
+
 async fn leaderboard(store: &ReadStore, of: &str, published: bool) -> Result<Leaderboard, Refused> {
     if leaderboard::FORMATS.contains(&of) {
         let mut all = Vec::new();
         for model in store.models().await? {
             for version in store.versions(&model.model).await? {
-                if format_of(store, &version).await.as_deref() == Some(of) {
+                if format_of(store, &version).await.as_deref() == Some(of) && !is_of_other_data(store, &version).await?
+                {
                     all.push(version);
                 }
             }
@@ -394,8 +412,8 @@ async fn leaderboard(store: &ReadStore, of: &str, published: bool) -> Result<Lea
     }
     let (model, versions) = known(store, of).await?;
     let format = match versions.first().filter(|_| published) {
-        Some(version) => format_of(store, version).await,
-        None => None,
+        Some(version) if !is_of_other_data(store, version).await? => format_of(store, version).await,
+        _ => None,
     };
     Ok(leaderboard::leaderboard(of.to_owned(), &versions, model.metric.as_deref(), format.as_deref()))
 }
