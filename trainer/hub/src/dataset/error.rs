@@ -64,6 +64,9 @@ impl FetchError {
             Self::Refused { .. } => "check the address and the proxy; `--from` reads a clone or an archive instead",
             Self::Content { .. } => "the checked files are kept; the same command tries again, `--from` reads a clone",
             Self::DiskFull { .. } => "free some space, or name a folder on another disk; the same command continues",
+            Self::Io { source, .. } if source.kind() == io::ErrorKind::NotFound => {
+                "name a file or folder that exists; `--from` reads a clone or an archive"
+            }
             Self::Io { .. } => "make the folder writable, or name another one; the same command continues",
         }
     }
