@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use protocol::id::{is_name, is_stage_name};
 use protocol::limits;
-use protocol::spelling::nearest;
+use protocol::spelling::{nearest, question};
 use protocol::stage::{Backend, DataOpen, DataSynthetic, Placement, StageSettings, TextEmbed};
 use protocol::sweep::Sweep;
 use protocol::{Seed, StageName};
@@ -255,6 +255,10 @@ impl Reader {
                 }
                 Some(entries) => {
                     for entry in entries {
+                        if entry.key_at.source > 0 && entry.value.entry("kind").is_none() {
+                            self.unwritten(entry, entries);
+                            continue;
+                        }
                         found.written.push(Written {
                             name: StageName::new(&*entry.key),
                             key_at: entry.key_at,
@@ -319,6 +323,15 @@ impl Reader {
                 None
             }
         }
+    }
+
+    /// Reports settings from the command line for a stage that the file does not have.
+    fn unwritten(&mut self, entry: &Entry, entries: &[Entry]) {
+        let written = || entries.iter().filter(|other| other.key_at.source == 0).map(|other| other.key.as_str());
+        let meant = question(&entry.key, written());
+        let message = format!("the file has no stage `{}`{meant}", entry.key);
+        let help = format!("its stages are {}", list_keys(written()));
+        self.mistake(entry.key_at, &format!("stages.{}", entry.key), message, Some(help));
     }
 
     fn stage(&mut self, entry: &Entry) -> Option<(StageSettings, Placement, Option<Sweep>)> {

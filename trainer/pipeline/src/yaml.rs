@@ -256,6 +256,12 @@ impl Builder<'_> {
                  indentation"
                     .into(),
             ),
+            info if info.contains("quoted scalar") => Some("close the quotation mark".into()),
+            info if info.contains("flow mapping") => Some("close the `{` of a line above, or add the comma".into()),
+            info if info.contains("flow sequence") => Some("close the `[` of a line above, or add the comma".into()),
+            info if info.contains("unknown anchor") => {
+                Some("define it before, as in `steps: &same 100`, or quote a string that begins with `*`".into())
+            }
             _ => None,
         };
         self.mistakes.push(YamlError { at, message: format!("invalid YAML: {}", error.info()), help });

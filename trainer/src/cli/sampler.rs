@@ -64,7 +64,10 @@ fn guidance(text: &str) -> Result<f64, String> {
 
 /// Parses a solver by its word in settings.
 fn solver(word: &str) -> Result<Solver, String> {
-    serde_json::from_value(word.into()).map_err(|e| e.to_string())
+    serde_json::from_value(word.into()).map_err(|error| match error.to_string().split_once(", expected") {
+        Some((_, expected)) => format!("there is no solver `{word}`; expected{expected}"),
+        None => error.to_string(),
+    })
 }
 
 impl SamplerArgs {

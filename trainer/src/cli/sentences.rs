@@ -6,6 +6,7 @@ use std::path::PathBuf;
 use clap::Args;
 use clap::error::ErrorKind;
 use mocap::requests::{self, Length, Request};
+use protocol::units::counted;
 
 use super::args::whole;
 use crate::report::problem::{Problem, Result};
@@ -108,8 +109,8 @@ impl SentenceArgs {
             each => {
                 let (lengths, sentences) = (each.len(), requests.len());
                 return Err(Problem::usage(format!(
-                    "there are {lengths} lengths for {sentences} sentences; give one length for all sentences, or one \
-                     for each"
+                    "there are {lengths} lengths for {}; give one length for all sentences, or one for each",
+                    counted(sentences, "sentence")
                 )));
             }
         }

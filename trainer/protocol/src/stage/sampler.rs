@@ -240,7 +240,8 @@ impl Family {
             Self::Autoregressive => {
                 at_most(1, &format!("{model} generates one token after another until the motion ends"));
             }
-            Self::Pcm { phases, .. } if *phases == steps => {}
+            // A number of phases that is wrong itself suggests no number of steps.
+            Self::Pcm { phases, .. } if *phases == steps || *phases == 0 => {}
             Self::Pcm { phases, .. } => {
                 let message = format!(
                     "`sampler.steps` is {steps}, but {model} has {}; a PCM student takes one step per phase",

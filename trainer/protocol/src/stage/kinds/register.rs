@@ -132,6 +132,9 @@ impl StageSpec for Register {
 
 /// Lists `one of ...`, with those most similar to `wanted` first: at most a few, without the ends of intervals.
 fn one_of(wanted: &str, given: &BTreeSet<String>) -> String {
+    if given.is_empty() {
+        return "add an `evaluate.*` stage".to_owned();
+    }
     let plain = |name: &&String| !name.ends_with(".lower") && !name.ends_with(".upper");
     let mut names: Vec<&String> = given.iter().filter(plain).collect();
     names.sort_by_key(|name| (name.contains('.') != wanted.contains('.'), std::cmp::Reverse(alike(wanted, name))));
@@ -163,6 +166,8 @@ impl Register {
     /// Refuses gates on metrics that no candidate has.
     fn check_gates(&self, stages: &Neighbours<'_>, p: &mut Problems) {
         let all: Option<Vec<BTreeSet<String>>> = self.from.iter().map(|from| stages.metrics_of(from)).collect();
+        // Without candidates, that is the mistake.
+        let all = all.filter(|all| !all.is_empty());
         let Some(given) = all.map(|all| all.into_iter().flatten().collect::<BTreeSet<String>>()) else { return };
         for (i, gate) in self.promote.require.iter().enumerate().filter(|(_, gate)| is_gate(gate)) {
             let metric = gate.split(['<', '>']).next().unwrap_or_default().trim();
