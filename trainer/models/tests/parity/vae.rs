@@ -111,18 +111,13 @@ fn recipe(settings: &Value) -> VaeRecipe {
         Some("l2") => Pointwise::L2,
         other => panic!("distance {other:?} does not exist here"),
     };
-    VaeRecipe {
-        weights: VaeLoss {
-            feature: weight("rf"),
-            joint: weight("rj"),
-            velocity: weight("rv"),
-            kl: weight("kl"),
-            masked: settings["mask"].as_bool().expect("a flag"),
-            ..VaeLoss::default()
-        },
-        feature: distance("lf"),
-        joint: distance("lj"),
-        velocity: distance("lv"),
-        feet: Pointwise::SmoothL1,
-    }
+    let weights = VaeLoss {
+        feature: weight("rf"),
+        joint: weight("rj"),
+        velocity: weight("rv"),
+        kl: weight("kl"),
+        masked: settings["mask"].as_bool().expect("a flag"),
+        ..VaeLoss::default()
+    };
+    VaeRecipe { feature: distance("lf"), joint: distance("lj"), velocity: distance("lv"), ..weights.into() }
 }
