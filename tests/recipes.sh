@@ -38,6 +38,10 @@ for recipe in "${recipes[@]}"; do
     else
         sets+=(--set 'stages.dataset={kind: data.synthetic, clips: 40, val: 0.1, test: 0.2}')
     fi
+    # A run needs all files of its pipeline, so the papers' evaluator is replaced. No training reads it.
+    ! grep -q 'kind: import.evaluator' "$file" || sets+=(--set 'stages.evaluator={kind: train.evaluator}')
+    # Half of the hashed words would be lost behind a ReLU, so a file with one is refused.
+    ! grep -q 'text_relu: true' "$file" || sets+=(--set stages.mld.text_relu=false)
     for stage in $(training "$file"); do
         sets+=(--set "stages.$stage.steps=$steps" --set "stages.$stage.warmup=0" --set "stages.$stage.batch={global: $batch, slices: 3}")
         sets+=(--set "stages.$stage.checkpoint={every: 1, keep: {latest: 1}}")

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
+use cluster_tests::{Bench, book, documented};
 use protocol::stage::{Keep, Mode};
 use protocol::{Digest, Seed};
 
@@ -549,6 +550,31 @@ fn every_shipped_pipeline_is_valid() {
         }
     }
     assert!(seen >= 7, "{seen}");
+}
+
+/// The commands of the chapter on the papers' rows are not run: training one row takes days of a GPU.
+#[test]
+fn every_row_of_the_papers_is_valid() {
+    let root = Bench::repository();
+    let mut rows = 0;
+    for line in documented::shell_lines(&book::source(&root).join("papers.md"), None) {
+        let words = documented::words(&line);
+        if words[..2] != ["trainer", "run"] {
+            continue;
+        }
+        let values = |option: &str| {
+            let pairs = words.windows(2).filter(|pair| pair[0] == option);
+            pairs.map(|pair| pair[1].clone()).collect::<Vec<_>>()
+        };
+        let text = std::fs::read_to_string(root.join(&words[2])).unwrap_or_else(|e| panic!("{line}: {e}"));
+        let pipeline = read(&words[2], &text, &values("--set")).unwrap_or_else(|e| panic!("{line}: {e}"));
+        pipeline.check().unwrap();
+        for until in values("--until") {
+            assert!(pipeline.stage(&until.as_str().into()).is_some(), "{line}: there is no stage `{until}`");
+        }
+        rows += 1;
+    }
+    assert!(rows >= 80, "{rows}");
 }
 
 #[test]
