@@ -17,12 +17,12 @@ trap 'rm -rf "$work"' EXIT
 
 # The stages of a recipe that train, in order.
 training() {
-    awk '/^  [a-z_0-9]+:/ { name = $1; sub(":", "", name) } /kind: (train|distill)\./ { print name }' "$1"
+    awk '/^ *#/ { next } /^  [a-z_0-9]+:/ { name = $1; sub(":", "", name) } /kind: (train|distill)\./ { print name }' "$1"
 }
 
 # The kind of a stage.
 kind() {
-    awk -v stage="$2" '/^  [a-z_0-9]+:/ { name = $1; sub(":", "", name) } name == stage && match($0, /kind: [a-z.0-9]+/) { print substr($0, RSTART + 6, RLENGTH - 6); exit }' "$1"
+    awk -v stage="$2" '/^ *#/ { next } /^  [a-z_0-9]+:/ { name = $1; sub(":", "", name) } name == stage && match($0, /kind: [a-z.0-9]+/) { print substr($0, RSTART + 6, RLENGTH - 6); exit }' "$1"
 }
 
 # Digests of the results of training and encoding.
