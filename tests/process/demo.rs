@@ -38,9 +38,14 @@ fn a_demo_draws_from_an_empty_folder() {
     let versions: Vec<_> =
         models["models"].as_array().expect("models").iter().map(|model| &model["versions"]).collect();
     assert_eq!(versions, [1, 1], "{models}");
-    bench
-        .run(&[&["generate", "a person claps", "--model", "demo-student:1", "-o", "clap.npy"], &store[..]].concat())
-        .expect_code(0);
+    let draw = |prompt| {
+        let command = ["generate", prompt, "--model", "demo-student:1", "-o", "clap.npy"];
+        bench.run(&[&command, &store[..]].concat()).expect_code(0).stderr
+    };
+    let said = draw("a person claps");
+    assert!(!said.contains("note:"), "the suggested sentence is known: {said}");
+    let said = draw("a person claps gleefully");
+    assert!(said.contains("`gleefully` did not occur") && said.contains("claps"), "{said}");
 }
 
 /// Measures the student as the quickstart did.

@@ -69,6 +69,22 @@ fn finished_stages_are_whole_in_every_report() {
     assert!(!said.stderr.contains('\u{1b}') && !said.stderr.contains(" 0/"), "{}", said.stderr);
     let lines = said.stderr.lines().filter(|line| line.trim_start().starts_with("vae ")).count();
     assert!(lines <= 4, "begun, done, and twice why the loss jumps: {}", said.stderr);
+    let board = bench.run(&["registry", "leaderboard", "smoke"]).expect_code(0).stdout;
+    assert!(board.contains("smoke:1") && !board.contains("[MotionPCM]"), "the clips are procedural:\n{board}");
+    no_worker_is_left(&bench);
+}
+
+/// Checks what a server that takes over the store says of the workers of an ended run.
+fn no_worker_is_left(bench: &Bench) {
+    let _server = bench.spawn(&["serve", "--bind", "127.0.0.1:0"]);
+    let workers = wait_for("the server", || {
+        let said = bench.run(&["worker", "list", "-o", "json"]);
+        if said.code != Some(0) {
+            return None;
+        }
+        said.json().as_array().filter(|workers| !workers.is_empty()).cloned()
+    });
+    assert!(workers.iter().all(|worker| worker["state"] == "gone"), "{workers:?}");
 }
 
 #[test]

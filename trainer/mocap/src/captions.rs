@@ -62,7 +62,11 @@ pub fn sentence(text: &str) -> Result<Caption, String> {
     }
 }
 
-/// Makes a sentence of a file's name: its words without numbers, in small letters. It is empty if the name has none.
+/// Words of file names that describe no motion.
+const OF_FILES: [&str; 5] = ["bvh", "clip", "dataset", "mocap", "recording"];
+
+/// Makes a sentence of a file's name: its words without numbers and [`OF_FILES`], in small letters. It is empty if the
+/// name has none.
 pub fn from_name(stem: &str) -> String {
     let mut words = String::new();
     let mut before = ' ';
@@ -76,7 +80,7 @@ pub fn from_name(stem: &str) -> String {
         }
         before = c;
     }
-    words.split_whitespace().collect::<Vec<_>>().join(" ")
+    words.split_whitespace().filter(|word| !OF_FILES.contains(word)).collect::<Vec<_>>().join(" ")
 }
 
 /// Writes a table of captions, one row per clip and sentence, that [`of_table`] reads.
@@ -316,7 +320,7 @@ mod tests {
 
     #[test]
     fn names_of_files_become_captions_that_can_be_read_back() {
-        let names = ["walk_forward-02", "WalkFast", "000003", "Subject1 jumps, twice"];
+        let names = ["dataset-1_walk_forward-02", "WalkFast", "000003", "Subject1 jumps, twice"];
         let rows: Vec<(String, String)> = names.map(|name| (name.to_owned(), from_name(name))).to_vec();
         let sentences: Vec<&str> = rows.iter().map(|(_, sentence)| sentence.as_str()).collect();
         assert_eq!(sentences, ["walk forward", "walk fast", "", "subject jumps twice"]);

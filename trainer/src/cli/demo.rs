@@ -19,8 +19,8 @@ use stages::generate::Generator;
 use tokio::signal::unix::{SignalKind, signal};
 
 use super::generate::exported;
-use super::model::{self, Found};
-use super::out;
+use super::model::{self, CAPTIONS, Found};
+use super::{out, unknown_words};
 use crate::client::{self, Target};
 use crate::local::fleet::Fleet;
 use crate::local::pack::{Pack, Packed};
@@ -260,8 +260,12 @@ async fn pack(store: &Path, file: &Path) -> Result<u8> {
     let Some(Data::Version { version, .. }) = reader.registry(&show).await?.data else {
         return Err(Problem::new(exit::FAULT, anyhow::anyhow!("the registry's answer is no version")));
     };
-    let models =
-        vec![packed(NAMES[0], manifest, of_teacher)?, packed(NAMES[1], student.manifest, version.metrics.clone())?];
+    let captions = unknown_words::captions(&reader, student.artifact).await?.unwrap_or_default();
+    let captions = unknown_words::covering(&captions);
+    let models = vec![
+        packed(NAMES[0], manifest, of_teacher, &captions)?,
+        packed(NAMES[1], student.manifest, version.metrics.clone(), &captions)?,
+    ];
     reader.close().await;
     teacher.blobs.add(student.blobs);
     let read = |digest| -> anyhow::Result<Vec<u8>> { Ok(checkpoint::Blobs::get(&teacher.blobs, digest)?.to_vec()) };
@@ -273,14 +277,14 @@ async fn pack(store: &Path, file: &Path) -> Result<u8> {
 }
 
 /// Describes a model for the file.
-fn packed(name: &str, manifest: Manifest, metrics: BTreeMap<String, f64>) -> Result<Packed> {
+fn packed(name: &str, manifest: Manifest, metrics: BTreeMap<String, f64>, captions: &[&str]) -> Result<Packed> {
     let head = Head {
         format: FORMAT,
         model: name.parse().map_err(Problem::usage)?,
         version: 1,
         artifact: manifest.digest(),
         metrics: metrics.into_iter().map(|(key, value)| (key, Some(value))).collect(),
-        source: json!({"pipeline": "quickstart", "metric": "latent_fid", "mode": "min"}),
+        source: json!({"pipeline": "quickstart", "metric": "latent_fid", "mode": "min", CAPTIONS: captions}),
     };
     Ok(Packed { head, manifest })
 }

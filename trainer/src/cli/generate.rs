@@ -152,7 +152,7 @@ async fn found(args: &GenerateArgs) -> Result<(Found, Option<Vocabulary>)> {
         (Some(stage), _) => model::stage(&reader, &reader.find(&args.run).await?, stage).await?,
         (None, model) => model::version(&reader, model.as_deref().unwrap_or_default()).await?,
     };
-    let vocabulary = unknown_words::vocabulary(&reader, found.artifact).await?;
+    let vocabulary = unknown_words::vocabulary(&reader, &found).await?;
     let found = args.control.completed(&reader, found).await?;
     reader.close().await;
     Ok((found, vocabulary))

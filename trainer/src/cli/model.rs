@@ -27,6 +27,8 @@ pub(super) struct Found {
     pub(super) label: Label,
     /// The model's manifest. If the model was trained here, the store has its lineage.
     pub(super) artifact: Digest,
+    /// Captions with the words of its training, if the model came with some, as that of `trainer demo` does.
+    pub(super) captions: Vec<String>,
     /// Evaluations of a stage's model and their samplers. A version has its own sampler.
     pub(super) measured: Vec<(String, Sampler)>,
 }
@@ -114,7 +116,9 @@ pub(super) async fn version(reader: &Reader, name: &str) -> Result<Found> {
     };
     let blobs = Fetched::files(reader, &manifest).await?;
     let (artifact, label) = (version.artifact, Label::Version(name.to_owned(), version.version));
-    Ok(Found { manifest, blobs, label, artifact, measured: Vec::new() })
+    let captions = &version.source["imported"]["source"][CAPTIONS];
+    let captions = serde_json::from_value(captions.clone()).unwrap_or_default();
+    Ok(Found { manifest, blobs, label, artifact, captions, measured: Vec::new() })
 }
 
 /// Finds the model of a stage of `run`, and the samplers of the run's evaluations of it.
@@ -142,7 +146,8 @@ pub(super) async fn stage(reader: &Reader, run: &RunView, name: &str) -> Result<
         }
     }
     let blobs = Fetched::files(reader, &manifest).await?;
-    Ok(Found { manifest, blobs, label: Label::Stage(run.run.to_string(), name.to_owned()), artifact: *model, measured })
+    let label = Label::Stage(run.run.to_string(), name.to_owned());
+    Ok(Found { manifest, blobs, label, artifact: *model, captions: Vec::new(), measured })
 }
 
 /// Stages of a run that have a model so far, without the trials of sweeps.
@@ -209,6 +214,8 @@ const LONGEST_INDEX: u64 = 64 << 20;
 /// The output of stages that produce a dataset, and its largest size to fetch for pictures.
 const DATASET: &str = "dataset";
 const LARGEST_DATASET: u64 = 256 << 20;
+/// The key of captions in the description of a model.
+pub(super) const CAPTIONS: &str = "captions";
 /// The output of stages that produce a model.
 const MODEL: &str = "model";
 /// The output of evaluations.

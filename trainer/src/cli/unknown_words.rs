@@ -6,7 +6,7 @@ use motion::vocabulary::Vocabulary;
 use protocol::Digest;
 use registry::cli::{Command, Data};
 
-use super::model;
+use super::model::{self, Found};
 use crate::reader::Reader;
 use crate::report::print;
 use crate::report::problem::Result;
@@ -16,11 +16,25 @@ const DATASET: &str = "dataset";
 /// Number of sentences offered in place of one with unknown words.
 const OFFERED: usize = 3;
 
-/// The vocabulary of a model's training; `None` for a model that was trained elsewhere, such as an imported one.
+/// The vocabulary of a model's training: of its lineage, else of the captions that came with it. `None` if neither is
+/// known, as of most imported models.
 ///
 /// # Errors
 /// If the store does not answer, or a dataset in it cannot be read.
-pub(super) async fn vocabulary(reader: &Reader, artifact: Digest) -> Result<Option<Vocabulary>> {
+pub(super) async fn vocabulary(reader: &Reader, found: &Found) -> Result<Option<Vocabulary>> {
+    let captions = match captions(reader, found.artifact).await? {
+        Some(captions) => captions,
+        None if found.captions.is_empty() => return Ok(None),
+        None => found.captions.iter().cloned().collect(),
+    };
+    Ok(Some(Vocabulary::of(captions.iter().map(String::as_str))))
+}
+
+/// The training captions of an artifact that was trained here.
+///
+/// # Errors
+/// As [`vocabulary`].
+pub(super) async fn captions(reader: &Reader, artifact: Digest) -> Result<Option<BTreeSet<String>>> {
     let answer = reader.registry(&Command::Lineage { reference: artifact.to_string() }).await?;
     let Some(Data::Lineage { nodes }) = answer.data else { return Ok(None) };
     let mut captions = BTreeSet::new();
@@ -30,7 +44,18 @@ pub(super) async fn vocabulary(reader: &Reader, artifact: Digest) -> Result<Opti
         is_known = true;
         captions.extend(read);
     }
-    Ok(is_known.then(|| Vocabulary::of(captions.iter().map(String::as_str))))
+    Ok(is_known.then_some(captions))
+}
+
+/// A few of the captions that have every word of all of them.
+pub(super) fn covering(captions: &BTreeSet<String>) -> Vec<&str> {
+    let mut kept: Vec<&str> = Vec::new();
+    for caption in captions {
+        if !Vocabulary::of(kept.iter().copied()).unknown(caption).is_empty() {
+            kept.push(caption);
+        }
+    }
+    kept
 }
 
 /// A sentence compared with the training captions.
@@ -72,5 +97,17 @@ impl Compared {
             some => format!("; nearest known: {some}"),
         };
         format!("note: {words} did not occur in the training of {label}: {rest}{offered}")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn covering_captions_have_every_word() {
+        let all = ["a person jumps", "a person jumps up", "a person walks", "someone walks", "walks up"];
+        let all = all.map(str::to_owned).into();
+        assert_eq!(covering(&all), ["a person jumps", "a person jumps up", "a person walks", "someone walks"]);
     }
 }
