@@ -120,7 +120,7 @@ impl Plan {
         }
         let wall = seconds / self.workers.max(1) as f64;
         text.push_str(&format!(
-            "\nabout {} with one worker on an idle machine, at best {} with {}; estimated by {} updates per stage\n",
+            "\nabout {} with one worker on an idle machine, at best {} with {}\nestimated by {} updates per stage\n",
             long(seconds),
             long(wall),
             self.workers,
