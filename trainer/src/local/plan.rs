@@ -120,18 +120,16 @@ impl Plan {
         }
         let wall = seconds / self.workers.max(1) as f64;
         text.push_str(&format!(
-            "\nabout {} with one worker on an idle machine, at best {} with {}\nestimated by {} updates per stage\n",
+            "\nabout {} with one worker on an idle machine, at best {} with {}\nestimated by {} updates per stage",
             long(seconds),
             long(wall),
             self.workers,
             stages::run::estimate::STEPS - 1,
         ));
         if untried > 0 {
-            text.push_str(&format!(
-                "without {} that could not be estimated within the time limit of a plan\n",
-                counted(untried, "stage")
-            ));
+            text.push_str(&format!(", without {} that could not be estimated in time", counted(untried, "stage")));
         }
+        text.push('\n');
         text
     }
 }
