@@ -57,6 +57,7 @@ fn an_interrupted_run_says_where_and_the_same_command_continues_it() {
 fn finished_stages_are_whole_in_every_report() {
     let bench = Bench::new(TRAINER);
     let said = bench.run(&["run", &Bench::config("smoke.yaml"), "--workers", "1"]).expect_code(0);
+    no_worker_is_left(&bench);
     let status = bench.run(&["status"]).expect_code(0).stdout;
     let again = bench.run(&["run", &Bench::config("smoke.yaml"), "--workers", "1"]).expect_code(0).stdout;
     for (stage, done) in [("vae", "12/12"), ("latents", "3/3"), ("mld", "16/16"), ("pcm", "12/12"), ("t2m_pcm", "3/3")]
@@ -71,7 +72,6 @@ fn finished_stages_are_whole_in_every_report() {
     assert!(lines <= 4, "begun, done, and twice why the loss jumps: {}", said.stderr);
     let board = bench.run(&["registry", "leaderboard", "smoke"]).expect_code(0).stdout;
     assert!(board.contains("smoke:1") && !board.contains("[MotionPCM]"), "the clips are procedural:\n{board}");
-    no_worker_is_left(&bench);
 }
 
 /// Checks what a server that takes over the store says of the workers of an ended run.

@@ -65,8 +65,8 @@ pub fn sentence(text: &str) -> Result<Caption, String> {
 /// Words of file names that describe no motion.
 const OF_FILES: [&str; 5] = ["bvh", "clip", "dataset", "mocap", "recording"];
 
-/// Makes a sentence of a file's name: its words without numbers and [`OF_FILES`], in small letters. It is empty if the
-/// name has none.
+/// Makes a sentence of a file's name: its words in small letters, without numbers and words such as `dataset`. It is
+/// empty if the name has none.
 pub fn from_name(stem: &str) -> String {
     let mut words = String::new();
     let mut before = ' ';
