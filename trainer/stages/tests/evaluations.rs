@@ -247,7 +247,7 @@ fn what_does_not_fit_is_refused_with_the_reason() {
     for (model, kind_of, reason) in [
         (other_shape, latents, "3x4"),
         (other_vae, latents, "is not the VAE of `latents`"),
-        (good, dataset, "kind Dataset"),
+        (good, dataset, "is a dataset; expected latents"),
     ] {
         let inputs = [("model", model), ("latents", kind_of), ("dataset", dataset)];
         let refused = bench.run("eval", &latent_fid(1, sampler.clone(), false), &inputs).unwrap_err();

@@ -439,7 +439,7 @@ fn what_an_evaluator_does_not_fit_is_refused_with_the_reason() {
         (store(&bench, &nothing, data), evaluator, &test, "`test` has no entries"),
         (data, evaluator, &few, "needs pools of 32"),
         (data, kit, &test, "`kit` skeletons"),
-        (data, data, &test, "kind Dataset"),
+        (data, data, &test, "is a dataset; expected"),
     ] {
         let inputs = [("dataset", data), ("evaluator", evaluator)];
         let refused = bench.run("eval", &evaluate(2, settings.clone()), &inputs).expect_err(reason);

@@ -116,7 +116,7 @@ fn what_fits_nothing_and_what_is_of_another_kind_is_refused() {
     let nothing = refused(other, outputs["vae"]);
     assert!(nothing.contains("`init` does not match this network"), "{nothing}");
     let kind = refused(settings, outputs["latents"]);
-    assert!(kind.contains("expected Vae"), "{kind}");
+    assert!(kind.contains("expected a VAE"), "{kind}");
 }
 
 #[test]
