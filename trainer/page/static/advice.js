@@ -9,7 +9,7 @@ const ADVICE = [
   [/differ(s)? from what|another copy|digest of|changed since/i, "The files differ from those that the run was submitted with. Bring them back, or submit the pipeline again for the new ones."],
   [/data.root/i, "The worker reads below its data roots alone: start it with `--data-root DIR` for the folder that the pipeline names, then resume."],
   [/no such file|does not exist|cannot (open|read)|not found/i, "Look whether the path is there on the worker's machine, and readable for it. Then resume."],
-  [/panicked|internal fault|bug of Stride/i, "This is a fault of Stride, not of your settings. Resume tries again; the lines below belong into a report."],
+  [/panicked|internal fault|bug in Stride/i, "This is a fault of Stride, not of your settings. Resume tries again; the lines below belong into a report."],
   [/stage-time|took longer|too long/i, "The stage ran beyond its time. Raise `--stage-time` of its workers, then resume."],
   [/connection|unreachable|timed out|lost/i, "A worker or the network was lost more often than the budget allows. Look at the Workers view, then resume."],
 ];

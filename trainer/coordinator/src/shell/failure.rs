@@ -122,7 +122,7 @@ impl From<Refused> for Failure {
             Refused::Write(error) => error.into(),
             Refused::Stopped => Self::new(StatusCode::SERVICE_UNAVAILABLE, "internal", refused.to_string()),
             Refused::Failed(_) => Self::new(StatusCode::SERVICE_UNAVAILABLE, "failed", refused.to_string())
-                .hint("start it again: acknowledged work is stored; and report this bug in Stride"),
+                .hint("start it again: acknowledged work is stored; report this bug in Stride"),
         }
     }
 }
