@@ -354,7 +354,7 @@ mod tests {
         let mut lines = |done| progress.stage(&stage(StageState::Running, done), start);
         assert_eq!(lines(10), ["           vae  continues at 10 of 100 steps"]);
         assert_eq!(lines(50), [""; 0]);
-        let joins = "the loss includes the terms on joints and feet";
+        let joins = "the loss includes the terms on joints";
         assert_eq!(lines(52), [format!("           vae  from step 50 of 100: {joins} (`loss.joint_from`)")]);
         assert_eq!(lines(60), [""; 0]);
         let mut later = self::progress();
