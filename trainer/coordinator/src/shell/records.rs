@@ -106,14 +106,19 @@ impl Records {
             QueryError::Invalid(why) => Refused::from(Rejected::Invalid(why)),
             error => WriteError::from(error).into(),
         })?;
-        let mut items = page.rows;
-        for row in &mut items {
+        let mut items = Vec::with_capacity(page.rows.len());
+        for row in page.rows {
             let summary = match (self.state.run(&row.run), self.ending.get(&row.run)) {
                 (Ok(run), _) => self.state.summary(run, self.now),
                 (Err(_), Some(view)) => RunSummary::of(&read(&row.run, view)?),
+                (Err(_), None) if row.state.is_final() => {
+                    items.push(row);
+                    continue;
+                }
+                // It was submitted after this state.
                 (Err(_), None) => continue,
             };
-            *row = RunSummary { created_ms: row.created_ms, changed_ms: row.changed_ms, ..summary };
+            items.push(RunSummary { created_ms: row.created_ms, changed_ms: row.changed_ms, ..summary });
         }
         // The state and the tables are not of one moment.
         items.retain(|row| asked.states.is_empty() || asked.states.contains(&row.state));

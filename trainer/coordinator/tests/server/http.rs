@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use axum::body::Body;
 use axum::http::{Request, StatusCode};
-use coordinator::{Config, Control, Coordinator, Handle, Policy};
+use coordinator::{Config, Control, Coordinator, Handle, Policy, Records};
 use pipeline::{Pipeline, PipelineStage, StageInput};
 use protocol::message::{
     ApiError, Assignment, CommitCheckpoint, DesiredAssignments, Doing, Grant, Join, Joined, LogBatch, MetricBatch,
@@ -14,7 +14,7 @@ use protocol::message::{
 use protocol::proof::{BlobStored, GRANT_HEADER, RECEIPT_HEADER, SECRET_HEADER, Vouched};
 use protocol::stage::{Backend, DataSynthetic, Placement, StageSettings, TrainVae};
 use protocol::{ArtifactKind, Digest, Manifest, RunId, Seed};
-use registry::{Holder, Store};
+use registry::{Holder, RunListQuery, Store};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
@@ -642,6 +642,21 @@ async fn a_large_blob_passes_in_little_memory_and_a_cut_upload_goes_on() -> Test
     let (_, length, came, found) = client.fetch(digest).await?;
     assert!(length == LARGE_BYTES && came < LARGE_BYTES && found != digest, "{came} bytes were sent");
     assert_eq!(client.fetch(digest).await?.0, 409);
+    handle.shutdown().await;
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_run_that_is_younger_than_the_records_is_not_in_their_list() -> TestResult {
+    let dir = tempfile::tempdir()?;
+    let (handle, _) = start(dir.path()).await?;
+    let first = handle.submit(submission(Some("first"))?).await?;
+    let records = Records::open(dir.path()).await?;
+    handle.submit(submission(Some("second"))?).await?;
+    let listed = records.run_list(&RunListQuery { limit: 10, ..RunListQuery::default() }).await?.items;
+    assert_eq!(listed.iter().map(|row| &row.run).collect::<Vec<_>>(), [&first]);
+    records.run_view(&listed[0].run).await?;
+    records.close().await;
     handle.shutdown().await;
     Ok(())
 }
