@@ -105,8 +105,7 @@ fn a_run_and_the_next_one_are_seen_on_the_page() {
     browser.until("document.querySelector('section[aria-labelledby=kept]')");
     browser.evaluate("document.querySelector('section[aria-labelledby=kept]').scrollIntoView()");
     browser.until("document.querySelectorAll('svg.still').length === 4");
-    let memory =
-        "[...document.querySelectorAll('.fact')].some((fact) => /^Memory[0-9.]+ [MG]iB$/.test(fact.textContent.trim()))";
+    let memory = "[...document.querySelectorAll('.fact')].some((fact) => /^Memory[0-9.]+ [MG]iB$/.test(fact.textContent.trim()))";
     assert_eq!(browser.evaluate(memory), json!(true), "the most memory that it had");
     browser.evaluate("document.querySelector('section[aria-labelledby=kept]').scrollIntoView()");
     keep(&mut browser, "checkpoints.png", DESK);
