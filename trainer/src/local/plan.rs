@@ -48,7 +48,7 @@ pub(crate) struct Plan {
     pub(crate) device: String,
     /// Default number of worker processes of `run`.
     pub(crate) workers: usize,
-    /// An earlier run whose times are those that this one needs, if the store has one.
+    /// The newest finished run of this name, if it computed all long stages of this one.
     before: Option<Before>,
 }
 

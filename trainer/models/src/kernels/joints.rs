@@ -37,7 +37,7 @@ pub enum Derivative {
 }
 
 impl Derivative {
-    /// Number of frames that it lacks.
+    /// Number of frames by which it is shorter than the path.
     pub const fn order(self) -> usize {
         match self {
             Self::Velocity => 1,

@@ -17,8 +17,9 @@ pub struct EncodeLatents {
     /// Number of random crops per entry.
     #[schemars(range(min = 1, max = 256), extend("x-unit" = "crops of an entry"))]
     pub crops: usize,
-    /// Exponent by which trainings on these latents draw clips with rare words more often: a clip is drawn in proportion
-    /// to `1 / (clips with its rarest word)^balance`, at most 16 times as often as most; 0 draws all alike.
+    /// Exponent by which trainings on these latents draw clips with rare words more often. An epoch draws a clip
+    /// `(n / own)^balance` times, rounded, from 1 to 16: `own` clips have its rarest word, and n is that number for the
+    /// median clip. 0 draws each clip once.
     #[schemars(range(min = 0.0, max = 2.0))]
     pub balance: f64,
     /// Changes the paths of the training split's crops, for a `train.control` on little data.
