@@ -3,7 +3,7 @@
 Each measurement is made of both in turns, so that other load of the machine meets both; medians are printed. Runs, batches and keys are
 alike. Stride's values come by the calls that workers make, MLflow's by `log_batch`. A worker is a program in Rust, so its messages are
 made before the time is taken, as are MLflow's lists of values. Those that only make the curve longer are put into MLflow's database. Stride's versions are rows that are put into its database before the server starts, since a version is
-otherwise the result of a training.
+otherwise the result of a training; `cargo bench -p registry --bench versions` registers versions.
 """
 
 from __future__ import annotations
@@ -295,8 +295,8 @@ def measure(ours: Stride, theirs: MLflow) -> None:
         theirs.add_run(number)
     compare(f"{LISTED} of {RUNS:,} runs, ms", ours.runs, theirs.runs, same=LISTED)
     compare(f"all {RUNS:,} runs, ms", ours.all_runs, theirs.all_runs, same=RUNS)
-    for number in range(VERSIONS):
-        theirs.add_version(number)
+    added = VERSIONS / timed(lambda: [theirs.add_version(number) for number in range(VERSIONS)])
+    print(f"{'versions registered a second':34}{'':12}{added:12,.0f}", flush=True)
     compare(f"{VERSIONS} versions of a model, ms", ours.versions, theirs.versions, same=VERSIONS)
 
 

@@ -1,4 +1,5 @@
-//! Labels of workers, such as `gpu=h100`. A stage may require some; only workers that have all of them get its work.
+//! Labels of workers, such as `gpu=h100`. A stage may require some; only workers that have all of them get its work. A
+//! worker whose label has the key `only` is kept for stages that require this label.
 
 use std::collections::BTreeSet;
 use std::fmt;
@@ -14,6 +15,11 @@ use crate::limits;
 #[derive(Debug, Clone, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, JsonSchema)]
 #[serde(transparent)]
 pub struct Labels(BTreeSet<String>);
+
+/// The key of labels that keep a worker for the stages that require them.
+const ONLY: &str = "only=";
+/// The label of workers that are kept for draws. While one is here, draws require it.
+pub const ONLY_DRAWS: &str = "only=draws";
 
 /// The reason for which a label is refused.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -36,9 +42,11 @@ impl Labels {
         self.0.iter().map(String::as_str)
     }
 
-    /// Returns true if each of `required` is among these labels.
+    /// Returns true if a worker with these labels may work on a stage that requires `required`: it has all of them, and
+    /// the stage requires those for which the worker is kept.
     pub fn have(&self, required: &Self) -> bool {
-        required.0.is_subset(&self.0)
+        let kept = self.iter().filter(|label| label.starts_with(ONLY)).all(|label| required.0.contains(label));
+        kept && required.0.is_subset(&self.0)
     }
 
     /// Checks labels of another process or of a file.
@@ -101,5 +109,16 @@ mod tests {
         assert!(labels("gpu=h100,zone=a").have(&labels("gpu=h100")));
         assert!(labels("").have(&labels("")));
         assert!(!labels("gpu=a100").have(&labels("gpu=h100")));
+    }
+
+    #[test]
+    fn a_worker_is_kept_for_the_stages_that_require_its_label() {
+        let labels = |text: &str| text.parse::<Labels>().unwrap_or_default();
+        let kept = labels("only=draws,zone=a");
+        assert!(kept.have(&labels(ONLY_DRAWS)));
+        assert!(kept.have(&labels("only=draws,zone=a")));
+        assert!(!kept.have(&labels("")));
+        assert!(!kept.have(&labels("zone=a")));
+        assert!(!labels("zone=a").have(&labels(ONLY_DRAWS)));
     }
 }

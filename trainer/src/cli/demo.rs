@@ -22,7 +22,7 @@ use super::generate::exported;
 use super::model::{self, CAPTIONS, Found};
 use super::{out, unknown_words};
 use crate::client::{self, Target};
-use crate::local::fleet::Fleet;
+use crate::local::fleet::{Crew, Fleet};
 use crate::local::pack::{Pack, Packed};
 use crate::local::{pipeline_file, run};
 use crate::reader::Reader;
@@ -219,7 +219,7 @@ async fn serve(args: &DemoArgs, folder: &Path) -> Result<u8> {
     let store = Store::open_existing(folder, Holder::this_process("trainer demo")).await?;
     let handle = Coordinator::start(store.clone(), Config::embedded()).await?;
     let announced = client::announce(&store, &handle)?;
-    let mut fleet = Fleet::start(1, &handle, Backend::default(), folder)?;
+    let mut fleet = Fleet::start(&Crew { count: 1, backend: Backend::default(), draws: false }, &handle, folder)?;
     let link = handle.page_link();
     match args.output {
         Output::Json => print::json(&json!({"schema_version": 1, "page": link})),

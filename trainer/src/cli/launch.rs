@@ -81,6 +81,10 @@ async fn stop(args: &JobsArgs) -> Result<u8> {
 }
 
 fn show(jobs: &[Job]) {
+    if jobs.is_empty() {
+        print::out("no jobs of this launcher");
+        return;
+    }
     let row = |job: &Job| vec![job.worker.clone(), job.id.clone(), job.state.name().to_owned()];
     print::out(&print::table(&["WORKER", "JOB", "STATE"], jobs.iter().map(row).collect()));
 }

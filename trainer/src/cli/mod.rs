@@ -300,7 +300,27 @@ fn explained(error: &clap::Error) -> Option<Problem> {
              own workers",
         ));
     }
-    sentences::without_quotes(error, words())
+    let text = || words().map(|word| word.to_string_lossy().into_owned());
+    unknown_command(error, text()).or_else(|| sentences::without_quotes(error, words()))
+}
+
+/// Names the command that an unknown word probably means, where the parser knows none.
+fn unknown_command(error: &clap::Error, words: impl Iterator<Item = String>) -> Option<Problem> {
+    use clap::error::{ContextKind, ErrorKind};
+
+    if error.kind() != ErrorKind::InvalidSubcommand || error.get(ContextKind::SuggestedSubcommand).is_some() {
+        return None;
+    }
+    let mut command = Cli::command();
+    for word in words.filter(|word| !word.starts_with('-')) {
+        let Some(known) = command.find_subcommand(&word).cloned() else {
+            let near = protocol::spelling::nearest(&word, command.get_subcommands().map(clap::Command::get_name))?;
+            let problem = Problem::usage(format!("there is no command `{word}`"));
+            return Some(problem.hint(format!("did you mean `{near}`? `trainer --help` lists the commands")));
+        };
+        command = known;
+    }
+    None
 }
 
 /// Lines that are logged without `RUST_LOG`. The database warns of each statement that waits for a slow disk, in lines of

@@ -6,8 +6,8 @@ use std::time::{Duration, Instant};
 
 use access::Token;
 use coordinator::Handle;
-use protocol::WorkerId;
 use protocol::stage::Backend;
+use protocol::{WorkerId, labels};
 use tokio::process::{Child, Command};
 
 use crate::local::out_of_memory::Watch;
@@ -24,7 +24,9 @@ const EARLY_DEATHS: u32 = 5;
 #[derive(Debug)]
 struct Member {
     name: WorkerId,
+    backend: Backend,
     device: usize,
+    label: Option<&'static str>,
     child: Option<Child>,
     since: Instant,
     /// Offset of the current process in the log, which all processes of the worker share.
@@ -33,13 +35,22 @@ struct Member {
     next_start: Instant,
 }
 
+/// The workers of a run.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Crew {
+    /// Number of workers for all stages.
+    pub(crate) count: usize,
+    pub(crate) backend: Backend,
+    /// Keeps one more worker for draws, so that they are made while all others train.
+    pub(crate) draws: bool,
+}
+
 /// All worker processes of a run.
 #[derive(Debug)]
 pub(crate) struct Fleet {
     members: Vec<Member>,
     url: String,
     token: Token,
-    backend: Backend,
     store: PathBuf,
     logs: PathBuf,
     memory: Watch,
@@ -54,26 +65,33 @@ pub(crate) struct Death {
 }
 
 impl Fleet {
-    /// Starts `count` workers for `coordinator`, which holds `store`. Their logs are in its folder `workers`.
-    pub(crate) fn start(count: usize, coordinator: &Handle, backend: Backend, store: &Path) -> Result<Self> {
+    /// Starts workers for `coordinator`, which holds `store`. Their logs are in its folder `workers`.
+    pub(crate) fn start(crew: &Crew, coordinator: &Handle, store: &Path) -> Result<Self> {
         let logs = store.join("workers");
         // Logs are optional: without the folder, the workers' output is discarded.
         let _ = std::fs::create_dir_all(&logs);
-        let devices = device_count(backend);
         let now = Instant::now();
-        let member = |i: usize| Member {
-            name: WorkerId::new(format!("w{}", i + 1)),
-            device: i % devices.max(1),
+        let devices = device_count(crew.backend);
+        let member = |name: String, backend: Backend, device: usize, label: Option<&'static str>| Member {
+            name: WorkerId::new(name),
+            backend,
+            device,
+            label,
             child: None,
             since: now,
             log_from: 0,
             early_deaths: 0,
             next_start: now,
         };
-        let members = (0..count).map(member).collect();
+        let mut members: Vec<Member> =
+            (0..crew.count).map(|i| member(format!("w{}", i + 1), crew.backend, i % devices.max(1), None)).collect();
+        if crew.draws {
+            // On the CPU, so that a training keeps the memory of its GPU.
+            members.push(member("draws".to_owned(), Backend::default(), 0, Some(labels::ONLY_DRAWS)));
+        }
         let (url, token) = (coordinator.local_url(), coordinator.worker_token().clone());
-        let mut fleet = Self { members, url, token, backend, store: store.to_owned(), logs, memory: Watch::new() };
-        for i in 0..count {
+        let mut fleet = Self { members, url, token, store: store.to_owned(), logs, memory: Watch::new() };
+        for i in 0..fleet.members.len() {
             fleet.spawn(i)?;
         }
         Ok(fleet)
@@ -90,8 +108,9 @@ impl Fleet {
         member.log_from = std::fs::metadata(&log).map_or(0, |log| log.len());
         let child = Command::new(program)
             .args(["worker", "join", &self.url, "--name", member.name.as_str(), "--die-with-parent", "--any-file"])
-            .args(["--backend", self.backend.name(), "--device", &member.device.to_string(), "--store"])
+            .args(["--backend", member.backend.name(), "--device", &member.device.to_string(), "--store"])
             .arg(&self.store)
+            .args(member.label.iter().flat_map(|label| ["--label", label]))
             // Not an argument, because every user of the machine can read arguments.
             .env("STRIDE_TOKEN", self.token.secret())
             // Our own settings are for another server.

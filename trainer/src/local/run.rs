@@ -13,7 +13,7 @@ use tokio::signal::unix::{Signal, SignalKind, signal};
 
 use crate::client;
 use crate::local::advice::advice;
-use crate::local::fleet::{self, Death, Fleet};
+use crate::local::fleet::{self, Crew, Death, Fleet};
 use crate::local::missing::check_backend;
 use crate::local::pipeline_file::PipelineFile;
 use crate::local::{pictures, pipeline_file};
@@ -178,7 +178,8 @@ async fn watch(
         }
         if fleet.is_none() && wants_workers(&view) {
             let count = options.workers.unwrap_or_else(|| fleet::default_size(pipeline.backend));
-            *fleet = Some(Fleet::start(count, handle, pipeline.backend, &options.store)?);
+            let crew = Crew { count, backend: pipeline.backend, draws: options.ui };
+            *fleet = Some(Fleet::start(&crew, handle, &options.store)?);
         }
         if let Some(fleet) = fleet {
             for death in fleet.reap(true)? {

@@ -20,6 +20,7 @@ use super::launchers::Launchers;
 use super::lines::Lines;
 use super::meters::Meters;
 use super::records::{Records, read};
+use super::run_times::TimesCache;
 use super::secrets::Secrets;
 use super::storage::{self, unless_away};
 use super::streams::Streams;
@@ -101,6 +102,7 @@ pub(crate) struct ActorHandle {
     pub(crate) streams: Streams,
     pub(crate) launchers: Launchers,
     pub(crate) lines: Lines,
+    times: Arc<TimesCache>,
 }
 
 impl ActorHandle {
@@ -137,6 +139,7 @@ impl ActorHandle {
             streams: Streams::default(),
             launchers: Launchers::default(),
             lines: Lines::default(),
+            times: Arc::default(),
         };
         (handle, queue)
     }
@@ -384,7 +387,7 @@ impl ActorHandle {
     pub(crate) fn records_for(&self, sees: Option<Group>) -> Records {
         let state = self.state();
         let now = self.now();
-        Records::new(self.seen_store(sees.as_ref()), state, now, sees)
+        Records::new(self.seen_store(sees.as_ref()), state, now, sees).with_times(Arc::clone(&self.times))
     }
 
     /// The newest stored state.

@@ -1,7 +1,7 @@
 //! Draws: motions of registered models, or of checkpoints, for sentences.
 //!
 //! A draw is a run of the pipeline [`PIPELINE`] with a stage `draw.motions` for each model. So an idle worker claims it
-//! like other work, and its result has a key: the same draw is answered from the store. The motions are in the stage's
+//! like other work, or one that is kept for draws, and its result has a key: the same draw is answered from the store. The motions are in the stage's
 //! artifact, in the viewer's form. A checkpoint has one more stage, which makes a model of it.
 
 use std::collections::BTreeMap;
@@ -14,7 +14,7 @@ use axum::{Extension, Json};
 use pipeline::{Pipeline, PipelineStage, StageInput};
 use protocol::message::Submit;
 use protocol::stage::{Backend, DrawMotions, Placement, StageSettings};
-use protocol::{ArtifactKind, Owner, RunId, Seed, StageName, limits};
+use protocol::{ArtifactKind, Labels, Owner, RunId, Seed, StageName, labels, limits};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value, json};
@@ -27,6 +27,7 @@ use super::failure::Failure;
 use super::queries::{idempotency_key, place};
 use crate::state::State as Decided;
 use crate::state::run::Run;
+use crate::view::WorkerView;
 
 /// Name of the pipeline of draws, and so the beginning of their runs' names.
 const PIPELINE: &str = "draw";
@@ -91,11 +92,13 @@ pub(crate) async fn draw(
     let stages = pipeline.stages.iter().map(|stage| stage.name.clone()).collect();
     let state = actor_handle.state();
     check_waiting(&state, &owner)?;
-    pipeline.backend = backend(&state);
+    let (backend, requires) = drawers(&state);
+    pipeline.backend = backend;
     drop(state);
     let _place = place(&actor_handle)?;
     let submit = |pipeline: &Pipeline| Submit { pipeline: json!(pipeline), source, idempotency_key, until: None };
     let run = if draw.checkpoints.is_empty() {
+        require(&mut pipeline, &requires);
         actor_handle.submit(submit(&pipeline), owner, caller.sees()).await?
     } else {
         let records = actor_handle.records_for(caller.sees());
@@ -108,6 +111,7 @@ pub(crate) async fn draw(
             pipeline.stages.extend([model, draw]);
         }
         pipeline.note_code_versions();
+        require(&mut pipeline, &requires);
         let submit = submit(&pipeline);
         actor_handle.submit_own(pipeline, submit, owner).await?
     };
@@ -133,11 +137,27 @@ fn is_draw(run: &Run) -> bool {
     run.pipeline.name == PIPELINE && run.pipeline.stages.iter().any(|stage| draws(&stage.settings))
 }
 
-/// The backend of an idle worker, otherwise of a working one.
-fn backend(state: &Decided) -> Backend {
+/// The backend of the workers that draw, and the labels that they have: those of a worker that is kept for draws,
+/// otherwise the backend of an idle worker, otherwise of a working one.
+fn drawers(state: &Decided) -> (Backend, Labels) {
+    let kept = Labels::from_iter([labels::ONLY_DRAWS.to_owned()]);
     let workers = state.worker_views();
-    let of = |wanted: &str| workers.iter().find(|worker| worker.state == wanted).map(|worker| worker.backend);
-    of("idle").or_else(|| of("working")).unwrap_or_default()
+    let of = |wanted: &str, required: &Labels| {
+        let fits = |worker: &&WorkerView| worker.state == wanted && worker.labels.have(required);
+        workers.iter().find(fits).map(|worker| worker.backend)
+    };
+    if let Some(backend) = of("idle", &kept).or_else(|| of("working", &kept)) {
+        return (backend, kept);
+    }
+    let any = Labels::default();
+    (of("idle", &any).or_else(|| of("working", &any)).unwrap_or_default(), any)
+}
+
+/// Lets all stages require labels of their workers.
+fn require(pipeline: &mut Pipeline, labels: &Labels) {
+    for stage in &mut pipeline.stages {
+        stage.placement.requires = labels.clone();
+    }
 }
 
 /// The name that a checkpoint has as a model until the stage that makes one of it has a name.

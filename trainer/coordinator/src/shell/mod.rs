@@ -40,6 +40,7 @@ mod revocable;
 mod route;
 mod route_server;
 mod run_settings;
+mod run_times;
 mod scrape;
 mod secrets;
 mod session_calls;

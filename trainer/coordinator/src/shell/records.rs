@@ -12,6 +12,7 @@ use registry::{
 };
 
 use super::clock::wall_clock;
+use super::run_times::{RunTimes, TimesCache};
 use super::start_error::StartError;
 use crate::batch::Refused;
 use crate::decide::decide;
@@ -40,6 +41,8 @@ pub struct Records {
     ending: BTreeMap<RunId, String>,
     /// The group whose runs are shown; `None` shows all.
     sees: Option<Group>,
+    /// Times that a running coordinator has read.
+    times: Arc<TimesCache>,
 }
 
 /// An error on opening records.
@@ -55,7 +58,12 @@ pub enum RecordsError {
 
 impl Records {
     pub(super) fn new(store: ReadStore, state: Arc<State>, now: Millis, sees: Option<Group>) -> Self {
-        Self { store, state, now, ending: BTreeMap::new(), sees }
+        Self { store, state, now, ending: BTreeMap::new(), sees, times: Arc::default() }
+    }
+
+    /// Shares the times in `cache`.
+    pub(super) fn with_times(self, times: Arc<TimesCache>) -> Self {
+        Self { times, ..self }
     }
 
     fn shows(&self, run: &Run) -> bool {
@@ -132,17 +140,30 @@ impl Records {
     /// If the run does not exist, or its row cannot be read.
     pub async fn run_view(&self, run: &RunId) -> Result<RunView, Refused> {
         let mut view = self.bare_view(run).await?;
-        let mut times = self.store.run_times(std::slice::from_ref(run)).await.map_err(WriteError::from)?;
-        view.times = times.remove(run).unwrap_or_default();
-        if view.stages.iter().any(|stage| !matches!(stage.state, StageState::Waiting | StageState::Cached)) {
-            let stages = self.store.stage_times(run).await.map_err(WriteError::from)?;
-            for stage in &mut view.stages {
-                if !matches!(stage.state, StageState::Waiting | StageState::Cached) {
-                    stage.times = stages.get(&stage.name).copied().unwrap_or_default();
-                }
+        let times = self.times(&view).await?;
+        view.times = times.run;
+        for stage in &mut view.stages {
+            if !matches!(stage.state, StageState::Waiting | StageState::Cached) {
+                stage.times = times.stages.get(&stage.name).copied().unwrap_or_default();
             }
         }
         Ok(view)
+    }
+
+    /// Times of a run and its stages. Those of an active run are read once for each state.
+    async fn times(&self, view: &RunView) -> Result<Arc<RunTimes>, Refused> {
+        let run = &view.run;
+        if let Some(kept) = self.times.get(&self.state, run) {
+            return Ok(kept);
+        }
+        let mut times = self.store.run_times(std::slice::from_ref(run)).await.map_err(WriteError::from)?;
+        let began = view.stages.iter().any(|stage| !matches!(stage.state, StageState::Waiting | StageState::Cached));
+        let stages = if began { self.store.stage_times(run).await.map_err(WriteError::from)? } else { BTreeMap::new() };
+        let times = Arc::new(RunTimes { run: times.remove(run).unwrap_or_default(), stages });
+        if self.state.run(run).is_ok() {
+            self.times.keep(&self.state, run.clone(), Arc::clone(&times));
+        }
+        Ok(times)
     }
 
     /// The view of a run as the coordinator has it, without times.

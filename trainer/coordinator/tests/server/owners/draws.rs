@@ -3,19 +3,21 @@
 use std::collections::BTreeMap;
 
 use coordinator::shell::Drawing;
-use protocol::{ArtifactKind, Manifest, Owner, limits};
+use protocol::message::{DesiredAssignments, Join, Joined, Poll};
+use protocol::{ArtifactKind, Manifest, Owner, labels, limits};
 use registry::Write;
 use reqwest::StatusCode;
 use serde_json::{Value, json};
 
 use super::lab::{Lab, TestResult};
+use crate::shell::offer;
 
 async fn draw(lab: &Lab, name: &str, body: &Value) -> TestResult<(StatusCode, Value)> {
     lab.call(name, "POST", "/v1/draws", body).await
 }
 
-#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_draw_is_a_run_of_its_caller_and_few_wait_at_a_time() -> TestResult {
+/// A lab with the version `drawn:1` of the project `motion`.
+async fn lab_with_a_model() -> TestResult<Lab> {
     let lab = Lab::new().await?;
     let owner = Owner { name: "alice".into(), project: Some("motion".into()), ..Owner::default() };
     let meta = json!({"generator": "latent-diffusion", "format": "humanml3d", "parts": {}});
@@ -23,7 +25,35 @@ async fn a_draw_is_a_run_of_its_caller_and_few_wait_at_a_time() -> TestResult {
     let (metrics, source) = (BTreeMap::new(), json!({"metric": "fid", "mode": "min"}));
     let own = Write::ModelOwner { model: "drawn".into(), owner };
     lab.store.write(vec![own, Write::Version { model: "drawn".into(), artifact, metrics, source }]).await?;
+    Ok(lab)
+}
 
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_worker_that_is_kept_for_draws_takes_nothing_else() -> TestResult {
+    let lab = lab_with_a_model().await?;
+    let kept = Join { labels: labels::ONLY_DRAWS.parse()?, ..offer() };
+    let (_, joined) = lab.call("node", "POST", "/v1/workers", &serde_json::to_value(kept)?).await?;
+    let Joined { incarnation, .. } = serde_json::from_value(joined)?;
+    let asked = json!({"models": ["drawn:1"], "sentences": ["a person walks"]});
+    let (status, answer) = draw(&lab, "anna", &asked).await?;
+    assert_eq!(status, StatusCode::OK, "{answer}");
+    let drawing: Drawing = serde_json::from_value(answer)?;
+    let poll = serde_json::to_value(Poll { incarnation, doing: vec![], ready: vec![], version: 0 })?;
+    let task = loop {
+        let (_, answer) = lab.call("node", "POST", "/v1/workers/a/poll", &poll).await?;
+        let desired: DesiredAssignments = serde_json::from_value(answer)?;
+        if let Some(assignment) = desired.assignments.first() {
+            break assignment.grant.task.to_string();
+        }
+    };
+    assert!(task.starts_with(drawing.run.as_str()), "older runs wait, and it got {task} instead of {}", drawing.run);
+    lab.handle.shutdown().await;
+    Ok(())
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_draw_is_a_run_of_its_caller_and_few_wait_at_a_time() -> TestResult {
+    let lab = lab_with_a_model().await?;
     let asked = json!({"models": ["drawn:1"], "sentences": ["a person walks", "a person \"jumps\""], "seed": 5, "seconds": 2.0});
     let (status, answer) = draw(&lab, "anna", &asked).await?;
     assert_eq!(status, StatusCode::OK, "{answer}");
