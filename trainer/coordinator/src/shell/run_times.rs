@@ -60,7 +60,7 @@ mod tests {
     #[test]
     fn times_hold_as_long_as_the_state() {
         let cache = TimesCache::default();
-        let run = RunId::new("r-1").expect("a name");
+        let run = RunId::new("r-1");
         let times = Times { created_ms: Some(30), ..Times::default() };
         let (first, second) = (state(), state());
         cache.keep(&first, run.clone(), Arc::new(RunTimes { run: times, ..RunTimes::default() }));
@@ -74,7 +74,7 @@ mod tests {
     fn the_number_of_runs_is_bounded() {
         let (cache, state) = (TimesCache::default(), state());
         for number in 0..2 * RUNS {
-            let run = RunId::new(format!("r-{number}")).expect("a name");
+            let run = RunId::new(format!("r-{number}"));
             cache.keep(&state, run, Arc::default());
         }
         assert_eq!(cache.0.lock().expect("the lock").runs.len(), RUNS);
