@@ -45,6 +45,9 @@ fn read_everything(bench: &Bench, finished: &str, interrupted: &str) {
         (&*format!("metrics {finished}"), 0),
         (&*format!("metrics {finished} --stage vae --key loss --csv"), 0),
         (&*format!("metrics {finished} --key none"), 7),
+        (&*format!("files {finished}"), 0),
+        (&*format!("files {finished} --name manifest.json --print"), 7),
+        (&*format!("files {finished} --stage vea"), 7),
         ("sweep status", 7),
         ("worker list", 0),
         (&*format!("plan {config}"), 0),
@@ -90,6 +93,26 @@ fn trains(bench: &Bench, mut running: Running) -> (Running, String) {
     }
 }
 
+/// Lists, prints and copies the files of a finished run.
+fn check_files(bench: &Bench, run: &str) {
+    let listed = bench.run(&["files", run, "-o", "json"]).expect_code(0).json();
+    let listed = listed["files"].as_array().expect("files");
+    assert!(listed.len() > 10, "{listed:?}");
+    let report = ["files", run, "--stage", "fid_pcm", "--name", "report.json", "--print"];
+    assert!(bench.run(&report).expect_code(0).json()["metrics"]["latent_fid"].is_number());
+    assert!(bench.run(&["files", run, "--print"]).expect_code(2).stderr.contains("`--print` writes one"));
+    assert!(bench.run(&["files", run, "--stage", "fid_pmc"]).expect_code(7).stderr.contains("did you mean `fid_pcm`?"));
+    bench.run(&["files", run, "--copy", "copied"]).expect_code(0);
+    let copied = bench.path().join("copied");
+    for file in listed {
+        let word = |key: &str| file[key].as_str().expect("a word");
+        let bytes = fs::read(copied.join(word("stage")).join(word("output")).join(word("name"))).expect("a copy");
+        assert_eq!(Digest::of(&bytes).to_string(), word("digest"));
+    }
+    assert_eq!(files(&copied).len(), listed.len(), "nothing else is there");
+    bench.run(&["files", run, "--copy", "copied"]).expect_code(2);
+}
+
 #[test]
 fn reading_a_store_that_nobody_holds_changes_nothing() {
     let bench = Bench::new(TRAINER);
@@ -125,6 +148,7 @@ fn reading_a_store_that_nobody_holds_changes_nothing() {
     bench.run(&["metrics", &finished, "--key", "loss", "--plot", "loss.svg"]).expect_code(0);
     let picture = fs::read_to_string(bench.path().join("loss.svg")).expect("a picture");
     assert!(picture.starts_with("<svg ") && picture.contains("<polyline"), "{picture}");
+    check_files(&bench, &finished);
     read_everything(&bench, &finished, &interrupted);
 
     let (resumed, again) = trains(&bench, bench.spawn(&["resume", &interrupted, "--workers", "1"]));

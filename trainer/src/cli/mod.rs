@@ -11,6 +11,7 @@ mod doctor;
 mod endpoint_args;
 mod explain;
 mod export;
+mod files;
 mod gallery;
 mod generate;
 mod import;
@@ -85,6 +86,11 @@ enum Verb {
         after_help = "Examples:\n  trainer metrics @last --stage vae\n  trainer metrics @last --key loss --plot loss.svg\n  trainer metrics @last --key loss --csv"
     )]
     Metrics(metrics::MetricsArgs),
+    /// Lists, copies or prints the files that a run's stages made, such as reports and pictures
+    #[command(
+        after_help = "Examples:\n  trainer files @last\n  trainer files @last --stage fid_pcm --name report.json --print\n  trainer files @last --copy made"
+    )]
+    Files(files::FilesArgs),
     /// Shows the trials of a run's sweeps and their results
     #[command(subcommand)]
     Sweep(sweep::SweepVerb),
@@ -360,6 +366,7 @@ impl Verb {
             Self::Status(args) => args.output,
             Self::Logs(args) => args.output,
             Self::Metrics(args) => args.output,
+            Self::Files(args) => args.output,
             Self::Cancel(args) | Self::Pause(args) => args.output,
             Self::Sweep(verb) => verb.output(),
             Self::Data(verb) => verb.output(),
@@ -396,6 +403,7 @@ async fn perform(verb: Verb) -> Result<u8> {
         Verb::Status(args) => remote::status(args).await,
         Verb::Logs(args) => remote::logs(args).await,
         Verb::Metrics(args) => metrics::metrics(args).await,
+        Verb::Files(args) => files::files(args).await,
         Verb::Sweep(verb) => sweep::sweep(verb).await,
         Verb::Cancel(args) => remote::control(args, "cancel").await,
         Verb::Pause(args) => remote::control(args, "pause").await,

@@ -84,7 +84,7 @@ impl Fetched {
     }
 }
 
-async fn verified(reader: &Reader, name: Digest) -> Result<Vec<u8>> {
+pub(super) async fn verified(reader: &Reader, name: Digest) -> Result<Vec<u8>> {
     let bytes = reader.blob(name).await?;
     let found = Digest::of(&bytes);
     if found != name {
@@ -165,7 +165,7 @@ pub(super) async fn report(reader: &Reader, digest: Digest) -> Result<serde_json
         .map_err(|error| Problem::failed(format!("cannot parse the report {digest}: {error}")))
 }
 
-async fn manifest(reader: &Reader, digest: Digest) -> Result<Manifest> {
+pub(super) async fn manifest(reader: &Reader, digest: Digest) -> Result<Manifest> {
     let manifest: Manifest = serde_json::from_slice(&verified(reader, digest).await?)
         .map_err(|error| Problem::failed(format!("cannot parse the manifest {digest}: {error}")))?;
     if manifest.format != Manifest::FORMAT {
