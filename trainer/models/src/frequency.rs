@@ -91,11 +91,31 @@ pub fn low_frequency(
     distance: Pointwise,
     weights: &[f32],
 ) -> Tensor<1> {
-    let [batch, _, width] = found.dims();
-    let device = found.device();
-    let slow = distance.of(low_pass(found - expected, lengths, keep));
+    weighted(low_pass(found - expected, lengths, keep), lengths, distance, weights)
+}
+
+/// The same distance between the fast parts: all coefficients but the lowest `keep`.
+pub fn high_frequency(
+    found: Tensor<3>,
+    expected: Tensor<3>,
+    lengths: &[usize],
+    keep: usize,
+    distance: Pointwise,
+    weights: &[f32],
+) -> Tensor<1> {
+    let difference = found - expected;
+    let frames = difference.dims()[1];
+    let fast = low_pass(difference.clone(), lengths, frames) - low_pass(difference, lengths, keep);
+    weighted(fast, lengths, distance, weights)
+}
+
+/// Distance of `difference_btd` from zero: the mean over a clip's frames and features, times `weights[b]`, summed.
+fn weighted(difference_btd: Tensor<3>, lengths: &[usize], distance: Pointwise, weights: &[f32]) -> Tensor<1> {
+    let [batch, _, width] = difference_btd.dims();
+    let device = difference_btd.device();
     let each = weights.iter().zip(lengths).map(|(weight, length)| weight / (length * width) as f32).collect();
-    (slow * Tensor::<3>::from_data(TensorData::new(each, [batch, 1, 1]), &device)).sum()
+    let each = Tensor::<3>::from_data(TensorData::new(each, [batch, 1, 1]), &device);
+    (distance.of(difference_btd) * each).sum()
 }
 
 /// The loss of the cosine S of two embeddings.
@@ -156,6 +176,28 @@ mod tests {
         close(low_pass(x.clone(), &[8], 8), &X);
         // Three frames have three coefficients; the frames after them have no effect.
         close(low_pass(x, &[3], 5), &[1.0, 2.0, 4.0, 0.0, 0.0, 0.0, 0.0, 0.0]);
+    }
+
+    #[test]
+    fn slow_and_fast_parts_share_the_whole_difference() {
+        let device = Device::flex();
+        let (x, zero) = (column(&X, &device), column(&[0.0; 8], &device));
+        let of = |part: fn(Tensor<3>, Tensor<3>, &[usize], usize, Pointwise, &[f32]) -> Tensor<1>, length, keep| {
+            part(x.clone(), zero.clone(), &[length], keep, Pointwise::L2, &[1.0]).into_scalar::<f32>()
+        };
+        for length in [8, 5] {
+            // The transform keeps lengths, so squares of the coefficients add up to those of the frames.
+            let whole: f32 = X[..length].iter().map(|x| x * x).sum::<f32>() / length as f32;
+            let sum = of(low_frequency, length, 3) + of(high_frequency, length, 3);
+            assert!((sum - whole).abs() < 1e-4, "{sum} instead of {whole}");
+            assert!(of(high_frequency, length, length) < 1e-6);
+        }
+        // Coefficients 1 to 7 of the test above.
+        let fast: f32 = [2.258_133_f32, -3.807_604, -3.781_081, 2.828_427, 0.304_157, 0.046_427, -1.229_532]
+            .iter()
+            .map(|c| c * c)
+            .sum();
+        assert!((of(high_frequency, 8, 1) - fast / 8.0).abs() < 1e-4);
     }
 
     #[test]

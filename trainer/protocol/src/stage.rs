@@ -39,7 +39,7 @@ pub use diffusion::{Diffusion, NoiseSchedule, Prediction};
 pub use distillation::{Distance, Distillation};
 pub use evaluation::{Mode, Split};
 pub use flow::FlowSolver;
-pub use frequency::{FrequencyLosses, LowFrequency, Norm, Over, Semantic};
+pub use frequency::{Band, FrequencyLosses, LowFrequency, Norm, Over, Semantic};
 pub use identity::{Backend, StageIdentity};
 pub use kinds::*;
 pub use neighbours::{Neighbour, Neighbours};

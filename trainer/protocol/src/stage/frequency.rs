@@ -34,6 +34,17 @@ pub enum Over {
     Batch,
 }
 
+/// Coefficients of the cosine transform that a term compares.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum Band {
+    /// The lowest `keep`.
+    #[default]
+    Slow,
+    /// All others: Free-T2M's table 6, in which training fails.
+    Fast,
+}
+
 /// The term on the slow part of the predicted motion.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
@@ -44,7 +55,9 @@ pub struct LowFrequency {
     /// Number K of compared coefficients of the cosine transform. Coefficient k is at `k fps / 2n` Hz in n frames.
     #[schemars(range(min = 1, max = 10_000), extend("x-unit" = "coefficients"))]
     pub keep: usize,
-    /// Distance of the slow parts.
+    /// Side of K that is compared.
+    pub band: Band,
+    /// Distance of these parts.
     pub distance: Norm,
     /// Lowest noise at which the term acts, as a share of the timesteps.
     #[schemars(range(min = 0.0, max = 1.0), extend("x-unit" = "of the timesteps"))]
@@ -62,7 +75,7 @@ impl Default for LowFrequency {
     fn default() -> Self {
         let distance = Norm::default();
         let over = Over::default();
-        Self { weight: 0.0, keep: 8, distance, from: 0.6, to: 1.0, masked: true, over }
+        Self { weight: 0.0, keep: 8, band: Band::default(), distance, from: 0.6, to: 1.0, masked: true, over }
     }
 }
 

@@ -4,10 +4,10 @@
 
 use burn::tensor::{Int, Tensor, TensorData};
 use models::diffusion::{Schedule, affine, unzip};
-use models::frequency::{Agreement, Stage, low_frequency, semantic};
+use models::frequency::{Agreement, Stage, high_frequency, low_frequency, semantic};
 use models::losses::Pointwise;
 use protocol::ArtifactKind;
-use protocol::stage::{DataFormat, FrequencyLosses, Norm, Over};
+use protocol::stage::{Band, DataFormat, FrequencyLosses, Norm, Over};
 
 use super::Losses;
 use crate::artifacts::{self, word};
@@ -139,7 +139,11 @@ impl FrequencyTerms {
             };
             let found = predicted.found.clone();
             let target = predicted.target.clone();
-            let sum = low_frequency(found, target, lengths, low.keep.min(frames), distance, &weights);
+            let term = match low.band {
+                Band::Slow => low_frequency,
+                Band::Fast => high_frequency,
+            };
+            let sum = term(found, target, lengths, low.keep.min(frames), distance, &weights);
             losses.add(LOW_FREQUENCY, sum, low.weight);
         }
         let meaning = &self.settings.semantic;

@@ -5,6 +5,9 @@
 //! DisCoRD's frequencies. Facts that the publication leaves to the user are settings. Tables of positions and other
 //! constants of a published file are kept beside the weights, for a later export.
 
+mod statistics;
+mod tokens;
+
 use std::collections::{BTreeMap, BTreeSet};
 
 use burn::module::Module;
@@ -12,40 +15,27 @@ use burn::tensor::Device;
 use checkpoint::model::{self, Model, Parts};
 use models::flat::{Entry, layout};
 use models::names::{Weights, from_bytes};
-use models::networks::{
-    Denoiser, Gpt, Init, MaskedTransformer, Mmm, MomaskConfig, Projection, ResidualTransformer, Tokenizer, Vae,
-};
-use motion::{DataPath, Skeleton, npy};
+use models::networks::{Denoiser, Init, Vae};
+use motion::Skeleton;
 use protocol::artifact::Role;
 use protocol::stage::{
-    DataFormat, Diffusion, Family, FlowBackbone, FlowNetwork, FlowPrediction, FlowProjection, ImportModel,
-    ImportedPart, NoiseSchedule, Prediction, StageSpec, TextActivation, TokenNetwork, TokenizerNetwork,
+    DataFormat, Diffusion, ImportModel, ImportedPart, NoiseSchedule, Prediction, StageSpec, TextActivation,
 };
-use protocol::units::counted;
 use protocol::{ArtifactKind, Digest, Manifest};
 use serde::Serialize;
 
 use crate::artifacts::{self, DenoiserMeta, Draft, EmbeddingsMeta, MODEL_FILE, VaeMeta, to_meta, word};
 use crate::context::{AttemptContext, ContextError, Outcome, StageError};
 use crate::external::{self, Given};
-use crate::generate::generator::{
-    FEATURE_DIFFUSION, GeneratorMeta, LATENT_DIFFUSION, MASKED_PREFIX, RESIDUAL_PREFIX, TOKENS,
-};
+use crate::generate::generator::{FEATURE_DIFFUSION, LATENT_DIFFUSION};
 use crate::kinds::shape::Plain;
 use crate::parts::control::{CONTROLNET_PREFIX, ControlMeta, TRAJECTORY_PREFIX};
-use crate::parts::flow_decoder::{Backbone, FlowMeta, HEAD};
 use crate::parts::latent_networks::TIME_DIM;
 use crate::parts::motion_networks::{Architecture, MotionDenoiserMeta};
-use crate::parts::tokenizer::TokenizerMeta;
 use crate::parts::{self, model_error, weights};
-use crate::published::sizes::TokenizerSizes;
 use crate::published::{Checkpoint, Found, Taken, sizes};
 use crate::train::data::latents;
-
-/// Name of a single codebook, in our files and in those of T2M-GPT and MMM.
-const CODEBOOK: (&str, &str) = ("quantizer.layers.0.codebook", "quantizer.codebook");
-/// Upper limit of a tokenizer's dilations.
-const REACH: usize = 10_000;
+use statistics::{FEATURES, JOINTS, statistics};
 
 impl Plain for ImportModel {
     fn run(&self, cx: &mut dyn AttemptContext) -> Result<Outcome, StageError> {
@@ -124,58 +114,10 @@ fn part(
     Ok(draft.into_manifest())
 }
 
-fn size_in_words(config: &MomaskConfig) -> String {
-    let MomaskConfig { codes, quantizers, network, text_dim } = config;
-    format!(
-        "{} of {codes} codes, {} of width {}, feed-forward width {}, token width {} and caption width {text_dim}",
-        counted(*quantizers, "codebook"),
-        counted(network.layers, "layer"),
-        network.width,
-        network.feed_forward,
-        network.embedding,
-    )
-}
-
 /// The setting's value if it departs from the rule, else `None`.
 fn departing(found: bool, rule: bool) -> Option<bool> {
     (found != rule).then_some(found)
 }
-
-/// Reads a statistic of a folder: the first existing file of `names`, with `len` finite numbers.
-fn statistic(folder: &DataPath, names: [&str; 2], len: usize) -> Result<Vec<f32>, StageError> {
-    let refuse = |what: String| StageError::Input(format!("{}: {what}", folder.display()));
-    let file = names.iter().map(|name| folder.join(name)).find(DataPath::has_entry);
-    let file = file.ok_or_else(|| refuse(format!("the folder has no `{}`", names.join("` or `"))))?;
-    let array = npy::read_any_float(&file).map_err(|e| StageError::Input(e.to_string()))?;
-    let refuse = |what: String| StageError::Input(format!("{}: {what}", file.display()));
-    if array.data.len() != len {
-        return Err(refuse(format!("has shape {:?}; expected {len} numbers", array.shape)));
-    }
-    if let Some(i) = array.data.iter().position(|v| !v.is_finite()) {
-        return Err(refuse(format!("value {i} is {}; expected a finite number", array.data[i])));
-    }
-    Ok(array.data)
-}
-
-/// Reads mean and deviation from a folder.
-fn statistics(folder: &DataPath, names: [[&str; 2]; 2], len: usize) -> Result<(Vec<f32>, Vec<f32>), StageError> {
-    let mean = statistic(folder, names[0], len)?;
-    let std = statistic(folder, names[1], len)?;
-    if let Some(i) = std.iter().position(|s| *s <= 0.0) {
-        return Err(StageError::Input(format!(
-            "{}: {}: value {i} is {}; expected a number above 0",
-            folder.display(),
-            names[1][0],
-            std[i]
-        )));
-    }
-    Ok((mean, std))
-}
-
-/// File names of the statistics of features.
-const FEATURES: [[&str; 2]; 2] = [["mean.npy", "Mean.npy"], ["std.npy", "Std.npy"]];
-/// File names of the statistics of joints.
-const JOINTS: [[&str; 2]; 2] = [["Mean_raw.npy", "mean_raw.npy"], ["Std_raw.npy", "std_raw.npy"]];
 
 impl Import<'_> {
     /// Reads the tensors of a network, which is created from shapes alone.
@@ -237,12 +179,6 @@ impl Import<'_> {
             )));
         }
         parts::manifest(&*cx.blobs(), meta.text, "the text encoder")
-    }
-
-    fn tokenizer_input(&self, cx: &dyn AttemptContext) -> Result<(Digest, Manifest, TokenizerMeta), StageError> {
-        let (digest, manifest) = artifacts::input(cx, "tokenizer", ArtifactKind::Tokenizer)?;
-        let meta = artifacts::meta(&manifest, "the tokenizer")?;
-        Ok((digest, manifest, meta))
     }
 
     /// Checks that a network in the file equals that of a part with the entries `entries`.
@@ -393,152 +329,6 @@ impl Import<'_> {
         Ok(cx.put_manifest(&model)?)
     }
 
-    fn tokenizer(&mut self, cx: &mut dyn AttemptContext) -> Result<Digest, StageError> {
-        let found = self.file.network(&sizes::TOKENIZER)?;
-        let TokenizerSizes { config, codes, quantizers, single } = sizes::of_tokenizer(&found, self.settings.growth)?;
-        let (format, mean, std) = self.statistics(cx, config.features, &found)?;
-        let TokenizerNetwork { depth, growth, .. } = config.network;
-        let reach = u32::try_from(depth).ok().and_then(|depth| growth.checked_pow(depth));
-        if reach.is_none_or(|reach| reach > REACH) {
-            return Err(found.refuse(format!(
-                "its dilations grow to {growth}^{depth}; expected at most {REACH} frames; set `growth` to the value \
-                 that it was trained with"
-            )));
-        }
-        let meta = TokenizerMeta {
-            format,
-            features: config.features,
-            codes,
-            code_dim: config.dim,
-            quantizers,
-            network: config.network,
-            mean,
-            std,
-        };
-        let network = Tokenizer::new(&meta.config(), &mut Init::shapes(&self.device));
-        let entries: Vec<Entry> = layout(&network).into_iter().chain(meta.books()).collect();
-        let alias = |name: &str| match single && name == CODEBOOK.0 {
-            true => CODEBOOK.1.to_owned(),
-            false => name.to_owned(),
-        };
-        let taken = found.take(&entries, &alias)?;
-        let network = self.taken(entries, taken);
-        Ok(cx.put_manifest(&part(cx, ArtifactKind::Tokenizer, &meta, &[network])?)?)
-    }
-
-    /// Uploads a model of tokens with its parts.
-    fn generator(
-        &self,
-        cx: &mut dyn AttemptContext,
-        (family, network): (Family, TokenNetwork),
-        (longest, text_dim): (usize, usize),
-        (tokenizer, text): ((Digest, Manifest, TokenizerMeta), Manifest),
-        networks: &[Network],
-    ) -> Result<Digest, StageError> {
-        let (digest, part, tokenizer) = tokenizer;
-        let meta = GeneratorMeta {
-            family,
-            network,
-            codes: tokenizer.codes,
-            quantizers: tokenizer.quantizers,
-            longest,
-            text_dim,
-            fits: Parts::from([(Role::TOKENIZER, digest), (Role::TEXT, text.digest())]),
-        };
-        let own = self::part(cx, ArtifactKind::TokenGenerator, &meta, networks)?;
-        let parts = [(Role::GENERATOR, own), (Role::TOKENIZER, part), (Role::TEXT, text)];
-        parts::publish_model(cx, TOKENS, tokenizer.format, &parts.into())
-    }
-
-    /// Refuses a network for other codebooks than the tokenizer's.
-    fn expect_codes(found: &Found<'_>, codes: usize, tokenizer: &TokenizerMeta, one: bool) -> Result<(), StageError> {
-        if codes != tokenizer.codes || (one && tokenizer.quantizers != 1) {
-            return Err(found.refuse(format!(
-                "it generates {codes} codes{}, but `tokenizer` has {} of {}; use the tokenizer that it was \
-                 trained with",
-                if one { " of one codebook" } else { "" },
-                counted(tokenizer.quantizers, "codebook"),
-                tokenizer.codes
-            )));
-        }
-        Ok(())
-    }
-
-    fn gpt(&mut self, cx: &mut dyn AttemptContext) -> Result<Digest, StageError> {
-        let tokenizer = self.tokenizer_input(cx)?;
-        let found = self.file.network(&sizes::GPT)?;
-        let config = sizes::of_gpt(&found, self.settings.longest, self.heads)?;
-        Self::expect_codes(&found, config.codes, &tokenizer.2, true)?;
-        let text = self.text(cx, &found, config.text_dim)?;
-        let network = self.network(&found, |init| Gpt::new(&config, init))?;
-        let lengths = (config.block - 2, config.text_dim);
-        self.generator(cx, (Family::Autoregressive, config.network), lengths, (tokenizer, text), &[network])
-    }
-
-    fn mmm(&mut self, cx: &mut dyn AttemptContext) -> Result<Digest, StageError> {
-        let tokenizer = self.tokenizer_input(cx)?;
-        let found = self.file.network(&sizes::MMM)?;
-        let config = sizes::of_mmm(&found, self.settings.longest, self.heads)?;
-        Self::expect_codes(&found, config.codes, &tokenizer.2, true)?;
-        if config.dim != tokenizer.2.code_dim {
-            return Err(found.refuse(format!(
-                "it expects codes of width {}, but those of `tokenizer` are {} wide; use the tokenizer that it was \
-                 trained with",
-                config.dim, tokenizer.2.code_dim
-            )));
-        }
-        let text = self.text(cx, &found, config.text_dim)?;
-        let network = self.network(&found, |init| Mmm::new(&config, init))?;
-        let lengths = (config.block - 2, config.text_dim);
-        self.generator(cx, (Family::Mmm, config.network), lengths, (tokenizer, text), &[network])
-    }
-
-    fn momask(&mut self, cx: &mut dyn AttemptContext) -> Result<Digest, StageError> {
-        let tokenizer = self.tokenizer_input(cx)?;
-        let quantizers = tokenizer.2.quantizers;
-        let found = self.file.network(&sizes::MASKED)?;
-        let config = sizes::of_masked(&found, quantizers, self.heads)?;
-        Self::expect_codes(&found, config.codes, &tokenizer.2, false)?;
-        let text = self.text(cx, &found, config.text_dim)?;
-        let mut networks =
-            vec![self.network(&found, |init| MaskedTransformer::new(&config, init))?.under(MASKED_PREFIX)];
-        match (self.settings.residual.as_str(), quantizers) {
-            ("", 1) => {}
-            ("", many) => {
-                return Err(found.refuse(format!(
-                    "`tokenizer` has {many} codebooks, but this network generates only the first; set `residual` to \
-                     the file of the residual transformer"
-                )));
-            }
-            _ => networks.push(self.above(cx, &config)?.under(RESIDUAL_PREFIX)),
-        }
-        let lengths = (self.settings.longest, config.text_dim);
-        self.generator(cx, (Family::Masked, config.network), lengths, (tokenizer, text), &networks)
-    }
-
-    /// Reads MoMask's network of the layers above the first.
-    fn above(&mut self, cx: &mut dyn AttemptContext, first: &MomaskConfig) -> Result<Network, StageError> {
-        let path = self.given.path("residual")?;
-        let file = Checkpoint::open(path)?;
-        let found = file.network(&sizes::RESIDUAL)?;
-        let config = sizes::of_residual(&found, self.heads)?;
-        if config != *first {
-            return Err(found.refuse(format!(
-                "it has {}, but the masked transformer has {}; use two networks of the same size, trained with the same \
-                 tokenizer",
-                size_in_words(&config),
-                size_in_words(first)
-            )));
-        }
-        let entries = layout(&ResidualTransformer::new(&config, true, &mut Init::shapes(&self.device)));
-        let taken = found.take(&entries, &str::to_owned)?;
-        if let Some(left_out) = file.left_out(&taken.read) {
-            cx.log(&format!("{}: tensors that were not read, by prefix: {left_out}", path.display()));
-        }
-        self.parameters += taken.values.len();
-        Ok(Network { entries, taken })
-    }
-
     fn mdm(&mut self, cx: &mut dyn AttemptContext) -> Result<Digest, StageError> {
         let found = self.file.network(&sizes::MDM)?;
         let config = sizes::of_mdm(&found, self.heads)?;
@@ -564,52 +354,5 @@ impl Import<'_> {
         let denoiser = part(cx, ArtifactKind::Denoiser, &meta, &[network])?;
         let parts = BTreeMap::from([(Role::DENOISER, denoiser), (Role::TEXT, text)]);
         parts::publish_model(cx, FEATURE_DIFFUSION, meta.format, &parts)
-    }
-
-    fn discord(&mut self, cx: &mut dyn AttemptContext) -> Result<Digest, StageError> {
-        let (digest, _, tokenizer) = self.tokenizer_input(cx)?;
-        let found = self.file.network(&sizes::UNET)?;
-        let config = sizes::of_unet(&found, (self.heads, HEAD))?;
-        if (config.features, config.token_dim) != (tokenizer.features, tokenizer.code_dim) {
-            return Err(found.refuse(format!(
-                "it expects {} features and codes of width {}, but `tokenizer` has {} and {}; use the tokenizer that \
-                 it was trained with",
-                config.features, config.token_dim, tokenizer.features, tokenizer.code_dim
-            )));
-        }
-        let projection = match config.projection {
-            Projection::Stack => FlowProjection::Stack,
-            Projection::Repeat => FlowProjection::Repeat,
-            Projection::Transposed => FlowProjection::Transposed,
-            Projection::Upsample => {
-                return Err(found.refuse("its projection is not supported; expected stack, repeat or transposed"));
-            }
-        };
-        let meta = FlowMeta {
-            format: tokenizer.format,
-            features: config.features,
-            code_dim: config.token_dim,
-            backbone: FlowBackbone::Unet,
-            prediction: FlowPrediction::Velocity,
-            network: FlowNetwork {
-                width: config.width,
-                condition: config.condition_dim,
-                layers: config.blocks,
-                heads: self.heads,
-                attention: config.attention.is_some(),
-                projection,
-                ..FlowNetwork::default()
-            },
-            solver: self.settings.solver.into(),
-            steps: self.settings.solver_steps,
-            fits: Parts::from([(Role::TOKENIZER, digest)]),
-        };
-        let Backbone::Unet(network) = meta.field(&mut Init::shapes(&self.device)).backbone else {
-            return Err(StageError::Fault("expected a U-Net".into()));
-        };
-        let entries = layout(&network);
-        let taken = found.take(&entries, &str::to_owned)?;
-        let network = self.taken(entries, taken);
-        Ok(cx.put_manifest(&part(cx, ArtifactKind::FlowDecoder, &meta, &[network])?)?)
     }
 }
