@@ -1,8 +1,9 @@
 //! Captions: the line grammar of the `texts/` folder, the token form of the evaluators, and the built-in embedding.
 //!
 //! A line is `caption#token token ...#from#to`, a token `word/POS`, the times seconds (`nan` reads as 0). Both times 0
-//! mean that the caption describes the whole clip. As in the published loaders, fields after the times are ignored, and
-//! a caption whose times are no valid range is not used; see [`Oddity`]. Source of grammar, classes and word lists: the
+//! mean that the caption describes the whole clip. A fifth field is the caption in other words, as in SATO's files. As in
+//! the published loaders, later fields are ignored, and a caption whose times are no valid range is not used; see
+//! [`Oddity`]. Source of grammar, classes and word lists: the
 //! HumanML3D and text-to-motion data definitions.
 
 use std::path::{Path, PathBuf};
@@ -31,6 +32,9 @@ pub struct Caption {
     pub from_s: f64,
     /// End in seconds.
     pub to_s: f64,
+    /// The sentence in other words.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub perturbed: Option<String>,
 }
 
 /// A caption line that does not parse.
@@ -48,7 +52,7 @@ pub struct TextError {
 impl Caption {
     /// Creates a caption of a whole clip.
     pub fn whole(text: impl Into<String>, tokens: Vec<String>) -> Self {
-        Self { text: text.into(), tokens, from_s: 0.0, to_s: 0.0 }
+        Self { text: text.into(), tokens, from_s: 0.0, to_s: 0.0, perturbed: None }
     }
 
     /// Returns true if it describes the whole clip.
@@ -82,7 +86,8 @@ impl Caption {
         if let Some(token) = tokens.iter().find(|t| split_token(t).is_none()) {
             return Err(format!("token `{}` is not `word/POS`", excerpt(token)));
         }
-        Ok(Self { text: text.to_owned(), tokens, from_s: seconds(from)?, to_s: seconds(to)? })
+        let perturbed = fields.next().map(str::trim).filter(|text| !text.is_empty()).map(str::to_owned);
+        Ok(Self { text: text.to_owned(), tokens, from_s: seconds(from)?, to_s: seconds(to)?, perturbed })
     }
 
     /// Returns true if its times describe the whole clip or a valid part of it.
@@ -92,7 +97,8 @@ impl Caption {
 
     /// Writes the line that [`Caption::parse`] reads.
     pub fn to_line(&self) -> String {
-        format!("{}#{}#{:?}#{:?}", self.text, self.tokens.join(" "), self.from_s, self.to_s)
+        let perturbed = self.perturbed.iter().map(|text| format!("#{text}")).collect::<String>();
+        format!("{}#{}#{:?}#{:?}{perturbed}", self.text, self.tokens.join(" "), self.from_s, self.to_s)
     }
 }
 
@@ -111,7 +117,7 @@ pub fn split_token(token: &str) -> Option<(&str, &str)> {
 pub enum Oddity {
     /// The times are no valid range, so the caption is not used. Holds them as written.
     Times(String),
-    /// The line has this many fields; those after the fourth are ignored.
+    /// The line has this many fields; those after the fifth are ignored.
     ExtraFields(usize),
 }
 
@@ -142,7 +148,7 @@ pub fn parse_file(file: &Path, content: &str) -> Result<Texts, Vec<TextError>> {
             }
         };
         let fields = line.trim().split('#').count();
-        if fields > 4 {
+        if fields > 5 {
             texts.odd.push((i + 1, Oddity::ExtraFields(fields)));
         }
         if caption.has_range() {
@@ -346,7 +352,7 @@ mod tests {
             "negative#a/DET#-1#3",
             "endless#a/DET#0#inf",
             "more#a/DET#0.0#0.0#5#x",
-            "both#a/DET#3#1#0",
+            "both#a/DET#3#1#0#5",
         ];
         let texts = parse_file(Path::new("1.txt"), &lines.join("\n")).unwrap();
         let used: Vec<(usize, &str)> = texts.captions.iter().map(|(line, c)| (*line, c.text.as_str())).collect();
@@ -358,10 +364,19 @@ mod tests {
             times(5, "-1 to 3 s"),
             times(6, "0 to inf s"),
             (7, Oddity::ExtraFields(6)),
-            (8, Oddity::ExtraFields(5)),
+            (8, Oddity::ExtraFields(6)),
             times(8, "3 to 1 s"),
         ];
         assert_eq!(texts.odd, expected);
+    }
+
+    #[test]
+    fn a_fifth_field_is_the_caption_in_other_words() {
+        let line = "a man walks#a/DET man/NOUN walk/VERB#0.0#0.0#a person strolls";
+        let caption = Caption::parse(line).unwrap();
+        assert_eq!(caption.perturbed.as_deref(), Some("a person strolls"));
+        assert_eq!(caption.to_line(), line);
+        assert_eq!(Caption::parse("a man walks#a/DET#0.0#0.0#").unwrap().perturbed, None);
     }
 
     proptest::proptest! {

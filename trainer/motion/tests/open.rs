@@ -155,7 +155,7 @@ fn what_the_rules_leave_out_is_reported() {
 fn odd_captions_are_left_out_and_listed() {
     let (folder, ids) = folder();
     let text = folder.path().join(format!("texts/{}.txt", ids[0]));
-    let lines = ["whole#whole/ADJ#0#0", "inverted#a/DET#4#1", "more#a/DET#0#0#9", "past#a/DET#900#901"];
+    let lines = ["whole#whole/ADJ#0#0", "inverted#a/DET#4#1", "more#a/DET#0#0#9#8", "past#a/DET#900#901"];
     fs::write(&text, lines.join("\n")).unwrap();
     fs::write(folder.path().join(format!("texts/{}.txt", ids[1])), "inverted#a/DET#4#1\n").unwrap();
     let (dataset, report) = Dataset::open(&DataPath::local(folder.path()), DataFormat::Humanml3d).unwrap();
@@ -165,7 +165,7 @@ fn odd_captions_are_left_out_and_listed() {
         reasons,
         [
             (ids[0].as_str(), inverted(2)),
-            (ids[0].as_str(), SkipReason::ExtraFields { line: 3, fields: 5 }),
+            (ids[0].as_str(), SkipReason::ExtraFields { line: 3, fields: 6 }),
             (ids[0].as_str(), SkipReason::CaptionRange { line: 4, frames: 0 }),
             (ids[1].as_str(), inverted(1)),
             (ids[1].as_str(), SkipReason::NoCaption),
@@ -176,7 +176,7 @@ fn odd_captions_are_left_out_and_listed() {
     assert_eq!(captions, ["whole", "more"]);
     let shown = report.to_string();
     assert!(shown.contains(&format!("texts/{}.txt:2 (4 to 1 s)", ids[0])), "{shown}");
-    assert!(shown.contains(&format!("texts/{}.txt:3 (5 fields)", ids[0])), "{shown}");
+    assert!(shown.contains(&format!("texts/{}.txt:3 (6 fields)", ids[0])), "{shown}");
 }
 
 /// Pipes, cycles of links, sockets and folders in place of files: each is reported at once, without blocking.

@@ -58,6 +58,9 @@ pub struct EvaluateT2m {
     /// the evaluator reads the original caption. 0 changes nothing.
     #[schemars(range(min = 0.0, max = 1.0), extend("x-unit" = "of the words"))]
     pub perturbed: f64,
+    /// Gives the model the fifth field of the caption's line in `texts/`, as in SATO's files; the evaluator reads the
+    /// original caption. Each caption needs one.
+    pub perturbed_texts: bool,
     /// Sampler for the model.
     pub sampler: Sampler,
     /// Number of repeats with other noise, captions, crops and pools.
@@ -96,6 +99,7 @@ impl Default for EvaluateT2m {
             real: false,
             shuffled: false,
             perturbed: 0.0,
+            perturbed_texts: false,
             sampler: Sampler::default(),
             repeats: 20,
             pools: vec![32],
@@ -148,7 +152,7 @@ impl StageSpec for EvaluateT2m {
                 .only_if(generated)
                 // Metrics with shuffled or perturbed captions do not describe the model, so it is not registered with
                 // them.
-                .measured_if(generated && !self.shuffled && self.perturbed == 0.0),
+                .measured_if(generated && !self.shuffled && self.perturbed == 0.0 && !self.perturbed_texts),
             Ref::stage("length", &mut self.length, ArtifactKind::Length).optional().only_if(generated),
             Ref::stage("vae", &mut self.vae, ArtifactKind::Vae).optional(),
             Ref::stage("tokenizer", &mut self.tokenizer, ArtifactKind::Tokenizer).optional(),
@@ -164,9 +168,15 @@ impl StageSpec for EvaluateT2m {
             p.add("length", message, "remove it");
         }
         self.check_subject(p);
-        if self.perturbed > 0.0 && !self.generates() {
-            let message = "`perturbed` changes the captions of a model, but no model is measured";
-            p.add("perturbed", message, "remove it");
+        for (key, set) in [("perturbed", self.perturbed > 0.0), ("perturbed_texts", self.perturbed_texts)] {
+            if set && !self.generates() {
+                let message = format!("`{key}` changes the captions of a model, but no model is measured");
+                p.add(key, message, "remove it");
+            }
+        }
+        if self.perturbed > 0.0 && self.perturbed_texts {
+            let message = "`perturbed` changes words of the captions, but `perturbed_texts` takes others";
+            p.add("perturbed", message, "remove one of them");
         }
         if self.pools.is_empty() {
             p.add(

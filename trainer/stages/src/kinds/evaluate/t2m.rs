@@ -162,6 +162,7 @@ impl Map for EvaluateT2m {
             "reconstructed": self.reconstructs(),
             "shuffled": self.shuffled,
             "perturbed": self.perturbed,
+            "perturbed_texts": self.perturbed_texts,
             "pools": self.pools,
             "drop_last": self.drop_last,
             "drawn_lengths": cx.task().inputs.contains_key("length"),

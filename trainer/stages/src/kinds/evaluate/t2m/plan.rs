@@ -44,13 +44,27 @@ impl<'a> Plan<'a> {
         }
         let pool = (settings.largest_pool(), ", or smaller `pools`");
         let of = EntryDraws::read(cx, settings.split, settings.all_if_small, pool)?;
+        let written = |caption: &Caption| {
+            let text = caption.perturbed.clone();
+            text.ok_or_else(|| {
+                StageError::Input(
+                    "`perturbed_texts`: a caption has no fifth field; expected \
+                     `caption#word/POS ...#from#to#perturbed caption` in each line of `texts/`"
+                        .into(),
+                )
+            })
+        };
         let tell = |(i, caption): (usize, &Caption)| {
             let mut stream = Stream::new(of.seed, "evaluate.t2m/perturbed", 0, i as u64);
             said_otherwise(&caption.text, settings.perturbed, &mut stream)
         };
-        let told = match settings.perturbed > 0.0 {
-            true => of.dataset.captions.iter().enumerate().map(tell).collect(),
-            false => Vec::new(),
+        let captions = &of.dataset.captions;
+        let told = if settings.perturbed_texts {
+            captions.iter().map(written).collect::<Result<_, _>>()?
+        } else if settings.perturbed > 0.0 {
+            captions.iter().enumerate().map(tell).collect()
+        } else {
+            Vec::new()
         };
         Ok(Self { settings, of, told })
     }
