@@ -2,8 +2,8 @@
 
 use std::collections::BTreeMap;
 
-use protocol::canonical;
 use protocol::demand::{Demand, DemandGroup, DemandWorker};
+use protocol::{Group, canonical};
 
 use crate::state::State;
 use crate::state::execution::StageExecution;
@@ -20,7 +20,8 @@ impl State {
     pub fn demand(&self, now: Millis) -> Demand {
         let mut groups: BTreeMap<Need, DemandGroup> = BTreeMap::new();
         for need in self.queue.needs() {
-            let group = groups.entry(Need { gang: false, ..need.clone() }).or_insert_with_key(group_of);
+            let need_of_all = Need { gang: false, group: Group::default(), ..need.clone() };
+            let group = groups.entry(need_of_all).or_insert_with_key(group_of);
             for (_, key) in self.queue.with(need).take(COUNTED) {
                 let execution = &self.executions[&key];
                 group.ready += slots(execution);
@@ -65,6 +66,7 @@ fn need_of(execution: &StageExecution) -> Need {
         backend: execution.backend,
         instruction_set: execution.bound_to().map(str::to_owned),
         requires: execution.placement.requires.clone(),
+        group: Group::default(),
     }
 }
 
@@ -81,7 +83,7 @@ fn group_of(need: &Need) -> DemandGroup {
 }
 
 /// Number of workers that an execution could take now, besides those at work.
-fn slots(execution: &StageExecution) -> u64 {
+pub(crate) fn slots(execution: &StageExecution) -> u64 {
     if !execution.is_gang() {
         return execution.tasks.ready() as u64;
     }

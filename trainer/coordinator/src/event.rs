@@ -71,6 +71,8 @@ pub enum Event {
         /// The time without progress. Milliseconds.
         for_ms: u64,
     },
+    /// A group has too few workers, and a gang of another one can spare a member.
+    Unshared,
     /// No member of a gang has advanced by a step for too long.
     GangStalled { task: TaskId, fence: Fence },
     /// A checkpoint was uploaded and is to be committed.
@@ -139,6 +141,7 @@ impl Event {
             | Self::WorkerGone { .. }
             | Self::GangDivided { .. }
             | Self::Quiet { .. }
+            | Self::Unshared
             | Self::GangStalled { .. }
             | Self::Control { .. }
             | Self::WorkerForgotten { .. }

@@ -13,7 +13,7 @@
 //! | C8 | Tasks that no running run waits for are asked to drain. |
 //! | C9 | A stage is active or done only if all of its inputs are done; an active stage has an execution that is not over. |
 //! | C10 | A run is finished exactly if all requested stages are done, and failed only with a failed stage. |
-//! | C11 | While a small task is ready and not in back-off, no worker of its backend is idle. |
+//! | C11 | While a small task is ready and not in back-off, no worker of its backend that is in its group's share is idle. |
 //! | C12 | The steps of a task's checkpoints increase. |
 //! | C13 | A stage in state `Sweeping` has a searcher that is not over, and an index for each of its tickets. |
 //! | C14 | Derived data agrees with its source: held and waiting tasks, indexes of tasks, tasks of workers, unused workers, active stages, users of executions, order of service. |
@@ -27,6 +27,7 @@ use std::sync::Arc;
 use protocol::message::{Member, RunState};
 
 use crate::decide::schedule;
+use crate::decide::shares::Shares;
 use crate::state::State;
 use crate::state::evidence;
 use crate::state::execution::{ExecutionState, StageExecution};
@@ -38,6 +39,7 @@ use crate::state::worker::{Presence, Worker};
 /// Invariants that `state` violates, each with its number; empty if there are none.
 pub fn check(state: &State) -> Vec<String> {
     let mut broken = check_index(state);
+    let shares = Shares::of(state, state.now);
     let mut busy = BTreeSet::new();
     let wanted: BTreeSet<_> = state.wanted().into_iter().collect();
     for execution in state.executions.values() {
@@ -58,7 +60,7 @@ pub fn check(state: &State) -> Vec<String> {
             let small =
                 task.part != Part::Gang && execution.state == ExecutionState::Open && wanted.contains(&execution.key);
             if small && !state.draining && task.is_free(state.now) && execution.is_ready(task) {
-                let idle: Vec<_> = schedule::idle(state, execution).collect();
+                let idle: Vec<_> = schedule::allowed(state, &shares, execution).collect();
                 if !idle.is_empty() {
                     broken.push(format!("C11: `{}` is ready and {idle:?} idle", task.id));
                 }

@@ -146,6 +146,9 @@ fn tick(state: &mut State, at: Millis, overslept: u64) -> Vec<Event> {
             Lease::Waiting { .. } | Lease::Held { .. } | Lease::Done { .. } => {}
         }
     }
+    if state.member_to_give(now).is_some() {
+        events.push(Event::Unshared);
+    }
     // Gangs come from the reports of their members, so that waiting runs cost nothing here.
     let reported: BTreeSet<&TaskId> = state.heard.words.values().map(|word| &word.grant.task).collect();
     for id in reported {

@@ -9,6 +9,7 @@ use super::attempts::Loss;
 use super::deciding::Deciding;
 use crate::fact::Fact;
 use crate::rejected::Rejected;
+use crate::state::State;
 use crate::state::evidence::{self, Complaints, Leaver, Verdict};
 use crate::state::task::{Part, Task};
 use crate::state::worker::Sign;
@@ -66,7 +67,7 @@ impl Deciding<'_> {
         };
         let worker = task.holders()[rank].worker.clone();
         // Its state is the only copy.
-        if !self.goes_on_without(task, &worker) {
+        if !self.state.goes_on_without(task, &worker) {
             return Ok(false);
         }
         tracing::warn!(task = %task.id, %worker, "the gang has made no step for {} s and waits for this worker; \
@@ -79,13 +80,6 @@ impl Deciding<'_> {
     pub(crate) fn leave(&mut self, key: Digest, i: usize, worker: &WorkerId, cause: LossCause) {
         self.suspect(worker, cause);
         self.take_from(key, i, std::slice::from_ref(worker), Loss::Lost);
-    }
-
-    /// Returns true if a gang keeps its state in memory without `worker`, because another member holds it.
-    pub(crate) fn goes_on_without(&self, task: &Task, worker: &WorkerId) -> bool {
-        let others = task.holders().iter().filter(|member| member.worker != *worker);
-        task.part == Part::Gang
-            && others.into_iter().any(|member| evidence::holds(&self.state.heard.words, task, member).is_some())
     }
 
     /// Returns true if `worker` is known to hold the state of a task.
@@ -124,5 +118,14 @@ impl Deciding<'_> {
         process.suspicions = left.saturating_add(1);
         process.suspected = Some(now);
         self.record(Fact::Worker { worker: worker.clone(), process });
+    }
+}
+
+impl State {
+    /// Returns true if a gang keeps its state in memory without `worker`, because another member holds it.
+    pub(crate) fn goes_on_without(&self, task: &Task, worker: &WorkerId) -> bool {
+        let others = task.holders().iter().filter(|member| member.worker != *worker);
+        task.part == Part::Gang
+            && others.into_iter().any(|member| evidence::holds(&self.heard.words, task, member).is_some())
     }
 }

@@ -25,6 +25,7 @@ pub(crate) mod outcome;
 mod reconcile;
 mod runs;
 pub(crate) mod schedule;
+pub(crate) mod shares;
 mod start;
 pub(crate) mod sweep;
 mod workers;
@@ -108,6 +109,7 @@ impl Deciding<'_> {
             }
             Event::GangDivided { task, fence } => return self.gang_divided(&task, fence),
             Event::GangStalled { task, fence } => return self.gang_stalled(&task, fence),
+            Event::Unshared => return Ok(self.share()),
             Event::Quiet { key, for_ms } => return Ok(self.quiet(key, for_ms)),
             Event::Checkpoint { commit } => return self.checkpoint(commit),
             Event::Outcome { report } => return self.outcome(report),

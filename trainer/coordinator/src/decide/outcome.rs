@@ -114,7 +114,7 @@ impl Deciding<'_> {
     fn failed(&mut self, key: Digest, i: usize, worker: &WorkerId, class: FailureClass, message: &str, rank: usize) {
         let task = &self.state.executions[&key].tasks[i];
         if class != FailureClass::OutOfMemory
-            && self.goes_on_without(task, worker)
+            && self.state.goes_on_without(task, worker)
             && !(class.is_final() && self.has_state(task, worker))
         {
             self.leave(key, i, worker, LossCause::Unreachable);

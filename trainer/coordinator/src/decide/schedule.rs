@@ -10,6 +10,8 @@
 //! 3. Running gangs admit idle workers, up to their `max`.
 //! 4. Waiting gangs start with all remaining workers.
 //!
+//! With work of several groups, each group may take only its [share](crate::decide::shares) of the idle workers.
+//!
 //! A gang admits only workers that have reported its inputs as fetched and its members as reachable.
 //! [`State::open_gangs`] tells idle workers which inputs to fetch; the gang does not wait for slow ones. All workers of
 //! an execution have the same instruction set.
@@ -21,10 +23,11 @@
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
-use protocol::Digest;
 use protocol::message::Member;
+use protocol::{Digest, WorkerId};
 
 use crate::decide::deciding::Deciding;
+use crate::decide::shares::Shares;
 use crate::fact::Fact;
 use crate::policy::GrantOrder;
 use crate::state::State;
@@ -32,6 +35,7 @@ use crate::state::evidence;
 use crate::state::execution::{ExecutionState, StageExecution};
 use crate::state::gang::{self, Change};
 use crate::state::queue::{Need, open_member};
+use crate::state::shared::Map;
 use crate::state::task::{Lease, Task};
 use crate::state::worker::{Presence, Worker};
 
@@ -54,25 +58,40 @@ pub(crate) fn schedule(cx: &mut Deciding<'_>) {
         }
     }
     end_backoffs(cx);
+    cx.share();
     // Usually all workers are busy, and nothing else needs checking.
     cx.state.open_gangs = Arc::default();
     if !cx.state.unused.iter().any(|name| cx.state.workers.get(name).is_some_and(|w| w.presence == Presence::Here)) {
         return;
     }
-    while let Some(key) = next_small(cx.state) {
+    loop {
+        let shares = Shares::of(cx.state, cx.now());
+        note_idle(cx, &shares);
+        let before = cx.facts.len();
+        assign(cx, &shares);
+        // What was assigned changes the shares of the rest.
+        if cx.facts.len() == before || !shares.are_divided() {
+            break;
+        }
+    }
+    cx.state.open_gangs = Arc::new(open_gangs(cx.state));
+    cx.state.visits += cx.state.open_gangs.len() as u64;
+}
+
+/// Assigns idle workers within the shares of their groups.
+fn assign(cx: &mut Deciding<'_>, shares: &Shares) {
+    while let Some(key) = next_small(cx.state, shares) {
         cx.state.visits += 1;
-        small_tasks(cx, key);
+        small_tasks(cx, key, shares);
     }
     let prepared = prepared_gangs(cx.state);
     cx.state.visits += prepared.len() as u64;
     for key in &prepared {
-        change_gangs(cx, *key, fit);
+        change_gangs(cx, *key, |state, execution, task| fit(state, shares, execution, task));
     }
     for key in &prepared {
-        start_gangs(cx, *key);
+        start_gangs(cx, *key, shares);
     }
-    cx.state.open_gangs = Arc::new(open_gangs(cx.state));
-    cx.state.visits += cx.state.open_gangs.len() as u64;
 }
 
 /// Makes tasks ready whose back-off has ended.
@@ -87,9 +106,31 @@ fn end_backoffs(cx: &mut Deciding<'_>) {
     }
 }
 
+/// Notes since when workers are idle, while they are divided.
+fn note_idle(cx: &mut Deciding<'_>, shares: &Shares) {
+    let now = cx.now();
+    let State { unused, heard, .. } = cx.state;
+    if !shares.are_divided() {
+        heard.idle = Map::default();
+        return;
+    }
+    let busy: Vec<WorkerId> = heard.idle.keys().filter(|name| !unused.contains(*name)).cloned().collect();
+    for name in busy {
+        heard.idle.remove_mut(&name);
+    }
+    for name in unused.iter() {
+        if !heard.idle.contains_key(name) {
+            heard.idle.insert_mut(name.clone(), now);
+        }
+    }
+}
+
 /// The first execution with a ready task that an idle worker can take.
-fn next_small(state: &State) -> Option<Digest> {
-    let needs = state.queue.needs().filter(|need| !need.gang && is_met(state, need));
+fn next_small(state: &State, shares: &Shares) -> Option<Digest> {
+    let is_met = |need: &Need| {
+        idle_that(state, |worker| need.takes(worker)).any(|member| shares.allow(&member.worker, &need.group))
+    };
+    let needs = state.queue.needs().filter(|need| !need.gang && is_met(need));
     let first = needs.filter_map(|need| state.queue.with(need).next()).min();
     first.map(|(_, key)| key)
 }
@@ -116,8 +157,18 @@ fn open_gangs(state: &State) -> Vec<(Digest, usize)> {
 }
 
 /// Idle workers that can take work of an execution, in the order of assignment.
-pub(crate) fn idle<'a>(state: &'a State, execution: &'a StageExecution) -> impl Iterator<Item = Member> + 'a {
+fn idle<'a>(state: &'a State, execution: &'a StageExecution) -> impl Iterator<Item = Member> + 'a {
     idle_that(state, move |worker| execution.takes(worker))
+}
+
+/// Those of them that work of the execution's group may take.
+pub(crate) fn allowed<'a>(
+    state: &'a State,
+    shares: &'a Shares,
+    execution: &'a StageExecution,
+) -> impl Iterator<Item = Member> + 'a {
+    let group = state.queue.group(&execution.key);
+    idle(state, execution).filter(move |member| group.is_none_or(|group| shares.allow(&member.worker, group)))
 }
 
 fn idle_that<'a>(state: &'a State, takes: impl Fn(&Worker) -> bool + 'a) -> impl Iterator<Item = Member> + 'a {
@@ -134,13 +185,14 @@ fn idle_that<'a>(state: &'a State, takes: impl Fn(&Worker) -> bool + 'a) -> impl
 /// Idle workers that have the inputs of a task and, as far as known, enough memory for it. All have the same
 /// instruction set: that of the execution's earlier work, or else the most common one. A shunned worker never joins
 /// others. If only shunned workers are left, one of them starts alone, or as many as the minimum requires.
-fn fit(state: &State, execution: &StageExecution, task: &Task) -> Vec<Member> {
+fn fit(state: &State, shares: &Shares, execution: &StageExecution, task: &Task) -> Vec<Member> {
     let fits = |member: &Member| {
         state.workers[&member.worker].ready.contains(&task.id) && !task.too_small.contains(&member.worker)
     };
     let is_shunned = |member: &Member| state.workers[&member.worker].shunned.is_some();
     let mut by_set: Vec<(&str, Vec<Member>)> = Vec::new();
-    for member in idle(state, execution).filter(fits).filter(|member| !task.is_held() || !is_shunned(member)) {
+    for member in allowed(state, shares, execution).filter(fits).filter(|member| !task.is_held() || !is_shunned(member))
+    {
         let set = state.workers[&member.worker].instruction_set.as_str();
         match by_set.iter_mut().find(|(known, _)| *known == set) {
             Some((_, members)) => members.push(member),
@@ -157,15 +209,15 @@ fn fit(state: &State, execution: &StageExecution, task: &Task) -> Vec<Member> {
 }
 
 /// The idle worker for task `i`. A worker that is too slow for a task, or dies of it, would be the first one each time.
-fn next_worker(state: &State, execution: &StageExecution, i: usize) -> Option<Member> {
+fn next_worker(state: &State, shares: &Shares, execution: &StageExecution, i: usize) -> Option<Member> {
     let task = &execution.tasks[i];
-    let mut idle = idle(state, execution);
+    let mut idle = allowed(state, shares, execution);
     if task.failed_on.is_empty() { idle.next() } else { idle.min_by_key(|member| task.failures_on(&member.worker)) }
 }
 
-fn small_tasks(cx: &mut Deciding<'_>, key: Digest) {
+fn small_tasks(cx: &mut Deciding<'_>, key: Digest, shares: &Shares) {
     while let Some(i) = cx.state.executions[&key].tasks.first_ready() {
-        let Some(worker) = next_worker(cx.state, &cx.state.executions[&key], i) else { return };
+        let Some(worker) = next_worker(cx.state, shares, &cx.state.executions[&key], i) else { return };
         grant(cx, key, i, vec![worker]);
     }
 }
@@ -187,7 +239,7 @@ fn change_gangs(cx: &mut Deciding<'_>, key: Digest, joiners: impl Fn(&State, &St
     }
 }
 
-fn start_gangs(cx: &mut Deciding<'_>, key: Digest) {
+fn start_gangs(cx: &mut Deciding<'_>, key: Digest, shares: &Shares) {
     let now = cx.now();
     if !cx.state.executions[&key].is_gang() {
         return;
@@ -197,7 +249,7 @@ fn start_gangs(cx: &mut Deciding<'_>, key: Digest) {
         let task = &execution.tasks[i];
         if task.is_free(now)
             && (execution.range().max == 1 || !cx.state.queue.is_sharding(execution.backend))
-            && let Some(members) = gang::start(&fit(cx.state, execution, task), execution.range())
+            && let Some(members) = gang::start(&fit(cx.state, shares, execution, task), execution.range())
         {
             grant(cx, key, i, members);
         }

@@ -56,6 +56,8 @@ pub struct Heard {
     pub progress: Map<TaskId, Arc<Progress>>,
     /// The highest reported memory of a worker's process by task, in bytes.
     pub memory: Map<TaskId, u64>,
+    /// Times since when workers hold no task, while they are divided among groups.
+    pub idle: Map<WorkerId, Millis>,
     /// Reports of gang members about their state and about each other. A worker that loses its task also loses its
     /// report.
     pub words: Arc<Words>,

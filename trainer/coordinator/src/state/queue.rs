@@ -6,7 +6,7 @@
 //! the index.
 
 use protocol::stage::Backend;
-use protocol::{Digest, Labels};
+use protocol::{Digest, Group, Labels};
 
 use super::execution::StageExecution;
 use super::gang;
@@ -38,6 +38,8 @@ pub struct Need {
     pub instruction_set: Option<String>,
     /// The labels that each worker must have.
     pub requires: Labels,
+    /// The group that waits. Empty where groups are not told apart.
+    pub group: Group,
 }
 
 impl Need {
@@ -86,6 +88,11 @@ impl Queue {
     /// The position of an execution that a running run waits for.
     pub fn rank(&self, key: &Digest) -> Option<Rank> {
         self.entries.get(key)?.rank
+    }
+
+    /// The group that waits for an execution's workers.
+    pub fn group(&self, key: &Digest) -> Option<&Group> {
+        self.entries.get(key)?.need.as_ref().map(|need| &need.group)
     }
 
     /// The position of an execution that needs gang members.

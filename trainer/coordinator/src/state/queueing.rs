@@ -2,8 +2,8 @@
 
 use std::collections::BTreeSet;
 
-use protocol::Digest;
 use protocol::message::RunState;
+use protocol::{Digest, Group};
 
 use super::State;
 use super::execution::{ExecutionState, StageExecution};
@@ -21,7 +21,8 @@ impl State {
     fn entry(&self, execution: &StageExecution) -> Entry {
         let rank = self.rank_now(execution);
         let is_wanted = rank.is_some();
-        let need = (is_wanted && execution.state == ExecutionState::Open).then(|| need(execution)).flatten();
+        let group = rank.and_then(|rank| self.runs.get(&rank.run)).map(|run| run.owner.group()).unwrap_or_default();
+        let need = (is_wanted && execution.state == ExecutionState::Open).then(|| need(execution, group)).flatten();
         let sharding = is_wanted && execution.tasks.is_any_shard_held();
         Entry { rank, need, sharding: sharding.then_some(execution.backend), due: execution.tasks.first_deadline() }
     }
@@ -96,7 +97,7 @@ impl State {
     }
 }
 
-fn need(execution: &StageExecution) -> Option<Need> {
+fn need(execution: &StageExecution, group: Group) -> Option<Need> {
     let gang = execution.is_gang();
     let is_needed = if gang { open_member(execution).is_some() } else { execution.tasks.first_ready().is_some() };
     is_needed.then(|| Need {
@@ -104,5 +105,6 @@ fn need(execution: &StageExecution) -> Option<Need> {
         backend: execution.backend,
         instruction_set: execution.bound_to().map(str::to_owned),
         requires: execution.placement.requires.clone(),
+        group,
     })
 }

@@ -12,4 +12,5 @@ mod liveness;
 mod promises;
 mod queued;
 mod resolve;
+mod shares;
 mod views;

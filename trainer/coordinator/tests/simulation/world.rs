@@ -145,7 +145,7 @@ impl World {
                     source: String::new(),
                     idempotency_key: random.chance(30).then(|| format!("key-{i}")),
                     until: random.chance(20).then(|| "mld".into()),
-                    owner: protocol::Owner::local("me"),
+                    owner: protocol::Owner::local(if i % 2 == 0 { "me" } else { "you" }),
                 };
                 (Millis(random.below(CHAOS_MS / 2)), event)
             })

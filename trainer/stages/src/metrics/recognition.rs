@@ -10,6 +10,9 @@ use nalgebra::{DMatrix, DVector};
 
 /// Added to the kernel's diagonal, which is 1.
 const RIDGE: f64 = 0.05;
+/// Standard deviations from the mean that count at most. Statistics that hardly vary in real clips would otherwise
+/// outweigh all others in generated motion.
+const FARTHEST: f64 = 10.0;
 /// Number of statistics per channel.
 const STATISTICS: usize = 5;
 
@@ -76,12 +79,16 @@ impl Classifier {
     /// The predicted class of a described motion.
     pub fn classify(&self, motion: &[f64]) -> usize {
         let motion = self.standard(motion);
-        let near = DVector::from_iterator(self.known.len(), self.known.iter().map(|known| self.near(known, &motion)));
-        (self.weights.transpose() * near).argmax().0
+        let distances: Vec<f64> = self.known.iter().map(|known| squared(known, &motion)).collect();
+        // A common factor changes no order. Without it, a motion that is far from all would be near to none.
+        let least = distances.iter().copied().fold(f64::INFINITY, f64::min);
+        let near = distances.iter().map(|distance| (-(distance - least) / self.bandwidth).exp());
+        (self.weights.transpose() * DVector::from_iterator(distances.len(), near)).argmax().0
     }
 
     fn standard(&self, motion: &[f64]) -> Vec<f64> {
-        motion.iter().zip(&self.mean).zip(&self.scale).map(|((v, mean), scale)| (v - mean) * scale).collect()
+        let standard = |((v, mean), scale): ((&f64, &f64), &f64)| ((v - mean) * scale).clamp(-FARTHEST, FARTHEST);
+        motion.iter().zip(&self.mean).zip(&self.scale).map(standard).collect()
     }
 
     fn near(&self, a: &[f64], b: &[f64]) -> f64 {
@@ -122,6 +129,12 @@ mod tests {
         let labels: Vec<usize> = (0..60).map(|i| i % 3).collect();
         let motions: Vec<Vec<f64>> = labels.iter().enumerate().map(|(i, class)| described(*class, i as u64)).collect();
         let classifier = Classifier::fit(&motions, &labels, 3).expect("sixty motions");
+        // A statistic that hardly varies in real clips puts a motion far from all of them alike.
+        for class in 0..3 {
+            let mut far = described(class, 2000);
+            far[0] += 100.0;
+            assert_eq!(classifier.classify(&far), class);
+        }
         let right = (0..60).filter(|i| classifier.classify(&described(i % 3, 1000 + *i as u64)) == i % 3).count();
         assert!(right >= 54, "{right} of 60");
     }

@@ -78,7 +78,8 @@ impl Default for EvaluateRecognition {
 
 impl StageSpec for EvaluateRecognition {
     const KIND: &'static str = "evaluate.recognition";
-    const VERSION: u32 = 2;
+    // Version 3 classifies motions that are far from all real ones.
+    const VERSION: u32 = 3;
     const SHAPE: Shape = Shape::Plain;
     const OUTPUT: Output = Output { name: "report", kind: ArtifactKind::Report };
 
