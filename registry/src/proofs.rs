@@ -38,10 +38,10 @@ impl Artifact {
     pub(crate) fn of(digest: Digest, own: u64, manifest: &Manifest) -> Self {
         let mut found = Vec::new();
         mentioned(&manifest.meta, &mut found);
-        let files = manifest.files.values().map(|file| (file.digest, file.bytes));
+        let files = manifest.blobs().map(|blob| (blob.digest, blob.bytes));
         Self {
             kind: manifest.kind,
-            bytes: files.clone().map(|(_, bytes)| bytes).sum(),
+            bytes: manifest.files.values().map(|file| file.bytes).sum(),
             blobs: files.chain([(digest, own)]).collect(),
             mentioned: found,
         }

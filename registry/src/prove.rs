@@ -6,7 +6,7 @@ use std::time::Duration;
 use futures::{StreamExt as _, TryStreamExt as _, stream};
 use protocol::Digest;
 
-use crate::blob::ManifestError;
+use crate::blob::{ManifestError, listed};
 use crate::catalog::{Done, Order};
 use crate::proofs::{Artifact, Proof};
 use crate::{Store, Write, WriteError};
@@ -25,17 +25,17 @@ impl Store {
         let (manifest, own) =
             self.ask_blobs(move || blobs.stored_manifest(artifact)).await.map_err(|e| unproven(&e))?;
         let found = Artifact::of(artifact, own, &manifest);
-        let mut unknown: Vec<_> = manifest.files.iter().map(|(name, file)| (name.clone(), file.clone())).collect();
-        unknown.retain(|(_, file)| self.blobs().just_stored(file.digest) != Some(file.bytes));
+        let mut unknown: Vec<_> = listed(&manifest).collect();
+        unknown.retain(|part| self.blobs().just_stored(part.blob.digest) != Some(part.blob.bytes));
         if !unknown.is_empty() {
-            let listed: Vec<Digest> = unknown.iter().map(|(_, file)| file.digest).collect();
+            let listed: Vec<Digest> = unknown.iter().map(|part| part.blob.digest).collect();
             let present = self.present(&listed).await?;
-            unknown.retain(|(_, file)| present.get(&file.digest) != Some(&file.bytes));
+            unknown.retain(|part| present.get(&part.blob.digest) != Some(&part.blob.bytes));
         }
         stream::iter(unknown)
-            .map(|(name, file)| async move {
+            .map(|part| async move {
                 let blobs = self.blobs().clone();
-                self.ask_blobs(move || blobs.check_listed(artifact, &name, &file)).await
+                self.ask_blobs(move || blobs.check_listed(artifact, &part)).await
             })
             .buffer_unordered(AT_ONCE)
             .try_collect::<()>()

@@ -237,7 +237,7 @@ async fn mark(
         while let Some((digest, read)) = reading.next().await {
             match (read, rows.roots.get(&digest)) {
                 (Ok(manifest), _) => {
-                    marked.extend(manifest.files.values().map(|file| file.digest));
+                    marked.extend(manifest.blobs().map(|blob| blob.digest));
                     mentioned(&manifest.meta, &mut next);
                 }
                 // A digest in `meta` that is not a manifest, or a blob removed since the listing.

@@ -13,7 +13,7 @@ use std::sync::OnceLock;
 
 use checkpoint::BlobError;
 use checkpoint::model::{Model, assemble, extend};
-use protocol::artifact::{FileEntry, Role};
+use protocol::artifact::{Chunk, FileEntry, Role};
 use protocol::digest::Hasher;
 use protocol::stage::{DataFormat, Sampler};
 use protocol::{ArtifactKind, Digest, Manifest, ModelName};
@@ -42,12 +42,12 @@ pub struct Whole {
 }
 
 fn listed(bytes: &[u8]) -> FileEntry {
-    FileEntry { digest: Digest::of(bytes), bytes: bytes.len() as u64 }
+    FileEntry::of_blob(Digest::of(bytes), bytes.len() as u64)
 }
 
-fn part(kind: ArtifactKind, meta: Value, weights: &[u8]) -> Manifest {
+fn part(kind: ArtifactKind, meta: Value, weights: FileEntry) -> Manifest {
     let mut manifest = Manifest::new(kind, meta);
-    manifest.files.insert("model.safetensors".into(), listed(weights));
+    manifest.list([("model.safetensors".to_owned(), weights)]);
     manifest
 }
 
@@ -57,11 +57,23 @@ impl Whole {
     /// # Panics
     /// Panics if the parts form no model, which would be an error in this function.
     pub fn of(weights: Vec<u8>) -> Self {
+        let entry = listed(&weights);
+        Self::with(weights, entry)
+    }
+
+    /// Makes a version whose VAE has these bytes as weights, in blobs of `chunk` bytes.
+    pub fn in_chunks(weights: Vec<u8>, chunk: usize) -> Self {
+        let cut = weights.chunks(chunk).map(|part| Chunk { digest: Digest::of(part), bytes: part.len() as u64 });
+        let entry = FileEntry { chunks: cut.collect(), ..listed(&weights) };
+        Self::with(weights, entry)
+    }
+
+    fn with(weights: Vec<u8>, entry: FileEntry) -> Self {
         let other = b"some weights".to_vec();
-        let vae = part(ArtifactKind::Vae, json!({"features": 263, "mean": [0.5], "std": [1.0]}), &weights);
+        let vae = part(ArtifactKind::Vae, json!({"features": 263, "mean": [0.5], "std": [1.0]}), entry);
         let text = Manifest::new(ArtifactKind::TextEncoder, json!({"encoder": "hashed", "dim": 4}));
         let fits = json!({"vae": vae.digest(), "text": text.digest()});
-        let denoiser = part(ArtifactKind::Denoiser, json!({"fits": fits}), &other);
+        let denoiser = part(ArtifactKind::Denoiser, json!({"fits": fits}), listed(&other));
         let parts = BTreeMap::from([(Role::VAE, vae), (Role::TEXT, text), (Role::DENOISER, denoiser)]);
         let manifest = assemble("latent-diffusion", DataFormat::Humanml3d, &parts).expect("parts that fit");
         let sampled = extend(&manifest, Some(&Sampler::default()), &BTreeMap::new());
@@ -209,9 +221,9 @@ impl Held {
     fn expect_whole(&self, found: &Bundle) {
         let manifest = &found.manifest;
         assert_eq!(self.files.get(&manifest.digest()), Some(&manifest.to_bytes()));
-        for (name, entry) in &manifest.files {
-            let given = self.files.get(&entry.digest).unwrap_or_else(|| panic!("`{name}` was not given"));
-            assert_eq!(given.len() as u64, entry.bytes, "`{name}`");
+        for Chunk { digest, bytes } in manifest.blobs() {
+            let given = self.files.get(&digest).unwrap_or_else(|| panic!("{digest} was not given"));
+            assert_eq!(given.len() as u64, bytes, "{digest}");
         }
         let model = Model::read(manifest).expect("it was read");
         let given: BTreeSet<&Role> = model.parts.keys().collect();

@@ -219,7 +219,7 @@ fn heads_and_manifests_that_this_build_does_not_read_are_refused() {
     assert!(vae.contains("expected a model"), "{vae}");
     assert!(with(&|m| m.format = 9, &same).contains("format 9"));
     assert!(with(&|_| {}, &|text| format!("{text} ")).contains("canonical JSON"));
-    let entry = |bytes| FileEntry { digest: Digest::of(b"x"), bytes };
+    let entry = |bytes| FileEntry::of_blob(Digest::of(b"x"), bytes);
     let lists = |name: &'static str, bytes: u64| with(&move |m| _ = m.files.insert(name.into(), entry(bytes)), &same);
     assert!(lists("../x", 1).contains("`..`"));
     assert!(lists("card.md", 1).contains("reserved for the bundle"));

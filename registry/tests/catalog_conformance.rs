@@ -460,7 +460,7 @@ async fn what_a_row_has_named_is_known_to_be_present(place: &impl Place) {
     let mut manifest = Manifest::new(ArtifactKind::Vae, json!({}));
     for i in 0..FILES {
         let digest = opened.blobs().put(format!("file {i}").as_bytes()).unwrap();
-        manifest.files.insert(i.to_string(), FileEntry { digest, bytes: format!("file {i}").len() as u64 });
+        manifest.files.insert(i.to_string(), FileEntry::of_blob(digest, format!("file {i}").len() as u64));
     }
     let made = opened.blobs().put(&manifest.to_bytes()).unwrap();
     let listed: Vec<Digest> = manifest.files.values().map(|file| file.digest).collect();

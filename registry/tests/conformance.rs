@@ -214,7 +214,7 @@ fn damage_is_noticed_and_mended(store: &BlobStore, damage: &dyn Fn(Digest, &[u8]
     // Read whole, in parts, and through a manifest; the last part is never returned.
     assert!(matches!(store.get(digest), Err(BlobError::Corrupt { expected, .. }) if expected == digest));
     let mut manifest = Manifest::new(ArtifactKind::Vae, json!({}));
-    manifest.files.insert("weights".into(), FileEntry { digest, bytes: good.len() as u64 });
+    manifest.files.insert("weights".into(), FileEntry::of_blob(digest, good.len() as u64));
     let manifest = store.put(&manifest.to_bytes()).unwrap();
     assert!(store.complete_manifest(manifest).is_ok(), "lengths say nothing");
     assert!(matches!(store.whole_manifest(manifest), Err(ManifestError::Blob(BlobError::Corrupt { .. }))));

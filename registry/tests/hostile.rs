@@ -88,7 +88,7 @@ fn made_to_do_harm() -> Vec<Named> {
         change(&mut manifest);
         Form::Manifest.marked(&manifest.to_bytes())
     };
-    let entry = |bytes: u64| FileEntry { digest: Digest::of(b"x"), bytes };
+    let entry = |bytes: u64| FileEntry::of_blob(Digest::of(b"x"), bytes);
     let lists = |name: &'static str, bytes: u64| {
         manifest(&move |manifest: &mut Manifest| _ = manifest.files.insert(name.into(), entry(bytes)))
     };

@@ -7,8 +7,9 @@ use std::sync::Arc;
 
 use bytes::{Bytes, BytesMut};
 use checkpoint::{Blob, BlobError, Blobs};
-use protocol::Digest;
+use protocol::artifact::Chunk;
 use protocol::digest::Hasher;
+use protocol::{Digest, FileEntry};
 
 use crate::active_assignment::ActiveAssignment;
 use crate::cache::{Arriving, Cache, Cached};
@@ -59,6 +60,27 @@ impl HttpBlobs {
                 }
             }
         }
+    }
+
+    /// Returns a file of several blobs as one, from the cache or joined from its blobs and verified as a whole.
+    fn joined(&self, file: &FileEntry) -> Result<Cached, BlobError> {
+        if let Some(whole) = self.cache.get(file.digest) {
+            return Ok(whole);
+        }
+        let local = |e: std::io::Error| BlobError::Storage(format!("file {} cannot be kept here: {e}", file.digest));
+        let mut joined = self.cache.arriving(file.digest, Some(file.bytes)).map_err(local)?;
+        let mut part = vec![0; PART_BYTES];
+        for Chunk { digest, .. } in file.blobs() {
+            let blob = self.cached(digest)?;
+            let mut offset = 0;
+            while offset < blob.bytes() {
+                let most = usize::try_from(blob.bytes() - offset).unwrap_or(PART_BYTES).min(PART_BYTES);
+                blob.read_at(offset, &mut part[..most])?;
+                joined.write(&part[..most]).map_err(local)?;
+                offset += most as u64;
+            }
+        }
+        joined.finish(&self.cache)?.map_err(|found| BlobError::Corrupt { expected: file.digest, found })
     }
 
     /// Fetches the missing bytes. Bytes that have arrived stay in `arriving` if the connection breaks.
@@ -159,6 +181,10 @@ impl Blobs for HttpBlobs {
 
     fn map(&self, digest: Digest) -> Result<Bytes, BlobError> {
         self.cached(digest)?.into_bytes()
+    }
+
+    fn map_chunks(&self, file: &FileEntry) -> Option<Result<Bytes, BlobError>> {
+        Some(self.joined(file).and_then(Cached::into_bytes))
     }
 }
 

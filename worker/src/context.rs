@@ -258,7 +258,7 @@ impl AttemptContext for HttpContext {
         let bytes = self.blobs.get(digest).map_err(blob_error)?;
         let manifest: Manifest = serde_json::from_slice(&bytes)
             .map_err(|e| ContextError::Corrupt(format!("cannot parse the manifest {digest}: {e}")))?;
-        if manifest.format != Manifest::FORMAT {
+        if !manifest.is_readable() {
             let found = manifest.format;
             let known = Manifest::FORMAT;
             return Err(ContextError::Corrupt(format!(

@@ -13,6 +13,7 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use checkpoint::BlobError;
+use protocol::artifact::Chunk;
 use protocol::message::{Member, Prepare};
 use protocol::{Digest, Manifest, TaskId, WorkerId};
 use tokio::sync::{Notify, watch};
@@ -175,10 +176,10 @@ fn prepare(task: &Prepare, client: &Client, cache: &Cache, news: &mut News) -> R
         let bytes = fetch(digest, client, cache, news)?.into_memory()?;
         let manifest: Manifest = serde_json::from_slice(&bytes).map_err(|e| Stopped::Manifest(digest, e))?;
         all.push(digest);
-        for file in manifest.files.values() {
-            let blob = fetch(file.digest, client, cache, news)?;
-            cache.keep_ahead(file.digest, &blob);
-            all.push(file.digest);
+        for Chunk { digest, .. } in manifest.blobs() {
+            let blob = fetch(digest, client, cache, news)?;
+            cache.keep_ahead(digest, &blob);
+            all.push(digest);
         }
     }
     Ok(all)

@@ -14,7 +14,7 @@ pub(crate) struct Receipts(Mutex<Held>);
 #[derive(Debug, Default)]
 struct Held {
     receipts: BTreeMap<Digest, String>,
-    /// Digests of the files and mentions of each uploaded manifest.
+    /// Digests of the blobs and mentions of each uploaded manifest.
     named: BTreeMap<Digest, Vec<Digest>>,
 }
 
@@ -33,7 +33,7 @@ impl Receipts {
     /// Records the digests that a manifest names, for [`for_manifest`](Self::for_manifest).
     pub(crate) fn note(&self, digest: Digest, manifest: &Manifest) {
         let mut named = manifest.mentions();
-        named.extend(manifest.files.values().map(|file| file.digest));
+        named.extend(manifest.blobs().map(|blob| blob.digest));
         lock(&self.0).named.insert(digest, named);
     }
 
@@ -68,7 +68,7 @@ mod tests {
         }
         receipts.keep(input, None);
         let mut manifest = Manifest::new(ArtifactKind::Denoiser, serde_json::json!({"fits": {"vae": input}}));
-        manifest.files.insert("model.safetensors".to_owned(), FileEntry { digest: weights, bytes: 1 });
+        manifest.files.insert("model.safetensors".to_owned(), FileEntry::of_blob(weights, 1));
         receipts.note(part, &manifest);
         let model = Manifest::new(ArtifactKind::Model, serde_json::json!({"parts": {"denoiser": part}}));
         receipts.note(model.digest(), &model);

@@ -16,7 +16,7 @@ use protocol::message::{
 };
 use protocol::stage::{Backend, CheckpointPolicy, DataSynthetic, StageSettings};
 use protocol::{
-    ArtifactKind, Attempt, Fence, Generation, Incarnation, Manifest, RunId, Seed, StageName, TaskId, WorkerId,
+    ArtifactKind, Attempt, Digest, Fence, Generation, Incarnation, Manifest, RunId, Seed, StageName, TaskId, WorkerId,
 };
 use stages::context::{AttemptContext, Exchange, GangContext, Outcome, Part, StageError};
 use tokio::runtime::Runtime;
@@ -125,10 +125,16 @@ impl Worker {
 
     /// Grants the task again under the next fence.
     fn grant(&self, attempt: u64) {
+        self.grant_from(attempt, None);
+    }
+
+    /// Like [`Self::grant`], from a checkpoint.
+    fn grant_from(&self, attempt: u64, resume: Option<Digest>) {
         let member = self.member.clone();
         self.fake.desired(|coordinator| {
             coordinator.fence += 1;
-            coordinator.assignments = vec![assignment(&member, attempt, coordinator.fence)];
+            let assignment = assignment(&member, attempt, coordinator.fence);
+            coordinator.assignments = vec![Assignment { resume, ..assignment }];
         });
     }
 

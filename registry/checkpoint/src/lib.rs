@@ -3,6 +3,7 @@
 //! An artifact is a [`Manifest`](protocol::Manifest) that lists blobs; tensors are safetensors, everything else is
 //! JSON. Loading an artifact executes no code. Other crates decide where blobs are stored and which writes are allowed.
 
+pub mod file;
 pub mod model;
 pub mod published;
 pub mod torch;
@@ -12,7 +13,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use bytes::Bytes;
-use protocol::Digest;
+use protocol::{Digest, FileEntry};
 
 /// Error of reading or writing a blob.
 #[derive(Debug, thiserror::Error)]
@@ -48,7 +49,7 @@ pub enum BlobError {
     Unavailable(String),
 }
 
-/// Content-addressed bytes. Reads are verified.
+/// Content-addressed bytes. Reads are verified. The module [`file`] reads and writes the files of artifacts.
 ///
 /// Large blobs should use [`put_pieces`](Self::put_pieces) and [`open`](Self::open), which hold no second copy.
 pub trait Blobs: Send + Sync + fmt::Debug {
@@ -72,6 +73,12 @@ pub trait Blobs: Send + Sync + fmt::Debug {
     /// For blobs that are read repeatedly, such as a dataset.
     fn map(&self, digest: Digest) -> Result<Bytes, BlobError> {
         Ok(Bytes::from_owner(self.get(digest)?))
+    }
+
+    /// Maps a file of several blobs. `None` if this store cannot; [`file::map`] then reads it into memory.
+    fn map_chunks(&self, file: &FileEntry) -> Option<Result<Bytes, BlobError>> {
+        let _ = file;
+        None
     }
 }
 

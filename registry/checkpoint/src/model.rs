@@ -177,8 +177,9 @@ fn complete(mut manifest: Manifest, mut model: Model, more: &BTreeMap<Role, Mani
 pub fn add_part(whole: &mut Manifest, role: &Role, part: &Manifest) -> Digest {
     let bytes = part.to_bytes();
     let digest = Digest::of(&bytes);
-    whole.files.insert(format!("{role}/{MANIFEST}"), FileEntry { digest, bytes: bytes.len() as u64 });
-    whole.files.extend(part.files.iter().map(|(name, entry)| (format!("{role}/{name}"), entry.clone())));
+    let own = (MANIFEST.to_owned(), FileEntry::of_blob(digest, bytes.len() as u64));
+    let files = part.files.iter().map(|(name, entry)| (name.clone(), entry.clone()));
+    whole.list([own].into_iter().chain(files).map(|(name, entry)| (format!("{role}/{name}"), entry)));
     digest
 }
 
@@ -201,7 +202,7 @@ mod tests {
     fn part(kind: ArtifactKind, meta: Value) -> Manifest {
         let mut manifest = Manifest::new(kind, meta);
         let digest = Digest::of(format!("{kind:?}").as_bytes());
-        manifest.files.insert("model.safetensors".into(), FileEntry { digest, bytes: 3 });
+        manifest.files.insert("model.safetensors".into(), FileEntry::of_blob(digest, 3));
         manifest
     }
 

@@ -334,7 +334,7 @@ mod tests {
         for (role, names) in parts {
             let name = format!("{role}/model.safetensors");
             let own = file(names);
-            let entry = FileEntry { digest: Digest::of(&own), bytes: own.len() as u64 };
+            let entry = FileEntry::of_blob(Digest::of(&own), own.len() as u64);
             manifest.files.insert(name.clone(), entry);
             bytes.insert(name, own);
         }

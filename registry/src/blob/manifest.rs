@@ -1,7 +1,8 @@
 //! Manifests in a store, with checks that their files are complete and whole.
 
 use checkpoint::BlobError;
-use protocol::{Digest, FileEntry, Manifest};
+use protocol::artifact::Chunk;
+use protocol::{Digest, Manifest};
 
 use super::BlobStore;
 
@@ -30,11 +31,11 @@ pub enum ManifestError {
         found: u32,
     },
     /// A file is missing or has another length.
-    #[error("manifest {digest} lists `{file}` as blob {blob} of {expected} bytes, which is {found}")]
+    #[error("manifest {digest} lists {file} as blob {blob} of {expected} bytes, which is {found}")]
     Incomplete {
         /// Digest of the manifest.
         digest: Digest,
-        /// The file's name in the manifest.
+        /// The file, or the chunk of one.
         file: String,
         blob: Digest,
         /// Length in the manifest.
@@ -55,27 +56,42 @@ impl ManifestError {
     }
 }
 
-/// Checks that the blob of a listed file exists with the listed length.
-fn as_listed(digest: Digest, name: &str, file: &FileEntry, found: Option<u64>) -> Result<(), ManifestError> {
-    if found == Some(file.bytes) {
-        return Ok(());
+/// A blob of a file in a manifest.
+#[derive(Debug, Clone)]
+pub(crate) struct Listed {
+    /// The file's name.
+    name: String,
+    /// Number of the blob among the file's, from 1.
+    number: usize,
+    /// Number of the file's blobs.
+    of: usize,
+    pub(crate) blob: Chunk,
+}
+
+impl Listed {
+    /// Names the file, or the chunk of one.
+    fn file(&self) -> String {
+        let Self { name, number, of, .. } = self;
+        if *of == 1 { format!("`{name}`") } else { format!("chunk {number} of {of} of `{name}`") }
     }
-    Err(ManifestError::Incomplete {
-        digest,
-        file: name.to_owned(),
-        blob: file.digest,
-        expected: file.bytes,
-        found: found.map_or_else(|| "not in the store".into(), |bytes| format!("{bytes} bytes long")),
+}
+
+/// Returns the blobs of a manifest's files.
+pub(crate) fn listed(manifest: &Manifest) -> impl Iterator<Item = Listed> + '_ {
+    manifest.files.iter().flat_map(|(name, file)| {
+        let of = file.chunks.len().max(1);
+        file.blobs().enumerate().map(move |(at, blob)| Listed { name: name.clone(), number: at + 1, of, blob })
     })
 }
 
 /// Parses the bytes of the manifest `digest`.
 fn parse(digest: Digest, bytes: &[u8]) -> Result<Manifest, ManifestError> {
-    let manifest: Manifest =
-        serde_json::from_slice(bytes).map_err(|e| ManifestError::NotAManifest { digest, cause: e.to_string() })?;
-    if manifest.format != Manifest::FORMAT {
+    let not_a_manifest = |cause: String| ManifestError::NotAManifest { digest, cause };
+    let manifest: Manifest = serde_json::from_slice(bytes).map_err(|e| not_a_manifest(e.to_string()))?;
+    if !manifest.is_readable() {
         return Err(ManifestError::Format { digest, found: manifest.format });
     }
+    manifest.check_files().map_err(not_a_manifest)?;
     Ok(manifest)
 }
 
@@ -107,24 +123,29 @@ impl BlobStore {
     /// Returns the manifest named `digest` after checking that every listed blob exists with the right length.
     pub fn complete_manifest(&self, digest: Digest) -> Result<Manifest, ManifestError> {
         let manifest = self.manifest(digest)?;
-        for (name, file) in &manifest.files {
-            let found = self.size(file.digest).map_err(ManifestError::Blob)?;
-            as_listed(digest, name, file, found)?;
+        for part in listed(&manifest) {
+            self.check_listed(digest, &part)?;
         }
         Ok(manifest)
     }
 
-    /// Checks that a file listed by the manifest `digest` exists with the right length.
-    pub(crate) fn check_listed(&self, digest: Digest, name: &str, file: &FileEntry) -> Result<(), ManifestError> {
-        as_listed(digest, name, file, self.size(file.digest).map_err(ManifestError::Blob)?)
+    /// Checks that a blob listed by the manifest `digest` exists with the right length.
+    pub(crate) fn check_listed(&self, digest: Digest, part: &Listed) -> Result<(), ManifestError> {
+        let Chunk { digest: blob, bytes: expected } = part.blob;
+        let found = self.size(blob).map_err(ManifestError::Blob)?;
+        if found == Some(expected) {
+            return Ok(());
+        }
+        let found = found.map_or_else(|| "not in the store".into(), |bytes| format!("{bytes} bytes long"));
+        Err(ManifestError::Incomplete { digest, file: part.file(), blob, expected, found })
     }
 
     /// Returns the manifest named `digest` after verifying every listed blob. Hashes the blobs that were written since
     /// they were last hashed.
     pub fn whole_manifest(&self, digest: Digest) -> Result<Manifest, ManifestError> {
         let manifest = self.complete_manifest(digest)?;
-        for file in manifest.files.values() {
-            self.verify(file.digest).map_err(ManifestError::Blob)?;
+        for blob in manifest.blobs() {
+            self.verify(blob.digest).map_err(ManifestError::Blob)?;
         }
         Ok(manifest)
     }

@@ -33,3 +33,4 @@ pub use self::store::BlobStore;
 pub use self::uploads::{Arriving, IDLE, Protected, ResumeError};
 
 pub(crate) use self::disk_error::{is_full, is_read_only};
+pub(crate) use self::manifest::listed;

@@ -1,8 +1,8 @@
 //! Reads a bundle as a stream without trusting it.
 //!
 //! Memory is bounded by the decompressor's window and by the limit of the manifests; a [`Sink`] gets the files piece by
-//! piece. The manifest announces the unpacked size, and each of its files is read once. Reading a small archive that
-//! unpacks to endless data stops at the first byte too many.
+//! piece. A file is one entry and may be several blobs. The manifest announces the unpacked size, and each of its files
+//! is read once. Reading a small archive that unpacks to endless data stops at the first byte too many.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::Read;
@@ -10,7 +10,7 @@ use std::path::{Component, Path};
 
 use checkpoint::BlobError;
 use checkpoint::model::{self, Model};
-use protocol::artifact::{FileEntry, Role};
+use protocol::artifact::{Chunk, Role};
 use protocol::digest::Hasher;
 use protocol::id::is_name;
 use protocol::{ArtifactKind, Digest, Manifest, limits, printable};
@@ -29,13 +29,13 @@ const MAGIC: [u8; 4] = [0x28, 0xb5, 0x2f, 0xfd];
 
 type Result<T> = std::result::Result<T, BundleError>;
 
-/// Receives the files of a bundle, one after the other. `()` only verifies them.
+/// Receives the blobs of a bundle's files, one after the other. `()` only verifies them.
 pub trait Sink {
-    /// Starts a file of `bytes` bytes whose announced digest is `digest`.
+    /// Starts a blob of `bytes` bytes whose announced digest is `digest`.
     fn begin(&mut self, digest: Digest, bytes: u64) -> std::result::Result<(), BlobError>;
-    /// Appends bytes to the file.
+    /// Appends bytes to the blob.
     fn write(&mut self, piece: &[u8]) -> std::result::Result<(), BlobError>;
-    /// Ends a file that was verified as `digest`.
+    /// Ends a blob that was verified as `digest`.
     fn end(&mut self, digest: Digest) -> std::result::Result<(), BlobError>;
 }
 
@@ -191,11 +191,11 @@ impl Reading {
     fn file(&mut self, name: &str, bytes: u64, from: &mut impl Read, sink: &mut impl Sink) -> Result<()> {
         let refuse = |why: String| BundleError::Entry { entry: name.to_owned(), why };
         let known = self.manifest.as_ref().and_then(|(manifest, model)| Some((manifest.files.get(name)?, model)));
-        let Some((FileEntry { digest, bytes: expected }, model)) = known else {
+        let Some((entry, model)) = known else {
             return Err(refuse(format!("`{MANIFEST}` does not list it")));
         };
-        if bytes != *expected {
-            return Err(refuse(format!("it has {bytes} bytes, and `{MANIFEST}` says {expected}")));
+        if bytes != entry.bytes {
+            return Err(refuse(format!("it has {bytes} bytes, and `{MANIFEST}` says {}", entry.bytes)));
         }
         let role = name.strip_suffix("/manifest.json").and_then(|role| Role::try_from(role.to_owned()).ok());
         let role = role.filter(|role| model.parts.contains_key(role));
@@ -206,32 +206,24 @@ impl Reading {
                 return Err(refuse(format!("the manifests have more than {MANIFESTS_BYTES} bytes together")));
             }
         }
-        sink.begin(*digest, bytes)?;
-        let mut hasher = Hasher::default();
-        let mut piece = vec![0; PIECE];
+        let mut whole = (!entry.chunks.is_empty()).then(Hasher::default);
         let mut left = bytes;
-        while left > 0 {
-            let most = usize::try_from(left).unwrap_or(PIECE).min(PIECE);
-            let count = from.read(&mut piece[..most]).map_err(|e| refuse(format!("it cannot be unpacked: {e}")))?;
-            if count == 0 {
-                return Err(refuse(format!("it is truncated: {left} of its {bytes} bytes are missing")));
-            }
-            left -= count as u64;
-            hasher.update(&piece[..count]);
-            sink.write(&piece[..count])?;
-            if let Some(kept) = &mut kept {
-                kept.extend_from_slice(&piece[..count]);
-            }
+        for blob in entry.blobs() {
+            let mut also = |piece: &[u8]| {
+                left -= piece.len() as u64;
+                whole.iter_mut().for_each(|hasher| hasher.update(piece));
+                kept.iter_mut().for_each(|kept| kept.extend_from_slice(piece));
+            };
+            pass(blob, from, &mut also, sink).map_err(|why| match why {
+                Spoiled::Refused(e) => BundleError::from(e),
+                Spoiled::Unreadable(e) => refuse(format!("it cannot be unpacked: {e}")),
+                Spoiled::Cut => refuse(format!("it is truncated: {left} of its {bytes} bytes are missing")),
+                Spoiled::Other(found) => refuse(other(found, blob.digest)),
+            })?;
         }
-        let found = hasher.finish();
-        if found != *digest {
-            return Err(refuse(format!(
-                "its bytes hash to {}, and `{MANIFEST}` says {}",
-                found.short(),
-                digest.short()
-            )));
+        if let Some(found) = whole.map(Hasher::finish).filter(|found| *found != entry.digest) {
+            return Err(refuse(other(found, entry.digest)));
         }
-        sink.end(*digest)?;
         if let (Some(role), Some(content)) = (role, kept) {
             self.parts.insert(role, manifest(name, &content)?);
         }
@@ -264,6 +256,49 @@ impl Reading {
             return Err(BundleError::Damaged(why));
         }
         Ok(Bundle { head, manifest, card: self.card })
+    }
+}
+
+/// Reason why a blob of an entry was not passed.
+enum Spoiled {
+    /// By the sink.
+    Refused(BlobError),
+    Unreadable(std::io::Error),
+    Cut,
+    /// Its bytes hash to this digest.
+    Other(Digest),
+}
+
+fn other(found: Digest, expected: Digest) -> String {
+    format!("its bytes hash to {}, and `{MANIFEST}` says {}", found.short(), expected.short())
+}
+
+/// Passes the next bytes of an entry as one blob to `sink`, and each piece to `also`.
+fn pass(
+    blob: Chunk,
+    from: &mut impl Read,
+    also: &mut impl FnMut(&[u8]),
+    sink: &mut impl Sink,
+) -> std::result::Result<(), Spoiled> {
+    sink.begin(blob.digest, blob.bytes).map_err(Spoiled::Refused)?;
+    let mut hasher = Hasher::default();
+    let mut piece = vec![0; PIECE];
+    let mut left = blob.bytes;
+    while left > 0 {
+        let most = usize::try_from(left).unwrap_or(PIECE).min(PIECE);
+        let count = match from.read(&mut piece[..most]) {
+            Ok(0) => return Err(Spoiled::Cut),
+            Ok(count) => count,
+            Err(e) => return Err(Spoiled::Unreadable(e)),
+        };
+        left -= count as u64;
+        hasher.update(&piece[..count]);
+        sink.write(&piece[..count]).map_err(Spoiled::Refused)?;
+        also(&piece[..count]);
+    }
+    match hasher.finish() {
+        found if found == blob.digest => sink.end(blob.digest).map_err(Spoiled::Refused),
+        found => Err(Spoiled::Other(found)),
     }
 }
 
@@ -307,11 +342,12 @@ fn manifest(name: &str, content: &[u8]) -> Result<Manifest> {
     let refuse = |why: String| BundleError::Entry { entry: name.to_owned(), why };
     let manifest: Manifest = serde_json::from_slice(content)
         .map_err(|e| refuse(format!("this build cannot parse it as a manifest: {e}")))?;
-    if manifest.format != Manifest::FORMAT {
+    if !manifest.is_readable() {
         let found = manifest.format;
         let known = Manifest::FORMAT;
         return Err(refuse(format!("it has format {found}, and this build reads {known}; use a newer build")));
     }
+    manifest.check_files().map_err(&refuse)?;
     // A part's manifest is named by the digest of its canonical bytes, so other bytes are refused.
     if manifest.to_bytes() != content {
         return Err(refuse("it is not canonical JSON".into()));
@@ -329,10 +365,6 @@ fn check_files(manifest: &Manifest, model: &Model) -> std::result::Result<(), St
         check_name(name).map_err(|why| format!("invalid file name `{}` in the manifest: {why}", printable(name)))?;
         if [HEAD, MANIFEST, CARD].contains(&name.as_str()) {
             return Err(format!("it lists `{name}`, which is reserved for the bundle"));
-        }
-        if entry.bytes > limits::BLOB_BYTES as u64 {
-            let most = limits::BLOB_BYTES;
-            return Err(format!("it lists `{}` of {} bytes; expected at most {most}", printable(name), entry.bytes));
         }
         total = total.saturating_add(entry.bytes);
     }

@@ -10,7 +10,7 @@ use protocol::artifact::Role;
 use protocol::message::ApiError;
 use protocol::{Manifest, ModelName, Owner};
 
-use super::export::{Source, whole};
+use super::export::{Source, whole, whole_file};
 use super::{Answer, Data, error};
 use crate::bundle::{self, BundleError, Head, ImportError, Writer};
 use crate::{Store, Version};
@@ -74,7 +74,7 @@ async fn write(source: &impl Source, version: &Version, file: File) -> Result<Ve
     for (name, entry) in &manifest.files {
         writer.file(name, entry.bytes).map_err(failed)?;
         let mut write = |piece: &[u8]| writer.write(piece).map_err(io::Error::other);
-        whole(source, entry.digest, &mut write).await?;
+        whole_file(source, entry, &mut write).await?;
     }
     let file = writer.finish().map_err(failed)?.into_inner().map_err(|e| error("storage", e.error(), None))?;
     file.sync_all().map_err(|e| error("storage", e, None))?;

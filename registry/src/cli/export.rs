@@ -7,7 +7,7 @@ use std::path::{Component, Path};
 
 use checkpoint::published::{ExportError, Layout, Planned, Written};
 use protocol::message::ApiError;
-use protocol::{Digest, Manifest};
+use protocol::{Digest, FileEntry, Manifest};
 use sha2::{Digest as _, Sha256};
 
 use super::error;
@@ -36,7 +36,7 @@ pub(super) async fn export(source: &impl Source, version: &Version, dir: &Path) 
         let parent = path.parent().unwrap_or(dir);
         let file = fs::create_dir_all(parent).and_then(|()| File::create_new(&path));
         let mut file = file.map_err(|e| failed(&path, &e))?;
-        whole(source, entry.digest, &mut |part| file.write_all(part)).await?;
+        whole_file(source, entry, &mut |part| file.write_all(part)).await?;
         names.push(name.clone());
     }
     let path = dir.join("manifest.json");
@@ -85,7 +85,7 @@ async fn written(source: &impl Source, manifest: &Manifest, planned: &Planned, t
     for name in planned.reads() {
         let Some(entry) = manifest.files.get(name) else { continue };
         let mut bytes = Vec::new();
-        whole(source, entry.digest, &mut |part| bytes.write_all(part)).await?;
+        whole_file(source, entry, &mut |part| bytes.write_all(part)).await?;
         files.insert(name.to_owned(), bytes);
     }
     planned.write(|| File::create_new(to).map(io::BufWriter::new), &files).map_err(|e| match e {
@@ -136,13 +136,37 @@ pub(super) async fn whole(
         write(part)
     };
     source.fetch(digest, &mut into).await?;
+    expect("blob", digest, hash)
+}
+
+/// Passes a file's bytes to `write` and verifies its blobs and its digest.
+pub(super) async fn whole_file(
+    source: &impl Source,
+    file: &FileEntry,
+    write: &mut impl FnMut(&[u8]) -> io::Result<()>,
+) -> Result<(), ApiError> {
+    if file.chunks.is_empty() {
+        return whole(source, file.digest, write).await;
+    }
+    let mut hash = Sha256::new();
+    let mut into = |part: &[u8]| {
+        hash.update(part);
+        write(part)
+    };
+    for blob in file.blobs() {
+        whole(source, blob.digest, &mut into).await?;
+    }
+    expect("file", file.digest, hash)
+}
+
+fn expect(what: &str, digest: Digest, hash: Sha256) -> Result<(), ApiError> {
     let found = Digest::from_bytes(hash.finalize().into());
     if found == digest {
         return Ok(());
     }
     Err(error(
         "damaged",
-        format!("blob {digest} is corrupt: its bytes hash to {found}"),
+        format!("{what} {digest} is corrupt: its bytes hash to {found}"),
         Some("`registry fsck` checks the store"),
     ))
 }

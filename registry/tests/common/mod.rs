@@ -57,7 +57,7 @@ pub fn artifact(blobs: &BlobStore, kind: ArtifactKind, content: &str) -> Digest 
     let bytes = content.as_bytes();
     let mut manifest = Manifest::new(kind, json!({}));
     let digest = blobs.put(bytes).unwrap();
-    manifest.files.insert("content".into(), FileEntry { digest, bytes: bytes.len() as u64 });
+    manifest.files.insert("content".into(), FileEntry::of_blob(digest, bytes.len() as u64));
     blobs.put(&manifest.to_bytes()).unwrap()
 }
 

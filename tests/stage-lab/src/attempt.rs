@@ -7,7 +7,7 @@ use std::sync::{Arc, Mutex, MutexGuard};
 use burn::tensor::Device;
 use checkpoint::{BlobError, Blobs};
 use protocol::message::StageTask;
-use protocol::{Digest, Manifest};
+use protocol::{Digest, Manifest, limits};
 
 use stages::context::{AttemptContext, ContextError, Outcome};
 use stages::external::DataAccess;
@@ -62,6 +62,8 @@ pub struct MemoryAttempt {
     stop: Arc<AtomicBool>,
     /// Access to files outside the store: unrestricted, without expected digests.
     pub data: Arc<DataAccess>,
+    /// Bytes of the blobs of a long file.
+    pub chunk_bytes: u64,
     /// Reports of the attempt so far.
     pub told: Told,
 }
@@ -70,7 +72,8 @@ impl MemoryAttempt {
     /// Creates an attempt at `task` that computes on `device`.
     pub fn new(task: StageTask, device: Device, blobs: Arc<MemoryBlobs>) -> Self {
         let data = Arc::new(DataAccess::unverified());
-        Self { task, device, blobs, stop: Arc::default(), data, told: Told::default() }
+        let chunk_bytes = limits::CHUNK_BYTES;
+        Self { task, device, blobs, stop: Arc::default(), data, chunk_bytes, told: Told::default() }
     }
 
     /// A flag that makes [`AttemptContext::interrupted`] true once set.
@@ -103,7 +106,7 @@ impl AttemptContext for MemoryAttempt {
 
     fn put_manifest(&mut self, manifest: &Manifest) -> Result<Digest, ContextError> {
         for (name, entry) in &manifest.files {
-            let blob = self.blobs.get(entry.digest);
+            let blob = checkpoint::file::get(&*self.blobs, entry);
             let blob = blob.map_err(|e| ContextError::Corrupt(format!("file `{name}` of a manifest: {e}")))?;
             if blob.len() as u64 != entry.bytes {
                 return Err(ContextError::Corrupt(format!(
@@ -126,6 +129,10 @@ impl AttemptContext for MemoryAttempt {
 
     fn log(&mut self, line: &str) {
         self.told.log.push(line.to_owned());
+    }
+
+    fn chunk_bytes(&self) -> u64 {
+        self.chunk_bytes
     }
 
     fn interrupted(&self) -> bool {

@@ -231,6 +231,9 @@ impl AttemptContext for Member {
     fn log(&mut self, line: &str) {
         self.attempt.log(line);
     }
+    fn chunk_bytes(&self) -> u64 {
+        self.attempt.chunk_bytes()
+    }
     fn interrupted(&self) -> bool {
         self.attempt.interrupted()
     }

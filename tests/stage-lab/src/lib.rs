@@ -15,7 +15,7 @@ use burn::tensor::Device;
 use checkpoint::Blobs as _;
 use protocol::message::StageTask;
 use protocol::stage::{CheckpointPolicy, Shape, StageSettings};
-use protocol::{Digest, Manifest, RunId, Seed, StageName};
+use protocol::{Digest, Manifest, RunId, Seed, StageName, limits};
 
 use stages::context::{ContextError, Part, StageError};
 use stages::kinds;
@@ -37,6 +37,8 @@ pub struct Bench {
     pub members: usize,
     /// Losses and joins of members.
     pub script: Script,
+    /// Bytes of the blobs of a long file.
+    pub chunk_bytes: u64,
 }
 
 impl Bench {
@@ -50,6 +52,7 @@ impl Bench {
             checkpoint: CheckpointPolicy::default(),
             members,
             script: Script::default(),
+            chunk_bytes: limits::CHUNK_BYTES,
         }
     }
 
@@ -103,7 +106,7 @@ impl Bench {
     /// If the stage records or returns values that its kind does not declare.
     pub fn run(&mut self, name: &str, settings: &StageSettings, inputs: &[(&str, Digest)]) -> Result<Ran, StageError> {
         let task = self.task(name, settings, inputs);
-        let attempt = || MemoryAttempt::new(task.clone(), self.device.clone(), Arc::clone(&self.blobs));
+        let attempt = self.attempt(task);
         match settings.shape() {
             Shape::Plain => {
                 let mut cx = attempt();
@@ -156,9 +159,20 @@ impl Bench {
         body: &Body<'_>,
     ) -> Result<Ran, StageError> {
         let task = self.task(name, settings, inputs);
-        let attempt = || MemoryAttempt::new(task.clone(), self.device.clone(), Arc::clone(&self.blobs));
+        let attempt = self.attempt(task);
         let saved = self.checkpoints.entry(name.to_owned()).or_default();
         gang::run(attempt, self.members, &self.script, saved, body)
+    }
+
+    /// Creates attempts at `task`.
+    fn attempt(&self, task: StageTask) -> impl Fn() -> MemoryAttempt + use<> {
+        let device = self.device.clone();
+        let blobs = Arc::clone(&self.blobs);
+        let chunk_bytes = self.chunk_bytes;
+        move || {
+            let attempt = MemoryAttempt::new(task.clone(), device.clone(), Arc::clone(&blobs));
+            MemoryAttempt { chunk_bytes, ..attempt }
+        }
     }
 
     fn task(&self, name: &str, settings: &StageSettings, inputs: &[(&str, Digest)]) -> StageTask {

@@ -169,7 +169,7 @@ impl Worker {
         let bytes = content.len() as u64;
         let mut manifest = Manifest::new(kind, serde_json::json!({}));
         let file = self.put(assignment, content).await?;
-        manifest.files.insert("content".into(), FileEntry { digest: file.0, bytes });
+        manifest.files.insert("content".into(), FileEntry::of_blob(file.0, bytes));
         let own = self.put(assignment, manifest.to_bytes()).await?;
         Ok(Output { digest: own.0, receipts: [file, own].into() })
     }

@@ -10,7 +10,7 @@ use std::fmt;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::{Digest, canonical};
+use crate::{Digest, canonical, limits, printable};
 
 /// Kind of an artifact. A stage refuses an input of another kind before anything runs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, JsonSchema)]
@@ -162,31 +162,118 @@ impl fmt::Display for Role {
 /// One file of an artifact.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct FileEntry {
+    /// Digest of the file.
+    pub digest: Digest,
+    /// Length of the file in bytes.
+    pub bytes: u64,
+    /// The blobs whose concatenation is the file. Empty if the file is one blob, named by `digest`.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub chunks: Vec<Chunk>,
+}
+
+/// A blob that holds a file or a part of one.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+pub struct Chunk {
     /// Digest of the blob.
     pub digest: Digest,
     /// Length of the blob in bytes.
     pub bytes: u64,
 }
 
+impl FileEntry {
+    /// Creates the entry of a file that is one blob.
+    pub fn of_blob(digest: Digest, bytes: u64) -> Self {
+        Self { digest, bytes, chunks: Vec::new() }
+    }
+
+    /// The blobs that hold the file, in order. Everything that walks the blobs of a manifest uses this.
+    pub fn blobs(&self) -> impl Iterator<Item = Chunk> + '_ {
+        let whole = self.chunks.is_empty().then_some(Chunk { digest: self.digest, bytes: self.bytes });
+        whole.into_iter().chain(self.chunks.iter().copied())
+    }
+
+    /// Checks the lengths of an untrusted entry.
+    ///
+    /// # Errors
+    /// The reason why no file can have this entry.
+    pub fn check(&self) -> Result<(), String> {
+        if self.bytes > limits::FILE_BYTES {
+            return Err(format!("it has {} bytes; expected at most {}", self.bytes, limits::FILE_BYTES));
+        }
+        if self.chunks.len() > limits::FILE_CHUNKS {
+            return Err(format!("it has {} chunks; expected at most {}", self.chunks.len(), limits::FILE_CHUNKS));
+        }
+        let most = limits::BLOB_BYTES as u64;
+        let mut total = 0u64;
+        for blob in self.blobs() {
+            if blob.bytes > most {
+                return Err(format!("its blob {} has {} bytes; expected at most {most}", blob.digest, blob.bytes));
+            }
+            total = total.saturating_add(blob.bytes);
+        }
+        if total != self.bytes {
+            return Err(format!("its chunks have {total} bytes together, and the file has {}", self.bytes));
+        }
+        Ok(())
+    }
+}
+
 /// Kind, meta and files of an artifact.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Manifest {
-    /// Version of this document, [`Manifest::FORMAT`].
+    /// Version of this document; see [`Manifest::list`].
     pub format: u32,
     pub kind: ArtifactKind,
     /// Data that a reader needs before it opens a file: shapes, settings, lineage. Never a clock, a host or a path.
     pub meta: serde_json::Value,
-    /// Files by name.
+    /// Files by name; [`Manifest::list`] adds to them.
     pub files: BTreeMap<String, FileEntry>,
 }
 
 impl Manifest {
-    /// Format version that this build writes.
-    pub const FORMAT: u32 = 1;
+    /// Newest format that this build reads.
+    pub const FORMAT: u32 = 2;
+    /// Format of a manifest whose files are one blob each. Its digest is the same in every build.
+    const WITHOUT_CHUNKS: u32 = 1;
 
     /// Creates a manifest without files.
     pub fn new(kind: ArtifactKind, meta: serde_json::Value) -> Self {
-        Self { format: Self::FORMAT, kind, meta, files: BTreeMap::new() }
+        Self { format: Self::WITHOUT_CHUNKS, kind, meta, files: BTreeMap::new() }
+    }
+
+    /// Adds files. A manifest with chunks has format 2, because a build that reads format 1 would delete the chunks as
+    /// unneeded.
+    pub fn list(&mut self, files: impl IntoIterator<Item = (String, FileEntry)>) {
+        self.files.extend(files);
+        self.format = self.expected_format();
+    }
+
+    fn expected_format(&self) -> u32 {
+        if self.files.values().any(|file| !file.chunks.is_empty()) { Self::FORMAT } else { Self::WITHOUT_CHUNKS }
+    }
+
+    /// Returns true if this build reads the manifest's format.
+    pub fn is_readable(&self) -> bool {
+        (Self::WITHOUT_CHUNKS..=Self::FORMAT).contains(&self.format)
+    }
+
+    /// Checks the files of an untrusted manifest.
+    ///
+    /// # Errors
+    /// The file that is invalid, and the reason.
+    pub fn check_files(&self) -> Result<(), String> {
+        if self.format < self.expected_format() {
+            return Err(format!("it has format {}, and a file has chunks", self.format));
+        }
+        for (name, file) in &self.files {
+            file.check().map_err(|why| format!("file `{}`: {why}", printable(name)))?;
+        }
+        Ok(())
+    }
+
+    /// The blobs of all files.
+    pub fn blobs(&self) -> impl Iterator<Item = Chunk> + '_ {
+        self.files.values().flat_map(FileEntry::blobs)
     }
 
     /// Serialises the bytes that are stored and hashed.
@@ -216,5 +303,58 @@ pub fn mentioned(meta: &serde_json::Value, found: &mut Vec<Digest>) {
         Value::Array(items) => items.iter().for_each(|item| mentioned(item, found)),
         Value::Object(map) => map.values().for_each(|item| mentioned(item, found)),
         Value::Null | Value::Bool(_) | Value::Number(_) => {}
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, reason = "a test may panic")]
+mod tests {
+    use super::*;
+
+    fn chunk(text: &str) -> Chunk {
+        Chunk { digest: Digest::of(text.as_bytes()), bytes: text.len() as u64 }
+    }
+
+    /// An older build reads and names a manifest without chunks, and refuses one with chunks.
+    #[test]
+    fn only_a_manifest_with_chunks_has_the_newer_format() {
+        let whole = FileEntry::of_blob(Digest::of(b"ab"), 2);
+        let cut = FileEntry { chunks: vec![chunk("a"), chunk("b")], ..whole.clone() };
+        let mut manifest = Manifest::new(ArtifactKind::Checkpoint, serde_json::Value::Null);
+        manifest.list([("state".to_owned(), whole.clone())]);
+        let text = String::from_utf8(manifest.to_bytes()).unwrap();
+        let digest = whole.digest;
+        assert_eq!(
+            text,
+            format!(
+                r#"{{"files":{{"state":{{"bytes":2,"digest":"{digest}"}}}},"format":1,"kind":"checkpoint","meta":null}}"#
+            )
+        );
+        manifest.list([("state".to_owned(), cut.clone())]);
+        assert_eq!(manifest.format, 2);
+        let read: Manifest = serde_json::from_slice(&manifest.to_bytes()).unwrap();
+        assert_eq!(read, manifest);
+        assert!(read.is_readable() && read.check_files().is_ok());
+        assert_eq!(read.blobs().collect::<Vec<_>>(), [chunk("a"), chunk("b")]);
+        let older = Manifest { format: 1, ..read };
+        assert!(older.check_files().is_err());
+        manifest.list([("state".to_owned(), whole)]);
+        assert_eq!(manifest.format, 1);
+        assert!(!Manifest { format: 3, ..manifest }.is_readable());
+    }
+
+    #[test]
+    fn lengths_that_do_not_fit_are_refused() {
+        let file = |bytes: u64, chunks: Vec<Chunk>| FileEntry { digest: Digest::of(b"ab"), bytes, chunks }.check();
+        assert_eq!(file(limits::BLOB_BYTES as u64, Vec::new()), Ok(()));
+        assert!(file(limits::BLOB_BYTES as u64 + 1, Vec::new()).unwrap_err().contains("its blob"));
+        let long = |bytes: u64| Chunk { bytes, ..chunk("a") };
+        let most = vec![long(limits::CHUNK_BYTES); limits::FILE_CHUNKS];
+        assert_eq!(file(limits::FILE_BYTES, most.clone()), Ok(()));
+        assert!(file(limits::FILE_BYTES + 1, most.clone()).unwrap_err().contains("expected at most 549755813888"));
+        let more = [most, vec![long(0)]].concat();
+        assert!(file(limits::FILE_BYTES, more).unwrap_err().contains("513 chunks"));
+        assert!(file(3, vec![chunk("a"), chunk("b")]).unwrap_err().contains("2 bytes together"));
+        assert!(file(1, vec![long(u64::MAX), long(2)]).is_err());
     }
 }

@@ -14,8 +14,15 @@ pub const BATCH_BYTES: usize = 4 << 20;
 pub const BATCH_ENTRIES: usize = 10_000;
 /// Largest size in bytes of a submission, which holds its pipeline as written and as read.
 pub const SUBMISSION_BYTES: usize = 8 << 20;
-/// Largest size of a blob, in bytes.
+/// Largest size of a blob, in bytes. Earlier builds stored a file as one blob.
 pub const BLOB_BYTES: usize = 8 << 30;
+/// Size in bytes of the blobs of a file, except its last one. It is part of the digest of an artifact with a longer
+/// file, so a change of it changes what a stage gives.
+pub const CHUNK_BYTES: u64 = 1 << 30;
+/// Largest number of blobs of a file. A reader holds each of them open.
+pub const FILE_CHUNKS: usize = 512;
+/// Largest size of a file of an artifact, in bytes: 512 GiB.
+pub const FILE_BYTES: u64 = FILE_CHUNKS as u64 * CHUNK_BYTES;
 /// Largest size in bytes of a version's bundle, and of all its files together.
 pub const BUNDLE_BYTES: usize = 256 << 30;
 /// Largest total size in bytes of all calls in memory at a time, without blobs; further calls wait.

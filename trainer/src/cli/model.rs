@@ -9,6 +9,7 @@ use checkpoint::model::{Drawn, Model};
 use checkpoint::{BlobError, Blobs};
 use models::device::DeviceInfo;
 use motion::Dataset;
+use protocol::artifact::Chunk;
 use protocol::message::RunView;
 use protocol::stage::Sampler;
 use protocol::{ArtifactKind, Digest, Manifest};
@@ -76,9 +77,9 @@ impl Fetched {
     /// Fetches the files of a manifest.
     async fn files(reader: &Reader, manifest: &Manifest) -> Result<Self> {
         let blobs = Self::default();
-        for file in manifest.files.values() {
-            let bytes = verified(reader, file.digest).await?;
-            blobs.0.lock().unwrap_or_else(PoisonError::into_inner).insert(file.digest, bytes.into());
+        for Chunk { digest, .. } in manifest.blobs() {
+            let bytes = verified(reader, digest).await?;
+            blobs.0.lock().unwrap_or_else(PoisonError::into_inner).insert(digest, bytes.into());
         }
         Ok(blobs)
     }
@@ -168,7 +169,7 @@ pub(super) async fn report(reader: &Reader, digest: Digest) -> Result<serde_json
 pub(super) async fn manifest(reader: &Reader, digest: Digest) -> Result<Manifest> {
     let manifest: Manifest = serde_json::from_slice(&verified(reader, digest).await?)
         .map_err(|error| Problem::failed(format!("cannot parse the manifest {digest}: {error}")))?;
-    if manifest.format != Manifest::FORMAT {
+    if !manifest.is_readable() {
         let (found, known) = (manifest.format, Manifest::FORMAT);
         return Err(Problem::failed(format!("the manifest {digest} has format {found}; this build reads {known}")));
     }
@@ -203,7 +204,7 @@ pub(super) async fn dataset(reader: &Reader, run: &RunView) -> Result<Option<Dat
     let blobs = Fetched::files(reader, &manifest).await?;
     let fetch = |name: &str| {
         let file = manifest.files.get(name).ok_or_else(|| format!("the dataset has no file `{name}`"))?;
-        blobs.get(file.digest).map(|bytes| bytes::Bytes::from(bytes.to_vec())).map_err(|error| error.to_string())
+        checkpoint::file::map(&blobs, file).map_err(|error| error.to_string())
     };
     Dataset::from_files(&fetch).map(Some).map_err(Problem::failed)
 }

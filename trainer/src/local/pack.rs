@@ -260,7 +260,7 @@ mod tests {
     /// A part with one file of weights.
     fn part(kind: ArtifactKind, meta: Value, file: &[u8]) -> Manifest {
         let mut part = Manifest::new(kind, meta);
-        let entry = FileEntry { digest: Digest::of(file), bytes: file.len() as u64 };
+        let entry = FileEntry::of_blob(Digest::of(file), file.len() as u64);
         part.files.insert("model.safetensors".into(), entry);
         part
     }

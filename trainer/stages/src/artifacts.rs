@@ -14,9 +14,9 @@ use checkpoint::model::{self, Parts};
 use checkpoint::{Blob, BlobError, Blobs};
 use motion::dataset::{Caption, Dataset, PackError, Split};
 use motion::{Stream, Values, paths};
-use protocol::artifact::{FileEntry, Role};
+use protocol::artifact::Role;
 use protocol::stage::{Augment, DataFormat, Diffusion, Family, LatentShape, Network};
-use protocol::{ArtifactKind, Digest, Manifest, Seed, StageName};
+use protocol::{ArtifactKind, Digest, FileEntry, Manifest, Seed, StageName};
 use safetensors::tensor::TensorView;
 use safetensors::{Dtype, SafeTensors};
 use serde::de::DeserializeOwned;
@@ -226,17 +226,17 @@ fn entry<'a>(manifest: &'a Manifest, name: &str) -> Result<&'a FileEntry, StageE
 
 /// Reads one file of an artifact into memory.
 pub fn file(blobs: &dyn Blobs, manifest: &Manifest, name: &str) -> Result<Arc<[u8]>, StageError> {
-    blobs.get(entry(manifest, name)?.digest).map_err(blob_error)
+    checkpoint::file::get(blobs, entry(manifest, name)?).map_err(blob_error)
 }
 
 /// Opens one file of an artifact for reading in pieces, for files too large to be in memory twice.
 pub fn open(blobs: &dyn Blobs, manifest: &Manifest, name: &str) -> Result<Box<dyn Blob>, StageError> {
-    blobs.open(entry(manifest, name)?.digest).map_err(blob_error)
+    checkpoint::file::open(blobs, entry(manifest, name)?).map_err(blob_error)
 }
 
 /// Maps one file of an artifact, which stays on disk if possible; for data that is read repeatedly.
 pub fn mapped(blobs: &dyn Blobs, manifest: &Manifest, name: &str) -> Result<Bytes, StageError> {
-    blobs.map(entry(manifest, name)?.digest).map_err(blob_error)
+    checkpoint::file::map(blobs, entry(manifest, name)?).map_err(blob_error)
 }
 
 /// Reads all files of an artifact into memory.
@@ -244,7 +244,7 @@ pub fn files(blobs: &dyn Blobs, manifest: &Manifest) -> Result<BTreeMap<String, 
     manifest
         .files
         .iter()
-        .map(|(name, entry)| Ok((name.clone(), blobs.get(entry.digest).map_err(blob_error)?)))
+        .map(|(name, entry)| Ok((name.clone(), checkpoint::file::get(blobs, entry).map_err(blob_error)?)))
         .collect()
 }
 
@@ -253,12 +253,13 @@ pub fn files(blobs: &dyn Blobs, manifest: &Manifest) -> Result<BTreeMap<String, 
 pub struct Draft {
     manifest: Manifest,
     blobs: Arc<dyn Blobs>,
+    chunk_bytes: u64,
 }
 
 impl Draft {
     /// Starts an artifact without files.
     pub fn new(cx: &dyn AttemptContext, kind: ArtifactKind, meta: serde_json::Value) -> Self {
-        Self { manifest: Manifest::new(kind, meta), blobs: cx.blobs() }
+        Self { manifest: Manifest::new(kind, meta), blobs: cx.blobs(), chunk_bytes: cx.chunk_bytes() }
     }
 
     /// Uploads one file.
@@ -268,9 +269,8 @@ impl Draft {
 
     /// Uploads one file that consists of `pieces`.
     pub fn add_pieces(&mut self, name: &str, pieces: &[&[u8]]) -> Result<(), StageError> {
-        let length = pieces.iter().map(|piece| piece.len() as u64).sum();
-        let digest = self.blobs.put_pieces(pieces).map_err(blob_error)?;
-        self.manifest.files.insert(name.to_owned(), FileEntry { digest, bytes: length });
+        let file = checkpoint::file::put(&*self.blobs, pieces, self.chunk_bytes).map_err(blob_error)?;
+        self.manifest.list([(name.to_owned(), file)]);
         Ok(())
     }
 

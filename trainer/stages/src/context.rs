@@ -166,9 +166,9 @@ pub trait AttemptContext {
     fn record(&mut self, step: u64, metrics: &[(&str, f64)]);
     /// Writes a line to the user's log.
     fn log(&mut self, line: &str);
-    /// Bytes of the largest file that the store takes.
-    fn most_blob_bytes(&self) -> u64 {
-        limits::BLOB_BYTES as u64
+    /// Bytes of the blobs of a long file.
+    fn chunk_bytes(&self) -> u64 {
+        limits::CHUNK_BYTES
     }
     /// Returns true if the grant has ended or a stop was requested. Long loops without steps check it regularly.
     fn interrupted(&self) -> bool;

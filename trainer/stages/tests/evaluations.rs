@@ -34,7 +34,8 @@ fn bench() -> Bench {
 
 fn put(bench: &Bench, kind: ArtifactKind, meta: serde_json::Value, weights: Vec<u8>) -> Digest {
     let blobs = bench.blobs();
-    let entry = FileEntry { bytes: weights.len() as u64, digest: blobs.put(weights).expect("stored") };
+    let entry =
+        FileEntry { bytes: weights.len() as u64, digest: blobs.put(weights).expect("stored"), chunks: Vec::new() };
     let mut manifest = Manifest::new(kind, meta);
     manifest.files.insert(MODEL_FILE.into(), entry);
     blobs.put(manifest.to_bytes()).expect("stored")

@@ -83,7 +83,8 @@ fn an_evaluator_is_the_same_bytes_with_any_members_and_after_any_stop() {
 
 fn put(bench: &Bench, kind: ArtifactKind, meta: serde_json::Value, weights: Vec<u8>) -> Digest {
     let blobs = bench.blobs();
-    let entry = FileEntry { bytes: weights.len() as u64, digest: blobs.put(weights).expect("stored") };
+    let entry =
+        FileEntry { bytes: weights.len() as u64, digest: blobs.put(weights).expect("stored"), chunks: Vec::new() };
     let mut manifest = Manifest::new(kind, meta);
     manifest.files.insert(MODEL_FILE.into(), entry);
     blobs.put(manifest.to_bytes()).expect("stored")
@@ -395,7 +396,8 @@ fn store(bench: &Bench, dataset: &Dataset, like: Digest) -> Digest {
     let mut manifest = Manifest::new(ArtifactKind::Dataset, bench.manifest(like).expect("a test's own files").meta);
     dataset
         .write_files::<PackError>(|name, bytes| {
-            let entry = FileEntry { bytes: bytes.len() as u64, digest: blobs.put(bytes).expect("stored") };
+            let entry =
+                FileEntry { bytes: bytes.len() as u64, digest: blobs.put(bytes).expect("stored"), chunks: Vec::new() };
             manifest.files.insert(name, entry);
             Ok(())
         })

@@ -56,7 +56,7 @@ fn kit_vae(bench: &Bench, like: &TrainVae) -> Digest {
     let bytes = names::save(&network);
     let blobs = bench.blobs();
     let mut manifest = Manifest::new(ArtifactKind::Vae, serde_json::to_value(&meta).unwrap());
-    let entry = FileEntry { digest: blobs.put_pieces(&[&bytes]).unwrap(), bytes: bytes.len() as u64 };
+    let entry = FileEntry::of_blob(blobs.put_pieces(&[&bytes]).unwrap(), bytes.len() as u64);
     manifest.files.insert(MODEL_FILE.into(), entry);
     blobs.put_pieces(&[&manifest.to_bytes()]).unwrap()
 }

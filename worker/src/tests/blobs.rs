@@ -65,6 +65,88 @@ fn cut_transfers_go_on_where_they_were_cut() {
     assert!(matches!(outcomes[0].outcome, TaskOutcome::Finished { .. }), "{outcomes:?}");
 }
 
+/// Bytes of a chunk in these tests: two parts of an upload.
+const CHUNK: usize = 9 << 20;
+
+/// A sparse file: zeros, except at the beginning of each chunk.
+fn sparse(name: u8, chunks: usize) -> Vec<u8> {
+    let mut bytes = vec![0; chunks * CHUNK];
+    for at in 0..chunks {
+        bytes[at * CHUNK..][..2].copy_from_slice(&[name, at as u8]);
+    }
+    bytes
+}
+
+/// The files of a checkpoint after `step`; only the first one depends on it.
+fn state(step: u8) -> [(&'static str, Vec<u8>); 3] {
+    [("state", sparse(step, 3)), ("average", sparse(254, 3)), ("frozen", sparse(255, 2))]
+}
+
+fn save(context: &mut dyn GangContext, step: u8) -> Result<(), StageError> {
+    let mut manifest = Manifest::new(ArtifactKind::Checkpoint, serde_json::json!({ "step": step }));
+    for (name, bytes) in state(step) {
+        let pieces = [&bytes[..1000], &bytes[1000..]];
+        let entry = checkpoint::file::put(&*context.blobs(), &pieces, CHUNK as u64).expect("uploaded");
+        manifest.list([(name.to_owned(), entry)]);
+    }
+    context.record(1, &[("loss", 0.5)]);
+    context.put_manifest(&manifest)?;
+    Ok(context.commit_checkpoint(1, &manifest, &BTreeMap::new())?)
+}
+
+/// The coordinator loses the chunk that is on its way in the middle of a checkpoint of three files. The next attempt
+/// reads the checkpoint and saves another one.
+#[test]
+fn a_cut_upload_sends_only_the_chunk_under_way_again() {
+    let worker = Worker::start(Box::new(|context| {
+        context.rendezvous(None, &[])?;
+        let Some(manifest) = context.latest_checkpoint()? else {
+            save(context, 1)?;
+            return Ok(Outcome::Yielded { at: 1 });
+        };
+        let blobs = context.blobs();
+        for (name, bytes) in state(1) {
+            let file = checkpoint::file::open(&*blobs, &manifest.files[name]).expect("fetched");
+            let mut read = vec![0; bytes.len()];
+            file.read_at(0, &mut read).expect("read");
+            assert!(read == bytes, "{name}");
+        }
+        let mapped = checkpoint::file::map(&*blobs, &manifest.files["average"]).expect("joined");
+        assert!(mapped == state(1)[1].1);
+        save(context, 2)?;
+        finished(context)
+    }));
+    let total = 8 * CHUNK as u64;
+    let received = || worker.fake.received.load(Ordering::SeqCst);
+    worker.fake.lose_at.store(total / 2 + 1, Ordering::SeqCst);
+    worker.grant(1);
+    worker.wait("a checkpoint", |coordinator| coordinator.checkpoints.len() == 1);
+    let sent = received();
+    // The manifest has some hundred bytes.
+    assert!((total + (8 << 20)..=total + CHUNK as u64 + 4096).contains(&sent), "{sent} bytes were sent for {total}");
+    worker.wait("an outcome", |coordinator| !coordinator.outcomes.is_empty());
+    lock(&worker.fake.coordinator).fetched.clear();
+    worker.fake.received.store(0, Ordering::SeqCst);
+
+    let resume = lock(&worker.fake.coordinator).checkpoints[0].manifest;
+    worker.grant_from(2, Some(resume));
+    worker.wait("another checkpoint", |coordinator| coordinator.checkpoints.len() == 2);
+    worker.wait("another outcome", |coordinator| coordinator.outcomes.len() == 2);
+    let coordinator = worker.leave();
+    assert!(matches!(coordinator.outcomes[1].outcome, TaskOutcome::Finished { .. }), "{:?}", coordinator.outcomes);
+    let of = |at: usize| -> Manifest {
+        serde_json::from_slice(&coordinator.blobs[&coordinator.checkpoints[at].manifest]).expect("a manifest")
+    };
+    let (first, second) = (of(0), of(1));
+    let chunks = |manifest: &Manifest, name: &str| manifest.files[name].chunks.len();
+    assert_eq!(["state", "average", "frozen"].map(|name| chunks(&first, name)), [3, 3, 2]);
+    assert_eq!(first.files["average"], second.files["average"]);
+    for blob in first.blobs() {
+        assert!(coordinator.fetched.contains(&blob.digest), "chunks are read, and not the whole");
+    }
+    assert!(!coordinator.fetched.contains(&first.files["state"].digest));
+}
+
 #[test]
 fn a_cut_download_goes_on() {
     const BYTES: usize = 20 << 20;

@@ -92,6 +92,8 @@ pub(super) struct Fake {
     pub(super) damage: AtomicU64,
     /// Number of coming blob transfers that break off in the middle.
     pub(super) cut: AtomicU64,
+    /// Number of transferred bytes after which the next part of a blob is cut and its staged bytes are lost.
+    pub(super) lose_at: AtomicU64,
     /// All blobs are damaged in the store.
     pub(super) rotten: AtomicBool,
     /// Bytes of transferred blobs, or the number of requests for damaged ones.
@@ -264,8 +266,10 @@ async fn put_blob(
     if lock(&fake.coordinator).unfit {
         return refuse(StatusCode::PAYLOAD_TOO_LARGE, "too-large");
     }
-    fake.received.fetch_add(body.len() as u64, Ordering::SeqCst);
-    let cut = fake.cut.fetch_update(Ordering::SeqCst, Ordering::SeqCst, |n| n.checked_sub(1)).is_ok();
+    let received = fake.received.fetch_add(body.len() as u64, Ordering::SeqCst);
+    let is_lost = |at: u64| (at > 0 && received >= at).then_some(0);
+    let lost = fake.lose_at.fetch_update(Ordering::SeqCst, Ordering::SeqCst, is_lost).is_ok();
+    let cut = lost || fake.cut.fetch_update(Ordering::SeqCst, Ordering::SeqCst, |n| n.checked_sub(1)).is_ok();
     let mut answer = serde_json::Value::Null;
     let response = fake.write(&grant, |coordinator| {
         let staged = coordinator.staged.entry(digest).or_default();
@@ -274,6 +278,9 @@ async fn put_blob(
         }
         assert_eq!(staged.len(), offset, "it goes on where it was cut");
         staged.extend_from_slice(if cut { &body[..body.len() / 2] } else { &body });
+        if lost {
+            staged.clear();
+        }
         let (staged, stored) = (staged.len(), staged.len() == bytes);
         if stored {
             let blob = coordinator.staged.remove(&digest).expect("it has arrived");

@@ -11,7 +11,7 @@ use super::*;
 fn artifact(fake: &Fake, bytes: &[u8]) -> (Digest, Digest) {
     let file = Digest::of(bytes);
     let mut manifest = Manifest::new(ArtifactKind::Dataset, serde_json::json!({}));
-    let entry = protocol::artifact::FileEntry { digest: file, bytes: bytes.len() as u64 };
+    let entry = protocol::artifact::FileEntry::of_blob(file, bytes.len() as u64);
     manifest.files.insert("file".to_owned(), entry);
     let blobs = &mut lock(&fake.coordinator).blobs;
     blobs.insert(file, bytes.to_vec());

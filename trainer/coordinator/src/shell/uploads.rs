@@ -224,7 +224,7 @@ pub(crate) async fn put_blob(
     if bytes > MAX_BLOB_BYTES {
         let message = format!("a blob of {bytes} bytes is too large: expected at most {MAX_BLOB_BYTES}");
         let failure = Failure::new(StatusCode::PAYLOAD_TOO_LARGE, "too-large", message);
-        return Err(failure.hint("train a smaller network: its state is one file"));
+        return Err(failure.hint("update the worker: this build stores a longer file as several blobs"));
     }
     let store = &actor_handle.store;
     let blobs = actor_handle.store.blobs().clone();

@@ -64,7 +64,7 @@ impl Reach {
                     continue;
                 }
             };
-            found.blobs.extend(manifest.files.values().map(|file| file.digest));
+            found.blobs.extend(manifest.blobs().map(|blob| blob.digest));
             queue.extend(followed(&manifest).into_iter().filter(|next| opened.insert(*next)));
         }
         let found = Arc::new(found);
@@ -99,9 +99,9 @@ impl Reach {
                 return Ok(Some(next));
             }
             let Opened::Manifest(manifest) = open(blobs, next)? else { continue };
-            for file in manifest.files.values() {
-                if !is_uploaded(file.digest) && !self.includes(blobs, roots, file.digest)? {
-                    return Ok(Some(file.digest));
+            for blob in manifest.blobs() {
+                if !is_uploaded(blob.digest) && !self.includes(blobs, roots, blob.digest)? {
+                    return Ok(Some(blob.digest));
                 }
             }
             for other in followed(&manifest) {

@@ -19,7 +19,7 @@ use checkpoint::Blobs;
 use pipeline::{Pipeline, PipelineStage};
 use protocol::message::StageTask;
 use protocol::stage::{CheckpointPolicy, Sampler, Shape, Split, StageSettings};
-use protocol::{ArtifactKind, Digest, Manifest, RunId, StageName, Steps};
+use protocol::{ArtifactKind, Digest, FileEntry, Manifest, RunId, StageName, Steps};
 use serde_json::{Value, json};
 
 use super::clock::Clock;
@@ -235,13 +235,13 @@ impl Tries<'_> {
             .files
             .into_iter()
             .filter(|(name, entry)| name.rsplit('/').next() == Some(MODEL_FILE) && !known.contains(&entry.digest));
-        let values = |digest: Digest| -> Option<u64> {
-            let bytes = self.blobs.get(digest).ok()?;
+        let values = |file: &FileEntry| -> Option<u64> {
+            let bytes = checkpoint::file::get(&*self.blobs, file).ok()?;
             let (_, metadata) = safetensors::SafeTensors::read_metadata(&bytes).ok()?;
             let count = |info: &safetensors::tensor::TensorInfo| info.shape.iter().product::<usize>() as u64;
             Some(metadata.tensors().values().map(|info| count(info)).sum())
         };
-        own.map(|(_, entry)| values(entry.digest)).sum()
+        own.map(|(_, entry)| values(&entry)).sum()
     }
 }
 

@@ -29,7 +29,7 @@ use burn::tensor::Device;
 use protocol::message::StageTask;
 use protocol::stage::Training;
 use protocol::units::grouped;
-use protocol::{ArtifactKind, Digest};
+use protocol::{ArtifactKind, Digest, limits};
 use serde_json::json;
 
 use crate::artifacts::Draft;
@@ -212,7 +212,7 @@ impl<'a> TrainingLoop<'a> {
         let groups = objective.groups();
         let buffers = objective.buffers();
         let bytes = TrainState::bytes_of(&groups, &buffers);
-        check_size(bytes, cx.most_blob_bytes())?;
+        check_size(bytes, limits::FILE_BYTES)?;
         if cx.leads() {
             cx.log(&parameters(&groups, bytes));
         }
@@ -613,11 +613,11 @@ mod tests {
 
     #[test]
     fn a_state_larger_than_a_file_may_be_is_refused_in_words() {
-        let refused = check_size(9 << 30, 8 << 30).map_err(|error| (error.class(), error.to_string()));
-        let Err((class, message)) = refused else { panic!("9 GiB are taken") };
+        let refused = check_size(600 << 30, limits::FILE_BYTES).map_err(|error| (error.class(), error.to_string()));
+        let Err((class, message)) = refused else { panic!("600 GiB are taken") };
         assert_eq!(class, protocol::message::FailureClass::Input);
-        assert!(message.contains("9.0 GiB") && message.contains("at most 8.0 GiB"), "{message}");
-        assert!(check_size(7 << 30, 8 << 30).is_ok());
+        assert!(message.contains("600.0 GiB") && message.contains("at most 512.0 GiB"), "{message}");
+        assert!(check_size(500 << 30, limits::FILE_BYTES).is_ok());
     }
 
     /// In a rolling upgrade, members of two builds may save one step; both saves are the same state.

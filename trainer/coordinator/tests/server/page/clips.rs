@@ -19,7 +19,7 @@ use crate::shell::TestResult;
 pub(super) fn artifact(store: &Store, kind: ArtifactKind, files: &[(&str, Vec<u8>)]) -> TestResult<Digest> {
     let mut manifest = Manifest::new(kind, json!({}));
     for (name, bytes) in files {
-        let entry = FileEntry { bytes: bytes.len() as u64, digest: store.blobs().put(bytes)? };
+        let entry = FileEntry { bytes: bytes.len() as u64, digest: store.blobs().put(bytes)?, chunks: Vec::new() };
         manifest.files.insert((*name).to_owned(), entry);
     }
     Ok(store.blobs().put(&manifest.to_bytes())?)

@@ -40,7 +40,9 @@ async fn a_browser_draws_with_several_models() -> TestResult {
     let meta = json!({"generator": "latent-diffusion", "format": "humanml3d", "parts": {}});
     for (version, metric) in [(1, 2.0), (2, 1.0)] {
         let mut manifest = Manifest::new(ArtifactKind::Model, meta.clone());
-        manifest.files.insert("x".into(), FileEntry { bytes: 1, digest: store.blobs().put(&[version])? });
+        manifest
+            .files
+            .insert("x".into(), FileEntry { bytes: 1, digest: store.blobs().put(&[version])?, chunks: Vec::new() });
         let artifact = store.blobs().put(&manifest.to_bytes())?;
         let own = Write::ModelOwner { model: "walks".into(), owner: Owner::local("root") };
         let metrics = BTreeMap::from([("fid".to_owned(), metric)]);

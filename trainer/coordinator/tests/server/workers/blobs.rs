@@ -3,6 +3,7 @@
 
 use std::collections::BTreeMap;
 
+use protocol::artifact::Chunk;
 use protocol::message::CommitCheckpoint;
 use protocol::proof::{BlobStored, GRANT_HEADER, PROCESS_HEADER, Process, RECEIPT_HEADER, SECRET_HEADER, Vouched};
 use protocol::{ArtifactKind, Digest, FileEntry, Incarnation, Manifest};
@@ -15,7 +16,7 @@ const CLIPS: &[u8] = b"clips of another run: a canary";
 /// A manifest of one file that mentions these digests.
 fn manifest(file: &[u8], mentions: &[Digest]) -> Manifest {
     let mut manifest = Manifest::new(ArtifactKind::Dataset, serde_json::json!({ "parts": mentions }));
-    manifest.files.insert("file".into(), FileEntry { digest: Digest::of(file), bytes: file.len() as u64 });
+    manifest.files.insert("file".into(), FileEntry::of_blob(Digest::of(file), file.len() as u64));
     manifest
 }
 
@@ -41,7 +42,7 @@ async fn a_manifest_names_no_blob_of_another_run() {
     let listed_as_part = {
         let mut manifest = manifest(mine, &[]);
         let (digest, bytes) = (hidden.digest(), hidden.to_bytes().len() as u64);
-        manifest.files.insert("vae/manifest.json".into(), FileEntry { digest, bytes });
+        manifest.files.insert("vae/manifest.json".into(), FileEntry::of_blob(digest, bytes));
         manifest
     };
     for (what, tried) in [
@@ -100,7 +101,7 @@ async fn a_manifest_may_name_blobs_of_inputs_and_digests_of_other_things() {
     let file = worker.put(&vae, weights).await;
     let mut saved = manifest(weights, &[dataset.digest()]);
     saved.kind = ArtifactKind::Checkpoint;
-    saved.files.insert("clips".into(), FileEntry { digest: Digest::of(CLIPS), bytes: CLIPS.len() as u64 });
+    saved.files.insert("clips".into(), FileEntry::of_blob(Digest::of(CLIPS), CLIPS.len() as u64));
     let stored = worker.put(&vae, &saved.to_bytes()).await;
     let receipts: BTreeMap<Digest, String> =
         [file, stored].map(|stored| (stored.digest, stored.receipt.unwrap())).into();
@@ -115,6 +116,39 @@ async fn a_manifest_may_name_blobs_of_inputs_and_digests_of_other_things() {
     let committed = post(&worker.server, &vae.secret, "/v1/checkpoints", &vouched).await;
     assert_eq!(committed.0, 200, "{committed:?}");
     assert_eq!(worker.holds().await[0].resume, Some(saved.digest()));
+    site.handle.shutdown().await;
+}
+
+/// Every chunk of a file needs a receipt like any other blob, and a reader of the artifact may read each.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn chunks_of_a_file_are_blobs_of_its_artifact() {
+    let site = Site::start(60_000).await;
+    site.submit(1).await;
+    let worker = Worker::join(&site, "nodes", "nodes-1").await;
+    let data = worker.given("dataset").await;
+    let chunks: Vec<Chunk> =
+        CLIPS.chunks(10).map(|part| Chunk { digest: Digest::of(part), bytes: part.len() as u64 }).collect();
+    let mut dataset = Manifest::new(ArtifactKind::Dataset, serde_json::json!({}));
+    let file = FileEntry { digest: Digest::of(CLIPS), bytes: CLIPS.len() as u64, chunks: chunks.clone() };
+    dataset.list([("clips".to_owned(), file)]);
+    let mut receipts = BTreeMap::new();
+    for part in CLIPS.chunks(10).chain([&dataset.to_bytes()[..]]) {
+        let stored = worker.put(&data, part).await;
+        receipts.insert(stored.digest, stored.receipt.unwrap());
+    }
+    let mut fewer = receipts.clone();
+    fewer.remove(&chunks[1].digest);
+    let refused = worker.finish(&data, dataset.digest(), fewer).await;
+    assert_eq!(code(&refused), (409, "unvouched"), "{refused:?}");
+    assert!(refused.1.to_string().contains(&chunks[1].digest.to_string()), "{refused:?}");
+    let finished = worker.finish(&data, dataset.digest(), receipts).await;
+    assert_eq!(finished.0, 200, "{finished:?}");
+
+    worker.given("vae").await;
+    for chunk in chunks {
+        assert_eq!(worker.read(chunk.digest).await, 200, "a chunk of an input");
+    }
+    assert_eq!(worker.read(Digest::of(CLIPS)).await, 403, "the file is no blob");
     site.handle.shutdown().await;
 }
 

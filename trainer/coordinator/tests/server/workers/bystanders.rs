@@ -219,7 +219,7 @@ impl Worker {
     ) -> (Digest, BTreeMap<Digest, String>) {
         let stored = self.put(assignment, file).await;
         let mut manifest = Manifest::new(kind, serde_json::json!({}));
-        manifest.files.insert("file".into(), FileEntry { digest: stored.digest, bytes: file.len() as u64 });
+        manifest.files.insert("file".into(), FileEntry::of_blob(stored.digest, file.len() as u64));
         let whole = self.put(assignment, &manifest.to_bytes()).await;
         let receipts = [stored, whole.clone()].map(|stored| (stored.digest, stored.receipt.unwrap()));
         (whole.digest, receipts.into())
