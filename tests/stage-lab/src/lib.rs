@@ -170,8 +170,9 @@ impl Bench {
         let blobs = Arc::clone(&self.blobs);
         let chunk_bytes = self.chunk_bytes;
         move || {
-            let attempt = MemoryAttempt::new(task.clone(), device.clone(), Arc::clone(&blobs));
-            MemoryAttempt { chunk_bytes, ..attempt }
+            let mut attempt = MemoryAttempt::new(task.clone(), device.clone(), Arc::clone(&blobs));
+            attempt.chunk_bytes = chunk_bytes;
+            attempt
         }
     }
 

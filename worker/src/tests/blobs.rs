@@ -132,6 +132,10 @@ fn a_cut_upload_sends_only_the_chunk_under_way_again() {
     worker.grant_from(2, Some(resume));
     worker.wait("another checkpoint", |coordinator| coordinator.checkpoints.len() == 2);
     worker.wait("another outcome", |coordinator| coordinator.outcomes.len() == 2);
+    let transferred = received();
+    // Each chunk was read once. Only those of the first file were sent; manifests have some thousand bytes.
+    let expected = total + 3 * CHUNK as u64;
+    assert!((expected..expected + 16_384).contains(&transferred), "{transferred} bytes were transferred");
     let coordinator = worker.leave();
     assert!(matches!(coordinator.outcomes[1].outcome, TaskOutcome::Finished { .. }), "{:?}", coordinator.outcomes);
     let of = |at: usize| -> Manifest {
