@@ -5,8 +5,9 @@ use std::io::Write as _;
 use std::path::{Component, Path, PathBuf};
 
 use clap::Args;
+use protocol::artifact::FileEntry;
 use protocol::message::RunView;
-use protocol::{Digest, printable, units};
+use protocol::{printable, units};
 use serde_json::json;
 
 use super::model::{manifest, verified};
@@ -45,8 +46,7 @@ struct Made {
     stage: String,
     output: String,
     name: String,
-    bytes: u64,
-    digest: Digest,
+    entry: FileEntry,
 }
 
 pub(crate) async fn files(args: FilesArgs) -> Result<u8> {
@@ -63,7 +63,7 @@ pub(crate) async fn files(args: FilesArgs) -> Result<u8> {
         print_one(&reader, &made).await?;
     } else if let Some(dir) = &args.copy {
         copy(&reader, &made, dir).await?;
-        let bytes = made.iter().map(|file| file.bytes).sum();
+        let bytes = made.iter().map(|file| file.entry.bytes).sum();
         print::out(&format!("{}: {} of {}", dir.display(), units::counted(made.len(), "file"), units::size(bytes)));
     } else {
         list(&run, &made, args.output);
@@ -85,12 +85,11 @@ async fn made(reader: &Reader, run: &RunView, stage: Option<&str>, name: Option<
     for view in run.stages.iter().filter(|view| stage.is_none_or(|stage| view.name.as_str() == stage)) {
         for (output, artifact) in &view.outputs {
             let manifest = manifest(reader, *artifact).await?;
-            made.extend(manifest.files.into_iter().map(|(name, file)| Made {
+            made.extend(manifest.files.into_iter().map(|(name, entry)| Made {
                 stage: view.name.to_string(),
                 output: output.clone(),
                 name,
-                bytes: file.bytes,
-                digest: file.digest,
+                entry,
             }));
         }
     }
@@ -108,8 +107,8 @@ fn list(run: &RunView, made: &[Made], output: Output) {
     match output {
         Output::Json => {
             let file = |file: &Made| {
-                let Made { stage, output, name, bytes, digest } = file;
-                json!({"stage": stage, "output": output, "name": name, "bytes": bytes, "digest": digest})
+                let Made { stage, output, name, entry } = file;
+                json!({"stage": stage, "output": output, "name": name, "bytes": entry.bytes, "digest": entry.digest})
             };
             let files: Vec<_> = made.iter().map(file).collect();
             print::json(&json!({"schema_version": 1, "run": run.run, "files": files}));
@@ -117,7 +116,7 @@ fn list(run: &RunView, made: &[Made], output: Output) {
         Output::Table => {
             let row = |file: &Made| {
                 let name = printable(&file.name).into_owned();
-                vec![file.stage.clone(), file.output.clone(), name, units::size(file.bytes)]
+                vec![file.stage.clone(), file.output.clone(), name, units::size(file.entry.bytes)]
             };
             print::out(&print::table(&["STAGE", "OUTPUT", "FILE", "SIZE"], made.iter().map(row).collect()));
         }
@@ -130,9 +129,11 @@ async fn print_one(reader: &Reader, made: &[Made]) -> Result<()> {
         let problem = Problem::usage(format!("{} fit; `--print` writes one", units::counted(made.len(), "file")));
         return Err(problem.hint("`--stage` and `--name` choose it, such as `--stage fid --name report.json`"));
     };
-    let bytes = verified(reader, file.digest).await?;
-    // A reader that has seen enough closes the pipe.
-    let _ = std::io::stdout().lock().write_all(&bytes);
+    for blob in file.entry.blobs() {
+        let bytes = verified(reader, blob.digest).await?;
+        // A reader that has seen enough closes the pipe.
+        let _ = std::io::stdout().lock().write_all(&bytes);
+    }
     Ok(())
 }
 
@@ -157,10 +158,12 @@ async fn copy_into(reader: &Reader, made: &[Made], dir: &Path) -> Result<()> {
             return Err(Problem::failed(format!("stage `{stage}` lists a file `{name}` outside its folder"))
                 .hint("`trainer registry fsck` checks the store"));
         }
-        let bytes = verified(reader, file.digest).await?;
+        let unwritten = |error| unwritten(&path, &error);
         let parent = path.parent().unwrap_or(dir);
-        let written = fs::create_dir_all(parent).and_then(|()| fs::write(&path, bytes));
-        written.map_err(|error| unwritten(&path, &error))?;
+        let mut copied = fs::create_dir_all(parent).and_then(|()| fs::File::create(&path)).map_err(unwritten)?;
+        for blob in file.entry.blobs() {
+            copied.write_all(&verified(reader, blob.digest).await?).map_err(unwritten)?;
+        }
     }
     Ok(())
 }
