@@ -19,7 +19,10 @@ use crate::{folder, sql};
 /// `stride.db.moved`.
 pub async fn to_postgres(dir: &Path, to: &PostgresAddress, holder: Holder) -> Result<u64, MoveError> {
     if !folder::has_database(dir) {
-        return Err(MoveError::Refused(format!("`{}` has no `{}` to move", dir.display(), folder::DATABASE)));
+        return Err(match store::remembered_catalog(dir)? {
+            Some(at) => MoveError::Refused(format!("the catalog of `{}` is in {at} already", dir.display())),
+            None => OpenError::NotAStore(dir.to_owned()).into(),
+        });
     }
     let held = Store::open_existing(dir, holder.clone()).await?;
     let pool = sql::sqlite::open_readers(dir, false);
@@ -38,6 +41,12 @@ pub async fn to_postgres(dir: &Path, to: &PostgresAddress, holder: Holder) -> Re
 
 /// Moves a catalog out of PostgreSQL into the folder `dir` of one of its processes. Returns the number of rows.
 pub async fn to_folder(from: &PostgresAddress, dir: &Path, holder: Holder) -> Result<u64, MoveError> {
+    if folder::has_database(dir) {
+        let (dir, file) = (dir.display(), folder::DATABASE);
+        return Err(MoveError::Refused(format!(
+            "`{dir}` has a catalog already, `{file}`; name a folder that uses {from}"
+        )));
+    }
     let held = Store::open_on(&PostgresCatalog::from(from.clone()), dir, None, holder.clone()).await?;
     let fresh = dir.join(format!("{}.new", folder::DATABASE));
     match fs::remove_file(&fresh) {

@@ -51,6 +51,13 @@ pub enum OpenError {
         /// Cause and remedy.
         message: String,
     },
+    /// The folder names another catalog than the command.
+    #[error("store `{}`: {message}", dir.display())]
+    Catalog {
+        dir: PathBuf,
+        /// Cause and remedy.
+        message: String,
+    },
     /// The folder is not a store and has other files.
     #[error("there is no store in `{}`, and the folder is not empty: it has {found}", dir.display())]
     NotEmpty {
@@ -140,7 +147,7 @@ impl OpenError {
                 "leave `--blobs` out, or choose another folder with `--store`; if the blobs were moved, `registry adopt --blobs \
                  {asked}` uses them there"
             ),
-            Self::Blobs { .. } => "nothing was changed; fix the problem and run the same command again".into(),
+            Self::Blobs { .. } | Self::Catalog { .. } => "nothing was changed; fix the problem and run the same command again".into(),
             Self::NotEmpty { .. } => "choose a folder that is empty or does not exist with `--store`".into(),
             Self::NotAStore(_) => "`trainer run PIPELINE` creates one; name its folder with `--store`".into(),
             Self::ReadOnly { .. } => "make the folder writable for this user, or choose another with `--store`".into(),
@@ -151,6 +158,10 @@ impl OpenError {
             Self::NewerSchema { .. } => "use the newer build that wrote it, or choose another folder with `--store`".into(),
             Self::OlderSchema { .. } => "a command that writes, such as `registry gc`, migrates it".into(),
             Self::Damaged { .. } => "restore it from a backup, or choose another folder with `--store`".into(),
+            // Errors of PostgreSQL have its address as their path.
+            Self::Other { path, .. } if path.starts_with("postgres:") => {
+                "nothing was changed: check that the database exists and answers, its address, and the file of the password".into()
+            }
             Self::Other { .. } => "check the folder's permissions and disk, or choose another with `--store`".into(),
         }
     }

@@ -187,7 +187,7 @@ fn the_units_of_systemd() {
     // Errors for callers with a wrong token, no token or no certificate.
     let nodes = etc("nodes.token");
     let said = bench.run(&["registry", "list", "--server", &url, "--token-file", &nodes, "--ca", &ca]).expect_code(5);
-    assert!(said.stderr.contains("`nodes` may worker"), "{}", said.stderr);
+    assert!(said.stderr.contains("`nodes` has the scope worker"), "{}", said.stderr);
     let said = bench.run(&["status", "--server", &url, "--ca", &ca]).expect_code(5);
     assert!(said.stderr.contains("--token-file"), "{}", said.stderr);
     let said = bench.run(&["status", "--server", &url, "--token-file", &me]).expect_code(6);

@@ -3,7 +3,7 @@
 
 use std::path::Path;
 
-use access::{Server, ServerOptions, explain, local};
+use access::{Server, ServerOptions, UNREACHABLE, describe, explain, local};
 use coordinator::shell::{CurveSeries, Curves, RunSettings, StageMetrics};
 use coordinator::{Config, Coordinator, Handle, WorkerView};
 use protocol::message::{ApiError, Listing, RunSummary, RunView, Submit};
@@ -78,10 +78,9 @@ impl Client {
 
     async fn try_send(&self, request: RequestBuilder) -> Result<Response> {
         self.server.send(request).await.map_err(|error| {
-            let urls = self.server.urls();
-            let problem =
-                Problem::new(exit::UNREACHABLE, anyhow::anyhow!("cannot reach `{urls}`: {}", explain(&error)));
-            problem.hint("start it with `trainer serve`, or give its address with --server")
+            let (urls, (why, advice)) = (self.server.urls(), describe(&error));
+            let problem = Problem::new(exit::UNREACHABLE, anyhow::anyhow!("cannot reach `{urls}`: {why}"));
+            problem.hint(advice.unwrap_or(UNREACHABLE))
         })
     }
 

@@ -149,6 +149,17 @@ pub(crate) enum End {
     Left,
     /// The coordinator refuses this worker.
     Refused(String),
+    /// The token is missing, unknown or lacks the scope.
+    Unauthorized(String),
+}
+
+impl End {
+    fn refused(error: &CallError, message: String) -> Self {
+        match error {
+            CallError::Unauthorized(_) => Self::Unauthorized(message),
+            _ => Self::Refused(message),
+        }
+    }
 }
 
 /// Joins the coordinator. Retries until it accepts this process; otherwise returns the end of the worker.
@@ -181,7 +192,8 @@ async fn join(client: &Client, join: &Join, shared: &Shared) -> Result<Joined, E
                 }
             }
             Err(error) => {
-                return Err(End::Refused(format!("the coordinator refused worker `{}`: {error}", join.worker)));
+                let message = format!("the coordinator refused worker `{}`: {error}", join.worker);
+                return Err(End::refused(&error, message));
             }
         }
         // An idle worker that is leaving does not wait for a coordinator.
@@ -254,7 +266,7 @@ async fn poll_on(client: &Client, offer: &Join, shared: &Shared) -> Result<Infal
             Err(error) => {
                 refusals += 1;
                 if refusals == REFUSALS {
-                    return Err(End::Refused(error.to_string()));
+                    return Err(End::refused(&error, error.to_string()));
                 }
                 tracing::warn!("the coordinator refused a poll: {error}");
                 pause = (pause * 2).min(LONGEST);

@@ -195,7 +195,9 @@ fn error(gave_up: GaveUp, wanted: Option<Digest>) -> BlobError {
         (GaveUp::Answer(CallError::Damaged(message)), _) => BlobError::Damaged(message),
         (GaveUp::Answer(CallError::Storage(message)), _) => BlobError::Storage(message),
         (GaveUp::Answer(CallError::Stale(message)), _) => BlobError::Refused(message),
-        (GaveUp::Answer(CallError::Refused(message)), _) => BlobError::Unfit(message),
+        (GaveUp::Answer(CallError::Refused(message) | CallError::Unauthorized(message)), _) => {
+            BlobError::Unfit(message)
+        }
         (GaveUp::Answer(error), _) => BlobError::Unavailable(error.to_string()),
     }
 }

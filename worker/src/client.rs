@@ -54,6 +54,9 @@ pub(crate) enum CallError {
     /// Another member leads the gang by the newest orders, so the call was not made.
     #[error("{0}")]
     NoLongerLeads(String),
+    /// The token is missing, unknown or lacks the scope.
+    #[error("{0}")]
+    Unauthorized(String),
     /// The call is invalid; the same call never succeeds.
     #[error("{0}")]
     Refused(String),
@@ -277,6 +280,7 @@ async fn check(sent: Result<Response, reqwest::Error>) -> Result<Response, CallE
         (StatusCode::REQUEST_TIMEOUT, _) => CallError::Away(message),
         (StatusCode::INTERNAL_SERVER_ERROR, _) => CallError::Fault(message),
         (status, _) if status.is_server_error() => CallError::Away(message),
+        (StatusCode::UNAUTHORIZED, _) | (_, "forbidden") => CallError::Unauthorized(message),
         _ => CallError::Refused(message),
     })
 }

@@ -492,7 +492,9 @@ fn given_up(gave_up: GaveUp) -> ContextError {
         GaveUp::Ended(reason) | GaveUp::Answer(CallError::Stale(reason)) => ContextError::GrantEnded(reason),
         GaveUp::Answer(CallError::Storage(message)) => ContextError::Storage(message),
         GaveUp::Answer(CallError::NoLongerLeads(message)) => ContextError::NoLongerLeads(message),
-        GaveUp::Answer(CallError::Refused(message)) => ContextError::Refused(message),
+        GaveUp::Answer(CallError::Refused(message) | CallError::Unauthorized(message)) => {
+            ContextError::Refused(message)
+        }
         GaveUp::Answer(error) => ContextError::Unavailable(error.to_string()),
     }
 }

@@ -88,6 +88,9 @@ pub enum JoinError {
     /// The coordinator refuses this worker.
     #[error("{0}")]
     Refused(String),
+    /// The token is missing, unknown or lacks the scope.
+    #[error("{0}")]
+    Unauthorized(String),
     /// The system lacks something that a worker needs.
     #[error("cannot start {what}: {source}")]
     System {
@@ -102,12 +105,13 @@ pub enum JoinError {
 }
 
 impl JoinError {
-    /// Exit code of the process: 2 for wrong usage, 3 for our fault, 1 otherwise.
+    /// Exit code of the process: 2 for wrong usage, 3 for our fault, 5 for a token without the right, 1 otherwise.
     pub fn exit_code(&self) -> u8 {
         match self {
             Self::Usage(_) => 2,
             Self::Refused(_) | Self::System { .. } => 1,
             Self::Fault => 3,
+            Self::Unauthorized(_) => 5,
         }
     }
 }
@@ -183,8 +187,10 @@ fn work(options: Options, device: Device, kinds: Arc<dyn Kinds>, timing: Timing)
     shared.end("this worker leaves");
     stage.join().map_err(|_| JoinError::Fault)?;
     preparer.join().map_err(|_| JoinError::Fault)?;
-    if let End::Refused(reason) = end {
-        return Err(JoinError::Refused(reason));
+    match end {
+        End::Left => {}
+        End::Refused(reason) => return Err(JoinError::Refused(reason)),
+        End::Unauthorized(reason) => return Err(JoinError::Unauthorized(reason)),
     }
     // Spares the coordinator the wait for the end of our lease. If this call is lost, the lease simply expires.
     let left = runtime.block_on(async { tokio::time::timeout(FAREWELL, client.leave(&offer.worker)).await });

@@ -108,7 +108,7 @@ fn attempt(held: &Arc<ActiveAssignment>, bench: &Bench) {
             // Without this report, the coordinator would wait for the end as long as this worker lives.
             let class = match error {
                 CallError::Storage(_) => FailureClass::Storage,
-                CallError::Refused(_) => FailureClass::Refused,
+                CallError::Refused(_) | CallError::Unauthorized(_) => FailureClass::Refused,
                 _ => FailureClass::Infrastructure,
             };
             let message = format!("its outputs were refused: {error}");

@@ -150,3 +150,9 @@ def test_a_version_draws_motions(server: stride.Server, pipeline: Path) -> None:
     with pytest.raises(stride.StrideError, match="seconds") as error:
         version.generate("a person walks", seconds=59.0)
     assert error.value.code == "failed"
+
+
+def test_a_missing_package_is_named_with_its_remedy(server: stride.Server, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "numpy", None)
+    with pytest.raises(stride.StrideError, match=r"numpy.*stride-client\[pandas\]"):
+        server.model("tiny@prod").generate("a person walks")

@@ -97,7 +97,7 @@ fn local(options: &ServerOptions, why: &str) -> Result<(), Box<Answer>> {
     match options.connect() {
         Ok(None) => Ok(()),
         Ok(Some(_)) => {
-            let hint = "run it there with `--store DIR`, and without a server";
+            let hint = "run it there with `--store DIR`, without --server and STRIDE_SERVER";
             Err(Box::new(Answer::refused(error("invalid", why, Some(hint)))))
         }
         Err(e) => Err(Box::new(refused(&e))),
@@ -256,7 +256,7 @@ async fn at_server(server: Server, work: impl AsyncFn(&Place) -> Result<Answer, 
     let url = server.url().to_owned();
     work(&Place::At(server)).await.unwrap_or_else(|failed| {
         let (CallError::Unreachable(why) | CallError::Incomplete(why)) = failed;
-        unreachable_(&format!("cannot reach `{url}`: {why}"))
+        Answer::refused(error("unreachable", format!("cannot reach `{url}`: {why}"), Some(access::UNREACHABLE)))
     })
 }
 
@@ -335,6 +335,10 @@ async fn import(place: &Place, file: &Path, model: Option<&str>) -> Result<Answe
             match check(sent).await? {
                 Ok(response) => {
                     let mut answer: Answer = response.json().await.map_err(|e| CallError::Incomplete(explain(&e)))?;
+                    if let Some(error) = &mut answer.error {
+                        // The server does not know the file's name.
+                        error.message = error.message.replacen("`bundle`", &format!("`{shown}`"), 1);
+                    }
                     if let Some(Data::Imported { file, .. }) = &mut answer.data {
                         *file = shown;
                     }

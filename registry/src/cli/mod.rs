@@ -18,6 +18,7 @@ use checkpoint::model::{self, Model as ModelMeta, Parts};
 use protocol::artifact::Role;
 use protocol::message::ApiError;
 use protocol::stage::{DataOpen, StageSpec};
+use protocol::units::counted;
 use protocol::{Alias, Digest, Manifest, ModelName, RunId};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -335,7 +336,7 @@ async fn audit(store: &ReadStore, limit: usize) -> Result<Data, Refused> {
 /// Returns the report, or an error with the report if it has problems.
 fn verified(report: fsck::Report) -> Result<Data, Refused> {
     let Some(first) = report.problems.first() else { return Ok(Data::Fsck { report }) };
-    let message = format!("{} problems found; the first: {first}", report.problems.len());
+    let message = format!("{} found; the first: {first}", counted(report.problems.len(), "problem"));
     let hint = "restore the store from a backup, or remove the damaged blobs under `blobs/` and run the pipelines \
                 that made them again";
     let mut answer = Answer::refused(error("damaged", message, Some(hint)));

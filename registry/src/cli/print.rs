@@ -7,7 +7,7 @@ use checkpoint::model::{Model, Parts};
 use comfy_table::{ContentArrangement, Table, presets};
 use protocol::artifact::Role;
 use protocol::message::ApiError;
-use protocol::units::size;
+use protocol::units::{counted, size};
 use protocol::{Digest, Manifest, RunId, printable};
 use serde_json::json;
 
@@ -224,11 +224,11 @@ fn lineage_as_table(nodes: &[LineageNode]) -> String {
 
 fn problems_of(report: &fsck::Report) -> String {
     let mut text = format!(
-        "{} blobs ({}) hashed, {} references followed, {} problems\n",
+        "{} blobs ({}) hashed, {} references followed, {}\n",
         report.blobs,
         size(report.bytes),
         report.references,
-        report.problems.len()
+        counted(report.problems.len(), "problem")
     );
     for problem in &report.problems {
         text += &format!("  {problem}\n");

@@ -61,7 +61,11 @@ fn kind(e: &sqlx::Error) -> Kind {
 
 pub(super) fn open_error(path: &Path, e: &sqlx::Error) -> OpenError {
     let path = path.to_owned();
-    let message = e.to_string();
+    // The text of PostgreSQL's errors has a line of its own sources.
+    let message = match e {
+        sqlx::Error::Database(e) if path.starts_with("postgres:") => e.message().to_owned(),
+        _ => e.to_string(),
+    };
     match kind(e) {
         Kind::ReadOnly | Kind::CannotOpen => OpenError::ReadOnly { path, message },
         Kind::Full => OpenError::Full { path, message },

@@ -29,8 +29,8 @@ use protocol::{Alias, Digest, Group, ModelName, RunId, TaskId};
 
 use self::opening::{Asked, HeldStore, Leading, Purpose};
 pub use self::parts::PostgresCatalog;
-use self::parts::{Inspection, RequestedPlace, make_folder, refuse_other_files, remembered_catalog, there};
-pub(crate) use self::parts::{forget_catalog, remember_catalog};
+use self::parts::{Inspection, RequestedPlace, make_folder, refuse_other_files, there};
+pub(crate) use self::parts::{forget_catalog, remember_catalog, remembered_catalog};
 use crate::blob::place::Place;
 use crate::blob::{Backend, BlobStore};
 use crate::calls::Calls;

@@ -60,7 +60,7 @@ pub(super) fn remove_files_of_earlier_builds(dir: &Path) -> io::Result<()> {
 const CATALOG: &str = "CATALOG";
 
 /// Returns the address of the database that the folder records; `None` if the database is in the folder.
-pub(super) fn remembered_catalog(dir: &Path) -> Result<Option<PostgresAddress>, OpenError> {
+pub(crate) fn remembered_catalog(dir: &Path) -> Result<Option<PostgresAddress>, OpenError> {
     let path = dir.join(CATALOG);
     let text = match fs::read_to_string(&path) {
         Ok(text) => text,
@@ -74,14 +74,13 @@ pub(super) fn remembered_catalog(dir: &Path) -> Result<Option<PostgresAddress>, 
 pub(super) fn choose_catalog(dir: &Path, asked: Option<PostgresCatalog>) -> Result<Option<PostgresCatalog>, OpenError> {
     let remembered = remembered_catalog(dir)?;
     let Some(asked) = asked else { return Ok(remembered.map(PostgresCatalog::from)) };
-    let path = dir.join(CATALOG);
     if folder::has_database(dir) {
-        let message = format!("its database is `{}`; `registry migrate` moves it", folder::DATABASE);
-        return Err(OpenError::Other { path: dir.to_owned(), message });
+        let message = format!("its database is `{}`; `registry migrate` moves it to PostgreSQL", folder::DATABASE);
+        return Err(OpenError::Catalog { dir: dir.to_owned(), message });
     }
     if let Some(other) = remembered.as_ref().filter(|other| !other.is_same_database(&asked.address)) {
         let message = format!("its catalog is {other}, not {}; choose another folder with `--store`", asked.address);
-        return Err(OpenError::Other { path, message });
+        return Err(OpenError::Catalog { dir: dir.to_owned(), message });
     }
     remember_catalog(dir, &asked.address)?;
     Ok(Some(asked))

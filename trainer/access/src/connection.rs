@@ -137,7 +137,9 @@ impl Server {
             // Redirects are not followed: the server never sends any, and another host must not get the token.
             .redirect(reqwest::redirect::Policy::none());
         let http = match (scheme, ca) {
-            ("https", Some(ca)) => http.tls_backend_preconfigured(tls::pinned(ca)?),
+            ("https", Some(ca)) => {
+                http.tls_backend_preconfigured(tls::pinned(ca).map_err(|error| error.named_by("--ca or STRIDE_CA"))?)
+            }
             ("https", None) => {
                 tls::install_provider();
                 http
@@ -236,9 +238,30 @@ pub fn retry_after(answer: &reqwest::Response) -> Duration {
     Duration::from_secs(seconds.unwrap_or(1).clamp(1, 60))
 }
 
-/// Describes a failed request down to its root cause, with advice for TLS errors. `reqwest` alone says only "error
-/// sending request".
+/// Advice if a server does not answer.
+pub const UNREACHABLE: &str = "start it with `trainer serve`, or give its address with --server";
+
+/// Errors of TLS by a part of their text, with advice.
+const TLS_ADVICE: [(&str, &str); 4] = [
+    ("InvalidContentType", "the server does not speak TLS there; try `http://`"),
+    (
+        "UnknownIssuer",
+        "its certificate is not signed by a trusted authority; check the file of --ca, or name its certificate there",
+    ),
+    ("not valid for name", "its certificate is for another name; use a name in the certificate"),
+    ("certificate expired", "renew the certificate, or correct the clock"),
+];
+
+/// Describes a failed request down to its root cause, with advice for TLS errors.
 pub fn explain(error: &reqwest::Error) -> String {
+    match describe(error) {
+        (text, Some(advice)) => format!("{text}; {advice}"),
+        (text, None) => text,
+    }
+}
+
+/// The root cause of a failed request, and advice for TLS errors. `reqwest` alone says only "error sending request".
+pub fn describe(error: &reqwest::Error) -> (String, Option<&'static str>) {
     let mut text = error.to_string();
     let mut root = text.clone();
     let mut cause: Option<&dyn std::error::Error> = std::error::Error::source(error);
@@ -251,18 +274,9 @@ pub fn explain(error: &reqwest::Error) -> String {
         }
         cause = error.source();
     }
-    let advice = [
-        ("InvalidContentType", "the server does not speak TLS there; try `http://`"),
-        ("UnknownIssuer", "its certificate is not signed by a trusted authority; check the file of --ca"),
-        ("not valid for name", "its certificate is for another name; use a name in the certificate"),
-        ("certificate expired", "renew the certificate, or correct the clock"),
-    ];
-    match advice.iter().find(|(sign, _)| text.contains(sign)) {
-        Some((_, advice)) => format!("{text}; {advice}"),
-        // The intermediate causes only repeat that connecting to this address failed.
-        None if error.is_connect() => root,
-        None => text,
-    }
+    let advice = TLS_ADVICE.iter().find(|(sign, _)| text.contains(sign)).map(|(_, advice)| *advice);
+    // The intermediate causes only repeat that connecting to this address failed.
+    (if error.is_connect() { root } else { text }, advice)
 }
 
 #[cfg(test)]

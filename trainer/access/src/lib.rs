@@ -19,7 +19,7 @@ pub mod tls;
 mod tokens;
 
 pub use caller::Caller;
-pub use connection::{ConnectError, Server, explain, retry_after};
+pub use connection::{ConnectError, Server, UNREACHABLE, describe, explain, retry_after};
 pub use expiry::Expiry;
 pub use names::Names;
 pub use options::{ConnectionOptions, ServerOptions, TokenOptions};

@@ -22,7 +22,9 @@ impl TokenOptions {
     pub fn read(&self) -> Result<Option<Token>, FileError> {
         match (&self.token, &self.token_file) {
             (Some(token), _) => Ok(Some(token.clone())),
-            (None, Some(path)) => Token::from_file(path).map(Some),
+            (None, Some(path)) => {
+                Token::from_file(path).map(Some).map_err(|error| error.named_by("--token-file or STRIDE_TOKEN_FILE"))
+            }
             (None, None) => Ok(None),
         }
     }

@@ -121,6 +121,11 @@ impl FileError {
         self
     }
 
+    /// Adds the options that name the file, unless there is other advice.
+    pub(crate) fn named_by(self, options: &str) -> Self {
+        if self.hint.is_some() { self } else { self.hint(&format!("{options} names this file")) }
+    }
+
     /// The user's next action, if there is one.
     pub fn advice(&self) -> Option<&str> {
         self.hint.as_deref()

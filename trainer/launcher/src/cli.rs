@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
-use access::{ConnectError, Server, ServerOptions};
+use access::{ConnectError, Server, ServerOptions, Token};
 use clap::{Args, Subcommand, ValueEnum};
 use protocol::Labels;
 use protocol::id::is_name;
@@ -84,7 +84,7 @@ pub struct FollowArgs {
     /// Time without work after which a worker is asked to leave, such as `30s`, `10m` or `1h`
     #[arg(long, value_name = "TIME", default_value = "10m", value_parser = time)]
     pub idle: Duration,
-    /// Number of jobs in a row that may end before their workers settle
+    /// The launcher ends after this many jobs in a row that cannot be submitted or end before any work
     #[arg(long, value_name = "N", default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..))]
     pub crashes: u32,
     /// URL of the server as workers reach it [default: that of --server]
@@ -201,6 +201,10 @@ impl FollowArgs {
         }
         more.extend(self.worker_arguments.iter().cloned());
         let this_program = || std::env::current_exe().ok().map(|path| path.display().to_string());
+        if let (Some(file), Engine::Local) = (&self.worker_token_file, engine) {
+            // Workers of this machine read this very file, so a mistake is shown at once.
+            Token::from_file(file).map_err(ConnectError::File)?;
+        }
         let program = match (&self.program, engine) {
             (Some(program), _) => program.clone(),
             (None, Engine::Local) => this_program().unwrap_or_else(|| "trainer".to_owned()),

@@ -75,10 +75,30 @@ impl EngineCommand {
             return Ok(String::from_utf8_lossy(&output.stdout).into_owned());
         }
         let errors = String::from_utf8_lossy(&output.stderr);
-        let said: String = errors.trim().chars().take(SAID).collect();
+        // The cause comes last: what stands before it is often a repetition.
+        let errors = errors.trim();
+        let skipped = errors.chars().count().saturating_sub(SAID);
+        let said: String = errors.chars().skip(skipped).collect();
         let said = if said.is_empty() { output.status.to_string() } else { protocol::printable(&said).into_owned() };
         Err(EngineError::Refused { program: self.program.clone(), said })
     }
+}
+
+/// Splits words into options, each with its value, and the other words. `takes_value` tells options whose value is the
+/// next word.
+pub fn split_options(words: Vec<String>, takes_value: impl Fn(&str) -> bool) -> (Vec<String>, Vec<String>) {
+    let (mut options, mut others) = (Vec::new(), Vec::new());
+    let mut words = words.into_iter();
+    while let Some(word) = words.next() {
+        if !word.starts_with('-') {
+            others.push(word);
+            continue;
+        }
+        let value = takes_value(&word).then(|| words.next()).flatten();
+        options.push(word);
+        options.extend(value);
+    }
+    (options, others)
 }
 
 /// A word for a POSIX shell.

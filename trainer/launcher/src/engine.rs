@@ -71,6 +71,9 @@ pub trait Launcher: Send + Sync {
     /// Asks a job to end: its worker saves and leaves. Asking twice is the same as once.
     async fn retire(&self, job: &Job) -> Result<(), EngineError>;
 
+    /// The place of a worker's log, for messages; NAME stands for the worker's name.
+    fn log(&self) -> &'static str;
+
     /// Largest number of jobs that the engine can hold; `None` if only the engine knows.
     fn capacity(&self) -> Option<usize> {
         None

@@ -1,9 +1,9 @@
 //! Decisions of a launcher: from demand and jobs to jobs to submit and to retire. No clock, no engine, no network.
 //!
 //! A worker counts as alive if it polls or if the engine lists its job; it is on its way until it first polls. A job
-//! that is neither listed nor polls has ended. If its worker never settled, that was a crash. After a crash, one job at
-//! a time is tried, with a growing pause; the limit of crashes ends the launcher. A worker that gets work or stays for a
-//! while proves the template good.
+//! that is neither listed nor polls has ended. If its worker never settled, that was a crash. A worker settles when it gets
+//! work or stays for a while; it proves the template good. After a crash, one job at a time is tried, with a growing pause;
+//! the limit of crashes ends the launcher.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -78,6 +78,8 @@ struct Known {
     doubtful: bool,
     /// First poll of its worker.
     joined: Option<Duration>,
+    /// Its worker has had work or has stayed for a while.
+    settled: bool,
     /// First time that the engine listed it as running.
     running: Option<Duration>,
     /// Since when it has nothing to do.
@@ -87,7 +89,16 @@ struct Known {
 
 impl Known {
     fn new(since: Duration) -> Self {
-        Self { since, seen: false, doubtful: false, joined: None, running: None, surplus: None, retired: false }
+        Self {
+            since,
+            seen: false,
+            doubtful: false,
+            joined: None,
+            settled: false,
+            running: None,
+            surplus: None,
+            retired: false,
+        }
     }
 }
 
@@ -98,6 +109,8 @@ pub struct Fleet {
     known: BTreeMap<String, Known>,
     /// Crashes since a worker last settled.
     crashes: u32,
+    /// Workers whose jobs crashed and that [`Fleet::take_crashed`] has not returned yet.
+    crashed: Vec<String>,
     /// End of the pause after a crash.
     resume: Duration,
     /// Number of submitted jobs, for their names.
@@ -106,7 +119,7 @@ pub struct Fleet {
 
 impl Fleet {
     pub fn new(plan: Plan) -> Self {
-        Self { plan, known: BTreeMap::new(), crashes: 0, resume: Duration::ZERO, submitted: 0 }
+        Self { plan, known: BTreeMap::new(), crashes: 0, crashed: Vec::new(), resume: Duration::ZERO, submitted: 0 }
     }
 
     pub fn plan(&self) -> &Plan {
@@ -116,6 +129,11 @@ impl Fleet {
     /// Returns true if the limit of crashes is reached.
     pub fn has_given_up(&self) -> bool {
         self.crashes >= self.plan.crashes
+    }
+
+    /// Workers whose jobs crashed since the last call.
+    pub fn take_crashed(&mut self) -> Vec<String> {
+        std::mem::take(&mut self.crashed)
     }
 
     /// Returns true if something changes soon without a change of demand.
@@ -169,6 +187,7 @@ impl Fleet {
             known.seen = true;
             let joined = *known.joined.get_or_insert(now);
             if !worker.idle || now >= joined + SETTLED {
+                known.settled = true;
                 self.crashes = 0;
             }
         }
@@ -176,26 +195,24 @@ impl Fleet {
             seen.jobs.iter().any(|job| job.worker == name)
                 || seen.demand.workers.iter().any(|worker| worker.worker.as_str() == name)
         };
-        let mut crashed = 0;
+        let before = self.crashed.len();
         self.known.retain(|name, job| {
             let waits = !job.seen && now < job.since + UNLISTED;
             let has_ended = !waits && !is_alive(name);
-            let has_settled = job.joined.is_some_and(|joined| now >= joined + SETTLED);
-            if has_ended && !job.retired && !job.doubtful && !has_settled {
-                crashed += 1;
+            if has_ended && !job.retired && !job.doubtful && !job.settled {
+                self.crashed.push(name.clone());
             }
             !has_ended
         });
-        for job in self.known.values_mut() {
+        for (name, job) in &mut self.known {
             let is_silent = job.joined.is_none() && job.running.is_some_and(|running| now >= running + SILENT);
             if is_silent && !job.retired {
                 job.retired = true;
-                crashed += 1;
+                self.crashed.push(name.clone());
             }
         }
         // Jobs that end together are one crash: the first of them would have been enough.
-        if crashed > 0 {
-            tracing::warn!(jobs = crashed, "ended before their workers settled");
+        if self.crashed.len() > before {
             self.crash(now);
         }
     }

@@ -23,7 +23,7 @@ const ENGINE: Duration = Duration::from_secs(120);
 /// The reason for which a launcher ends.
 #[derive(Debug, thiserror::Error)]
 pub enum FollowError {
-    #[error("{jobs} jobs in a row ended before their workers settled; the last error: {last}")]
+    #[error("{jobs} jobs in a row failed (--crashes): {last}")]
     Crashes { jobs: u32, last: String },
     /// The token is missing or lacks the scope, or the call is refused for good.
     #[error("{message}")]
@@ -103,7 +103,7 @@ pub async fn follow(server: &Server, plan: Plan, engine: &dyn Launcher) -> Resul
     let mut fleet = Fleet::new(plan);
     let mut version = None;
     let mut is_leading = None;
-    let mut last_error = "none of the engine; see the jobs' own logs".to_owned();
+    let mut last_error = String::new();
     loop {
         let wait = if fleet.is_busy() { BUSY } else { QUIET };
         let demand = match demand(server, fleet.plan(), Some(&own_name), version, wait).await {
@@ -120,7 +120,8 @@ pub async fn follow(server: &Server, plan: Plan, engine: &dyn Launcher) -> Resul
         let leads = demand.lead_ms > 0;
         if is_leading.replace(leads) != Some(leads) {
             let state = if leads { "following the demand" } else { "another launcher follows this demand; waiting" };
-            tracing::info!(labels = %fleet.plan().labels, "{state}");
+            let plan = fleet.plan();
+            tracing::info!(backend = plan.backend.name(), labels = %plan.labels, "{state}");
         }
         if leads {
             match bounded("list", engine.list()).await {
@@ -128,6 +129,11 @@ pub async fn follow(server: &Server, plan: Plan, engine: &dyn Launcher) -> Resul
                     let seen = Observation { now: clock.now(), stamp: Clock::stamp(), demand: &demand, jobs: &jobs };
                     let until = answered + Duration::from_millis(demand.lead_ms);
                     let actions = fleet.decide(seen);
+                    let crashed = fleet.take_crashed();
+                    if !crashed.is_empty() {
+                        last_error = crash(&crashed, engine);
+                        tracing::warn!("{last_error}");
+                    }
                     if let Some(error) = perform(&mut fleet, engine, actions, until, &clock).await {
                         last_error = error.to_string();
                     }
@@ -143,6 +149,12 @@ pub async fn follow(server: &Server, plan: Plan, engine: &dyn Launcher) -> Resul
         }
         sleep(PASS).await;
     }
+}
+
+/// The message about jobs that crashed.
+fn crash(workers: &[String], engine: &dyn Launcher) -> String {
+    let (names, log) = (workers.join(", "), engine.log());
+    format!("{names} ended before any work; the reason is in the log: {log}")
 }
 
 /// Performs actions while this launcher leads. Returns the last error.

@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use async_trait::async_trait;
 
-use crate::command::{EngineCommand, quoted};
+use crate::command::{EngineCommand, quoted, split_options};
 use crate::engine::{EngineError, Job, JobState, Launcher};
 use crate::worker_command::{WITHOUT_TOKEN, WorkerCommand};
 
@@ -20,6 +20,19 @@ pub struct Host {
     pub name: Option<String>,
     /// Largest number of workers on it; `None` sets no limit.
     pub slots: Option<usize>,
+}
+
+impl Host {
+    fn shown(&self) -> &str {
+        self.name.as_deref().unwrap_or("localhost")
+    }
+}
+
+/// Returns true if the value of an option of `ssh` is the next word.
+fn takes_value(option: &str) -> bool {
+    let with_value = |letter: char| "BbcDEeFIiJLlmOopQRSWw".contains(letter);
+    // The rest of a word behind such a letter is the value.
+    option.find(with_value).is_some_and(|at| at + 1 == option.len())
 }
 
 /// The processes of one launcher.
@@ -43,12 +56,13 @@ impl Hosts {
         Self { worker, prefix, hosts, options: Vec::new(), limit, counts: Mutex::default() }
     }
 
-    /// The processes of the machines in `options`, each `HOST` or `HOST:WORKERS`. Options with a dash are of `ssh`.
+    /// The processes of the machines in `options`, each `HOST` or `HOST:WORKERS`. Words with a dash, and their values, are
+    /// options of `ssh`.
     ///
     /// # Errors
     /// No machine is named, or a number is malformed.
     pub fn ssh(worker: WorkerCommand, prefix: String, options: Vec<String>, limit: Duration) -> Result<Self, String> {
-        let (options, words): (Vec<_>, Vec<_>) = options.into_iter().partition(|option| option.starts_with('-'));
+        let (options, words) = split_options(options, takes_value);
         let host = |word: &String| {
             let (name, slots) = word.rsplit_once(':').unwrap_or((word, "1"));
             let slots =
@@ -103,12 +117,15 @@ impl Launcher for Hosts {
                 Ok(text) => {
                     let found = workers(&text, &self.prefix);
                     counts.insert(i, found.len());
-                    let job =
-                        |(worker, process)| Job { worker, id: format!("{i}/{process}"), state: JobState::Running };
+                    let job = |(worker, process)| Job {
+                        worker,
+                        id: format!("{}/{process}", host.shown()),
+                        state: JobState::Running,
+                    };
                     jobs.extend(found.into_iter().map(job));
                 }
                 Err(error) => {
-                    tracing::warn!(host = host.name.as_deref().unwrap_or("this machine"), %error, "no list of workers");
+                    tracing::warn!(host = host.shown(), %error, "no list of workers");
                     last_error = Some(error);
                 }
             }
@@ -130,19 +147,30 @@ impl Launcher for Hosts {
         let Some((_, i)) = most else { return Err(EngineError::NoSlot(format!("{} hosts tried", self.hosts.len()))) };
         let log = format!("\"${{TMPDIR:-/tmp}}\"/{}.log", quoted(worker));
         let line = self.worker.line(worker);
-        let script = format!("{WITHOUT_TOKEN}; nohup setsid {line} </dev/null >>{log} 2>&1 &");
+        let program = quoted(&self.worker.program);
+        let missing = quoted(&format!(
+            "{} has no program `{}`; --program names another",
+            self.hosts[i].shown(),
+            self.worker.program
+        ));
+        let check = format!("command -v {program} >/dev/null || {{ echo {missing} >&2; exit 127; }}");
+        let script = format!("{WITHOUT_TOKEN}; {check}; nohup setsid {line} </dev/null >>{log} 2>&1 &");
         self.shell(&self.hosts[i], &script).run(self.limit).await?;
         *self.counts().entry(i).or_default() += 1;
         Ok(())
     }
 
     async fn retire(&self, job: &Job) -> Result<(), EngineError> {
-        let Some((host, process)) = job.id.split_once('/') else { return Ok(()) };
-        let Some(host) = host.parse::<usize>().ok().and_then(|i| self.hosts.get(i)) else { return Ok(()) };
+        let Some((name, process)) = job.id.rsplit_once('/') else { return Ok(()) };
+        let Some(host) = self.hosts.iter().find(|host| host.shown() == name) else { return Ok(()) };
         // The number may belong to another process by now.
         let name = quoted(&format!("--name {}", job.worker));
         let script = format!("if ps -ww -o args= -p {process} | grep -qF -- {name}; then kill -TERM {process}; fi");
         self.shell(host, &script).run(self.limit).await.map(drop)
+    }
+
+    fn log(&self) -> &'static str {
+        "NAME.log in the temporary folder of its machine"
     }
 
     fn capacity(&self) -> Option<usize> {
@@ -178,6 +206,9 @@ mod tests {
                 .map(|hosts| (hosts.capacity(), hosts.options))
         };
         assert_eq!(hosts(&["a:2", "-oPort=22", "b"]), Ok((Some(3), vec!["-oPort=22".to_owned()])));
+        let options = ["-F", "ssh.conf", "a:2", "-vi", "key", "-p22", "-A", "b"];
+        let words = ["-F", "ssh.conf", "-vi", "key", "-p22", "-A"].map(str::to_owned).to_vec();
+        assert_eq!(hosts(&options), Ok((Some(3), words)), "an option may have its value in the next word");
         assert!(hosts(&[]).is_err_and(|why| why.contains("HOST:WORKERS")));
         assert!(hosts(&["a:many"]).is_err_and(|why| why.contains("`a:many`")));
     }

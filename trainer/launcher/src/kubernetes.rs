@@ -9,7 +9,7 @@ use std::time::Duration;
 use async_trait::async_trait;
 use serde_json::{Value, json};
 
-use crate::command::EngineCommand;
+use crate::command::{EngineCommand, split_options};
 use crate::engine::{EngineError, Job, JobState, Launcher};
 use crate::worker_command::WorkerCommand;
 
@@ -17,6 +17,21 @@ use crate::worker_command::WorkerCommand;
 const TEMPLATE: &str = "stride-worker";
 /// The label of the launcher's Jobs.
 const LABEL: &str = "stride.dev/launcher";
+/// Options of every `kubectl` whose value is the next word.
+const WITH_VALUE: [&str; 12] = [
+    "-n",
+    "--namespace",
+    "-s",
+    "--server",
+    "--as",
+    "--cluster",
+    "--context",
+    "--kubeconfig",
+    "--request-timeout",
+    "--token",
+    "--user",
+    "--certificate-authority",
+];
 
 /// Jobs of one launcher on Kubernetes.
 #[derive(Debug, Clone)]
@@ -31,9 +46,9 @@ pub struct Kubernetes {
 }
 
 impl Kubernetes {
-    /// The first of `options` that does not begin with a dash names the CronJob.
+    /// The first word of `options` that is no option names the CronJob.
     pub fn new(worker: WorkerCommand, name: String, options: Vec<String>, limit: Duration) -> Self {
-        let (options, mut names): (Vec<_>, Vec<_>) = options.into_iter().partition(|option| option.starts_with('-'));
+        let (options, mut names) = split_options(options, |option| WITH_VALUE.contains(&option));
         let template = if names.is_empty() { TEMPLATE.to_owned() } else { names.swap_remove(0) };
         Self { worker, name, template, options, limit }
     }
@@ -115,6 +130,10 @@ impl Launcher for Kubernetes {
         let arguments = ["delete", "job", &job.id, "--cascade=foreground", "--wait=false", "--ignore-not-found"];
         self.kubectl(&arguments).run(self.limit).await.map(drop)
     }
+
+    fn log(&self) -> &'static str {
+        "`kubectl logs job/NAME`, while the Job exists"
+    }
 }
 
 #[cfg(test)]
@@ -135,6 +154,9 @@ mod tests {
         let options = ["--namespace=stride", "big-worker"].map(str::to_owned).to_vec();
         let kubernetes = Kubernetes::new(worker, "stride-a".into(), options, Duration::from_secs(1));
         assert_eq!((kubernetes.template.as_str(), kubernetes.options.len()), ("big-worker", 1));
+        let options = ["-n", "stride", "big-worker"].map(str::to_owned).to_vec();
+        let other = Kubernetes::new(kubernetes.worker.clone(), "stride-a".into(), options, Duration::from_secs(1));
+        assert_eq!((other.template.as_str(), other.options.join(" ").as_str()), ("big-worker", "-n stride"));
         let cron_job = json!({"spec": {"jobTemplate": {
             "metadata": {"labels": {"kueue.x-k8s.io/queue-name": "gpus"}},
             "spec": {"completionMode": "Indexed", "template": {"spec": {"containers": [{"args": ["worker", "join", "u"]}]}}},

@@ -80,6 +80,10 @@ impl Launcher for Slurm {
             None => Ok(()),
         }
     }
+
+    fn log(&self) -> &'static str {
+        "slurm-JOB.out in this folder, if the options name no other file"
+    }
 }
 
 #[cfg(test)]

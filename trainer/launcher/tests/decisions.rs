@@ -181,6 +181,24 @@ fn a_crashing_template_is_tried_ever_more_rarely_and_then_given_up() {
 }
 
 #[test]
+fn jobs_that_end_before_any_work_are_named_and_others_are_not() {
+    let (mut world, mut fleet) = (World::new(), Fleet::new(plan(0, 4)));
+    world.slots = 2;
+    while world.working() < 2 {
+        world.pass(&mut fleet);
+    }
+    world.pass(&mut fleet);
+    (world.slots, world.jobs) = (0, BTreeMap::new());
+    world.run(&mut fleet, 5);
+    assert_eq!(fleet.take_crashed(), Vec::<String>::new(), "these workers have worked");
+    (world.slots, world.starts_in) = (2, None);
+    world.run(&mut fleet, 30);
+    let crashed = fleet.take_crashed();
+    assert!(crashed.len() >= 2 && crashed.iter().all(|name| name.starts_with("stride-t-")), "{crashed:?}");
+    assert_eq!(fleet.take_crashed(), Vec::<String>::new(), "each is named once");
+}
+
+#[test]
 fn a_template_that_works_again_is_trusted_again() {
     let (mut world, mut fleet) = (World::new(), Fleet::new(plan(0, 4)));
     (world.slots, world.starts_in) = (4, None);

@@ -110,7 +110,8 @@ fn list(backend: Backend) -> Vec<DeviceInfo> {
                 let (name, note) = match identity(device) {
                     Some((name, true)) => (name, note(backend)),
                     Some((name, false)) => (name, "an emulated GPU on the CPU: for checks, slow"),
-                    None => (format!("{device:?}"), note(backend)),
+                    // The bits of a result depend on the instruction set.
+                    None => (format!("CPU, {}", crate::instruction_set()), note(backend)),
                 };
                 DeviceInfo { backend, index: Some(index), name, note: note.to_owned() }
             })
@@ -120,8 +121,8 @@ fn list(backend: Backend) -> Vec<DeviceInfo> {
 
 fn note(backend: Backend) -> &'static str {
     match backend {
-        Backend::Flex => "CPU, pure Rust, fused kernels; the same bits on every run",
-        Backend::Ndarray => "CPU, kept as a cross-check; slower than flex",
+        Backend::Flex => "pure Rust, fused kernels; the same bits on every run",
+        Backend::Ndarray => "kept as a cross-check; slower than flex",
         Backend::Wgpu => "GPU through Vulkan, Metal or DirectX",
         Backend::Cuda => "NVIDIA GPU",
     }

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use access::Tokens;
 use clap::Args;
-use coordinator::Config;
+use coordinator::{Config, Handle};
 
 use crate::report::problem::Result;
 
@@ -23,6 +23,16 @@ pub(super) struct EndpointArgs {
 }
 
 impl EndpointArgs {
+    /// The URL by which callers reach the server: with the name of `--host`; with the machine's name if it listens on all
+    /// networks.
+    pub(super) fn url(&self, handle: &Handle) -> String {
+        let address = handle.address();
+        let own = || nix::unistd::gethostname().ok()?.into_string().ok();
+        let name = self.host.first().cloned().or_else(|| address.ip().is_unspecified().then(own).flatten());
+        let scheme = if self.tls_cert.is_some() { "https" } else { "http" };
+        name.map_or_else(|| handle.url(), |name| format!("{scheme}://{name}:{}", address.port()))
+    }
+
     /// Configures a server at `listen` for callers with one of `tokens`. Without TLS, it accepts callers from other
     /// machines only if `insecure`.
     pub(super) fn config(&self, listen: SocketAddr, tokens: Tokens, insecure: bool) -> Result<Config> {

@@ -7,6 +7,9 @@ use launcher::{EngineError, Job};
 use crate::report::print;
 use crate::report::problem::{Problem, Result, exit};
 
+/// Advice if the program of an engine cannot be started.
+const MISSING: &str = "run the launcher on a machine that has this program, such as a login node";
+
 impl From<ArgumentError> for Problem {
     fn from(error: ArgumentError) -> Self {
         match error {
@@ -24,12 +27,13 @@ impl From<FollowError> for Problem {
     fn from(error: FollowError) -> Self {
         match &error {
             FollowError::Crashes { .. } => {
-                Self::failed(error).hint("run the worker's command by hand on one of the machines; see the jobs' logs")
+                Self::failed(error).hint("correct the cause, then start the launcher again with the same options")
             }
             FollowError::Refused { status, .. } if matches!(status.as_u16(), 401 | 403) => {
                 Self::new(exit::UNAUTHORISED, error).hint("a launcher's token needs the scope `launch`")
             }
-            FollowError::Unreachable { .. } => Self::new(exit::UNREACHABLE, error),
+            FollowError::Unreachable { .. } => Self::new(exit::UNREACHABLE, error).hint(access::UNREACHABLE),
+            FollowError::Engine(EngineError::Missing { .. }) => Self::failed(error).hint(MISSING),
             FollowError::Refused { .. } | FollowError::Engine(_) => Self::failed(error),
         }
     }
@@ -37,7 +41,7 @@ impl From<FollowError> for Problem {
 
 impl From<EngineError> for Problem {
     fn from(error: EngineError) -> Self {
-        Self::failed(error)
+        FollowError::Engine(error).into()
     }
 }
 
@@ -76,7 +80,11 @@ async fn status(args: &JobsArgs) -> Result<u8> {
 
 async fn stop(args: &JobsArgs) -> Result<u8> {
     let (engine, plan) = (args.engine()?, args.kind.plan());
-    show(&follow::stop(&plan, &*engine).await?);
+    let jobs = follow::stop(&plan, &*engine).await?;
+    show(&jobs);
+    if !jobs.is_empty() {
+        print::note("asked these jobs to save and leave; a launcher that still runs starts new ones while work waits");
+    }
     Ok(0)
 }
 

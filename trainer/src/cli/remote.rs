@@ -234,6 +234,7 @@ pub(crate) async fn workers(args: WorkersArgs) -> Result<u8> {
     let workers = reader.workers().await?;
     match args.output {
         Output::Json => print::json(&workers),
+        Output::Table if workers.is_empty() => print::out("no workers; `trainer worker join` adds one to a server"),
         Output::Table => {
             let row = |worker: &coordinator::WorkerView| {
                 let task = worker.task.as_ref().map(ToString::to_string).unwrap_or_default();

@@ -147,12 +147,8 @@ impl ServeArgs {
 }
 
 /// The address of the page. The key that signs this user in is shown on a terminal alone: a log may have other readers.
-fn page(handle: &Handle) -> String {
-    if std::io::stderr().is_terminal() {
-        handle.page_link()
-    } else {
-        format!("{}/ (sign in with a token)", handle.url())
-    }
+fn page(handle: &Handle, url: &str) -> String {
+    if std::io::stderr().is_terminal() { handle.page_link_at(url) } else { format!("{url}/ (sign in with a token)") }
 }
 
 pub(crate) async fn serve(args: ServeArgs) -> Result<u8> {
@@ -175,12 +171,13 @@ pub(crate) async fn serve(args: ServeArgs) -> Result<u8> {
     };
     let handle = Coordinator::start(store.clone(), config).await?;
     let announced = client::announce(&store, &handle)?;
-    let token = if open { format!(" --token-file {}", args.store.join("token").display()) } else { String::new() };
-    let url = handle.url();
+    let token = if open { args.store.join("token").display().to_string() } else { "FILE".to_owned() };
+    let url = args.endpoint.url(&handle);
     print::note(&format!(
-        "listening on {url} with the store {}\n  page {}\n  trainer worker join {url}{token}\n  trainer submit PIPELINE --server {url}{token}",
+        "listening on {} with the store {}\n  page {}\n  trainer worker join {url} --token-file {token}\n  trainer submit PIPELINE --server {url} --token-file {token}",
+        handle.url(),
         args.store.display(),
-        page(&handle),
+        page(&handle, &url),
     ));
     let failure = loop {
         tokio::select! {

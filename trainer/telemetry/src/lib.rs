@@ -14,6 +14,9 @@ use tracing_subscriber::{EnvFilter, Layer as _, fmt, registry};
 /// Target of all spans: requests of the server, tasks and stages of a worker.
 pub const SPANS: &str = "spans";
 
+/// A library that logs each certificate that it refuses. Our own errors name the cause.
+const QUIET: &str = "rustls_platform_verifier";
+
 /// Sends the last spans when it is dropped.
 #[derive(Debug, Default)]
 #[must_use]
@@ -29,7 +32,7 @@ pub struct Traces {
 /// # Errors
 /// Another subscriber is set already.
 pub fn init(service: &'static str, filter: &str, ansi: bool) -> Result<Traces, TryInitError> {
-    let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(filter));
+    let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(format!("{filter},{QUIET}=off")));
     let lines = fmt::layer().with_writer(std::io::stderr).with_ansi(ansi).log_internal_errors(false);
     let lines = registry().with(lines.with_filter(filter));
     #[cfg(feature = "otel")]

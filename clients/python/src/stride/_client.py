@@ -348,6 +348,11 @@ class Run:
         return Metrics(self.name, stage, key, *(b"".join(column) for column in columns))
 
 
+def _missing(error: ImportError) -> StrideError:
+    """The error for a package that only some calls need."""
+    return StrideError("invalid", f"this call needs `{error.name}`", "`pip install 'stride-client[pandas]'` installs it")
+
+
 def _unpacked(answer: bytes) -> dict[str, tuple[memoryview[int], memoryview[float]]]:
     (length,) = struct.unpack_from("<I", answer)
     at = 4 + length
@@ -388,9 +393,11 @@ class Metrics:
 
     def to_pandas(self) -> pandas.Series[Any]:
         """The values as a series by step; needs pandas."""
-        import numpy
-        import pandas
-
+        try:
+            import numpy
+            import pandas
+        except ImportError as error:
+            raise _missing(error) from error
         index = pandas.Index(numpy.frombuffer(self._steps, dtype="<u8").astype("int64"), name="step")
         return pandas.Series(numpy.frombuffer(self._values, dtype="<f8"), index=index, name=self.key)
 
@@ -433,7 +440,10 @@ class Model:
         Raises:
             StrideError: The server refuses the draw, or it failed.
         """
-        import numpy
+        try:
+            import numpy
+        except ImportError as error:
+            raise _missing(error) from error
 
         from ._motions import motions
 

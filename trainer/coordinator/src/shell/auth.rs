@@ -95,7 +95,7 @@ impl Gate {
                 }
             },
         };
-        let token = token.ok_or_else(|| unauthorized(&Unknown::Nobody))?;
+        let token = token.ok_or_else(|| unauthorized(&Unknown::Missing))?;
         let caller = self.tokens.find(token).map_err(|unknown| unauthorized(&unknown))?;
         let standing = Standing::new(Arc::clone(&self.tokens), token, Arc::clone(&caller));
         Ok(Shown { caller, standing, session })
@@ -250,9 +250,13 @@ async fn admitted_call(gate: &Arc<Gate>, route: Route, shown: Shown, mut request
 
 fn unauthorized(unknown: &Unknown) -> Failure {
     match unknown {
-        Unknown::Nobody => {
+        Unknown::Missing => {
             Failure::new(StatusCode::UNAUTHORIZED, "unauthorized", "this server requires a token".to_owned())
                 .hint("give it with --token-file, --token, STRIDE_TOKEN_FILE or STRIDE_TOKEN")
+        }
+        Unknown::Nobody => {
+            Failure::new(StatusCode::UNAUTHORIZED, "unauthorized", "this server does not know the token".to_owned())
+                .hint("it is of another server, or was revoked; the server reads its token file again at SIGHUP")
         }
         Unknown::Expired(caller) => {
             let at = caller.expires.as_ref().map(ToString::to_string).unwrap_or_default();
@@ -265,8 +269,12 @@ fn unauthorized(unknown: &Unknown) -> Failure {
 /// The refusal of a token without the required scope.
 pub(crate) fn forbidden(caller: &Caller, needed: &[Scope]) -> Failure {
     let needed: Vec<&str> = needed.iter().map(|scope| scope.name()).collect();
-    let message =
-        format!("the token of `{}` may {}; this call needs {}", caller.name, caller.scopes, needed.join(" or "));
+    let message = format!(
+        "the token of `{}` has the scope {}; this call needs {}",
+        caller.name,
+        caller.scopes,
+        needed.join(" or ")
+    );
     Failure::new(StatusCode::FORBIDDEN, "forbidden", message)
         .hint("use another token, or add the scope to the server's token file")
 }

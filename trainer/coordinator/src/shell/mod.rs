@@ -288,7 +288,12 @@ impl Handle {
 
     /// The address of its page, with a key in the fragment that signs this process's user in. It is good once, for an hour.
     pub fn page_link(&self) -> String {
-        format!("{}/#key={}", self.url(), self.sessions.key())
+        self.page_link_at(&self.url())
+    }
+
+    /// The same for a server that its callers reach at `url`.
+    pub fn page_link_at(&self, url: &str) -> String {
+        format!("{url}/#key={}", self.sessions.key())
     }
 
     /// A token with all scopes, valid for the life of this coordinator. Its name is the user's.

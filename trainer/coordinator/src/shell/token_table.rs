@@ -23,6 +23,8 @@ pub(crate) struct TokenTable {
 /// The reason why a token is refused.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum Unknown {
+    /// The call has no token.
+    Missing,
     /// No line has the token.
     Nobody,
     /// The token has expired.
