@@ -122,7 +122,8 @@ impl FileError {
     }
 
     /// Adds the options that name the file, unless there is other advice.
-    pub(crate) fn named_by(self, options: &str) -> Self {
+    #[must_use]
+    pub fn named_by(self, options: &str) -> Self {
         if self.hint.is_some() { self } else { self.hint(&format!("{options} names this file")) }
     }
 

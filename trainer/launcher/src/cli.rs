@@ -203,7 +203,7 @@ impl FollowArgs {
         let this_program = || std::env::current_exe().ok().map(|path| path.display().to_string());
         if let (Some(file), Engine::Local) = (&self.worker_token_file, engine) {
             // Workers of this machine read this very file, so a mistake is shown at once.
-            Token::from_file(file).map_err(ConnectError::File)?;
+            Token::from_file(file).map_err(|error| ConnectError::File(error.named_by("--worker-token-file")))?;
         }
         let program = match (&self.program, engine) {
             (Some(program), _) => program.clone(),

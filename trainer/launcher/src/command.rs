@@ -78,7 +78,10 @@ impl EngineCommand {
         // The cause comes last: what stands before it is often a repetition.
         let errors = errors.trim();
         let skipped = errors.chars().count().saturating_sub(SAID);
-        let said: String = errors.chars().skip(skipped).collect();
+        let mut said: String = errors.chars().skip(skipped).collect();
+        if let (true, Some((_, whole))) = (skipped > 0, said.split_once('\n')) {
+            said = whole.to_owned();
+        }
         let said = if said.is_empty() { output.status.to_string() } else { protocol::printable(&said).into_owned() };
         Err(EngineError::Refused { program: self.program.clone(), said })
     }
@@ -133,6 +136,11 @@ mod tests {
         assert_eq!(run("echo out; echo err >&2").await.as_deref(), Ok("out\n"));
         let error = run("echo no such partition >&2; exit 1").await.expect_err("it fails");
         assert_eq!(error.to_string(), "`sh` failed: no such partition");
+        let error = run("for i in $(seq 60); do echo again $i >&2; done; echo the cause >&2; exit 1")
+            .await
+            .expect_err("it fails");
+        let said = error.to_string();
+        assert!(said.starts_with("`sh` failed: again ") && said.ends_with("\nthe cause"), "{said}");
         let error = EngineCommand::new("no-such-program", [""; 0]).run(LIMIT).await.expect_err("there is none");
         assert!(matches!(error, EngineError::Missing { .. }), "{error}");
         let echoed = EngineCommand::new("cat", [""; 0]).with_input("a job\n".into()).run(LIMIT).await;

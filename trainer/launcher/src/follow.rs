@@ -5,6 +5,7 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 use access::{Server, explain};
 use protocol::demand::Demand;
 use protocol::message::ApiError;
+use protocol::units::counted;
 use reqwest::{Method, StatusCode};
 use tokio::time::{sleep, timeout};
 
@@ -23,7 +24,7 @@ const ENGINE: Duration = Duration::from_secs(120);
 /// The reason for which a launcher ends.
 #[derive(Debug, thiserror::Error)]
 pub enum FollowError {
-    #[error("{jobs} jobs in a row failed (--crashes): {last}")]
+    #[error("{} failed in a row (--crashes): {last}", counted(*jobs, "job"))]
     Crashes { jobs: u32, last: String },
     /// The token is missing or lacks the scope, or the call is refused for good.
     #[error("{message}")]
@@ -121,7 +122,7 @@ pub async fn follow(server: &Server, plan: Plan, engine: &dyn Launcher) -> Resul
         if is_leading.replace(leads) != Some(leads) {
             let state = if leads { "following the demand" } else { "another launcher follows this demand; waiting" };
             let plan = fleet.plan();
-            tracing::info!(backend = plan.backend.name(), labels = %plan.labels, "{state}");
+            tracing::info!(backend = plan.backend.name(), labels = %plan.labels, prefix = plan.prefix, "{state}");
         }
         if leads {
             match bounded("list", engine.list()).await {
@@ -153,8 +154,8 @@ pub async fn follow(server: &Server, plan: Plan, engine: &dyn Launcher) -> Resul
 
 /// The message about jobs that crashed.
 fn crash(workers: &[String], engine: &dyn Launcher) -> String {
-    let (names, log) = (workers.join(", "), engine.log());
-    format!("{names} ended before any work; the reason is in the log: {log}")
+    let first = workers.first().map_or("NAME", String::as_str);
+    format!("{} ended before any work; see the log, {}", workers.join(", "), engine.log().replace("NAME", first))
 }
 
 /// Performs actions while this launcher leads. Returns the last error.
