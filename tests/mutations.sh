@@ -129,7 +129,10 @@ mutation word-outlives-membership trainer/coordinator/src/state/apply.rs 's/drop
 mutation old-report-is-believed trainer/coordinator/src/state/evidence.rs 's/ && word\.grant\.fence == self\.task\.fence && !any_holds =>/ \&\& (any_holds || !any_holds) =>/' coordinator:lib:evidence
 mutation suspicion-never-fades trainer/coordinator/src/decide/gangs.rs 's/saturating_sub\(u32::try_from\(faded\)[^)]*\)\)/saturating_sub(u32::try_from(faded * 0).unwrap_or(0))/' coordinator:decisions:gangs
 mutation too-few-lose-their-state trainer/coordinator/src/decide/attempts.rs 's/!left\.is_empty\(\) && self\.may_hold/left.is_empty() \&\& self.may_hold/' coordinator:decisions:gangs
-mutation failing-lead-ends-the-try trainer/coordinator/src/decide/outcome.rs 's/&& self\.goes_on_without/\&\& !self.goes_on_without/' coordinator:decisions:gangs
+mutation failing-lead-ends-the-try trainer/coordinator/src/decide/outcome.rs 's/&& self\.state\.goes_on_without/\&\& !self.state.goes_on_without/' coordinator:decisions:gangs
+mutation no-shares trainer/coordinator/src/decide/shares.rs 's/if groups\.len\(\) < 2/if groups.len() < 200/' coordinator:decisions:shares
+mutation gangs-give-nothing trainer/coordinator/src/decide/shares.rs 's/own \+ 2/own + 200/' coordinator:decisions:shares
+mutation shares-for-ever trainer/coordinator/src/decide/shares.rs 's/idle_ms > state\.policy\.share_ms/idle_ms > state.policy.share_ms * 100/' coordinator:decisions:shares
 mutation joins-without-reaching worker/src/prepare.rs 's/for Member \{ worker, peer_address, \.\. \} in &task\.peers \{/for Member { worker, peer_address, .. } in task.peers.iter().take(0) {/' worker:lib:prepare
 mutation only-whole-frames-count worker/src/gang/link.rs 's/if count > 0 \{/if count > 1 << 20 {/' worker:lib:relay
 mutation signs-behind-frames worker/src/gang/link.rs 's/writer\.sign\(sign, patience, abort\)\?;/let _ = sign;/' worker:lib:relay
