@@ -298,8 +298,10 @@ pub(crate) async fn plan(pipeline: &Pipeline, store: Option<&ReadStore>) -> Resu
     }
     let backend = pipeline.backend;
     let device = models::device::available().into_iter().find(|device| device.backend == backend);
-    // The part of a name before its first comma, such as `CPU`.
-    let device = device.and_then(|device| device.name.split(',').next().map(str::to_owned)).unwrap_or_default();
+    // The name of the device, or why there is none, up to its first comma.
+    let device =
+        device.map(|device| if device.index.is_some() { device.name } else { device.note }).unwrap_or_default();
+    let device = device.split(',').next().unwrap_or_default();
     let before = finished.and_then(|(run, worked)| Some(Before { run, seconds: needed(&stages, &worked)? }));
     Ok(Plan {
         schema_version: 1,
