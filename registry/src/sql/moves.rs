@@ -33,13 +33,16 @@ pub(super) async fn register(
     run(conn, add.bind(model.as_str()).bind(now)).await?;
     declare(conn, model, source).await?;
 
-    let versions = models::versions(conn, model).await.map_err(write_error)?;
-    if let Some(version) = versions.into_iter().find(|version| version.artifact == artifact) {
-        let mut all = version.metrics;
+    // One row, because this runs inside the writer's transaction and a model may have thousands of versions.
+    let find = query("SELECT version, metrics FROM versions WHERE model = ? AND artifact = ?");
+    let find = find.bind(model.as_str()).bind(artifact.to_string());
+    if let Some(row) = find.fetch_optional(&mut *conn).await.map_err(write_error)? {
+        let (version, known): (i64, String) = (row.get(0), row.get(1));
+        let mut all = models::numbers(&known);
         all.extend(metrics.clone());
         let set = query("UPDATE versions SET metrics = ? WHERE model = ? AND version = ?");
-        run(conn, set.bind(json(&all)).bind(model.as_str()).bind(int(version.version))).await?;
-        return Ok(version.version);
+        run(conn, set.bind(json(&all)).bind(model.as_str()).bind(version)).await?;
+        return Ok(version.unsigned_abs());
     }
     // The single writer makes the next number safe; the primary key refuses a duplicate as well.
     let add = query(
