@@ -35,7 +35,7 @@ fn stored(store: &Store, of: std::ops::Range<usize>) -> Result<Vec<Write>> {
     Ok(writes)
 }
 
-/// Registers versions by `callers` at once, each of which waits for one before the next, and returns versions a second.
+/// Registers versions by `callers` at once and returns versions a second. Each caller waits for a version before the next.
 async fn registered(store: &Store, writes: Vec<Write>, callers: usize) -> Result<f64> {
     let (count, begun) = (writes.len(), Instant::now());
     let mut tasks = JoinSet::new();

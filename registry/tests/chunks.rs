@@ -30,7 +30,7 @@ fn sparse(name: u8, chunks: usize) -> Vec<u8> {
     bytes
 }
 
-/// A checkpoint of three files, the first of which changes with each step.
+/// A checkpoint of three files. The first one changes with each step.
 fn put_checkpoint(blobs: &BlobStore, step: u8) -> (Digest, Manifest) {
     let mut manifest = Manifest::new(ArtifactKind::Checkpoint, json!({}));
     for (name, bytes) in [("state", sparse(step, 5)), ("frozen", sparse(255, 3)), ("small", vec![1; 10])] {

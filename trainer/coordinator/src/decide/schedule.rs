@@ -69,7 +69,7 @@ pub(crate) fn schedule(cx: &mut Deciding<'_>) {
         note_idle(cx, &shares);
         let before = cx.facts.len();
         assign(cx, &shares);
-        // What was assigned changes the shares of the rest.
+        // Each assignment changes the shares of the workers that are left.
         if cx.facts.len() == before || !shares.are_divided() {
             break;
         }

@@ -96,7 +96,7 @@ impl State {
                 **group == claim.need.group
                     && self.workers.get(name).is_some_and(|worker| claim.execution.takes(worker))
             });
-            // One worker at a time, unless the work cannot begin with it.
+            // Gives one worker at a time, or as many as the work needs to begin.
             if coming.count() >= claim.execution.range().min.max(1) {
                 return None;
             }

@@ -137,8 +137,8 @@ fn is_draw(run: &Run) -> bool {
     run.pipeline.name == PIPELINE && run.pipeline.stages.iter().any(|stage| draws(&stage.settings))
 }
 
-/// The backend of the workers that draw, and the labels that they have: those of a worker that is kept for draws,
-/// otherwise the backend of an idle worker, otherwise of a working one.
+/// Backend and labels of the workers that draw. A worker that is kept for draws comes first. Without one, the labels are
+/// empty, and the backend is that of an idle worker, otherwise of a working one.
 fn drawers(state: &Decided) -> (Backend, Labels) {
     let kept = Labels::from_iter([labels::ONLY_DRAWS.to_owned()]);
     let workers = state.worker_views();
