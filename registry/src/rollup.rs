@@ -3,10 +3,10 @@
 //!
 //! A bucket counts values, not steps: a value that is recorded every fifty steps would fill no bucket of steps.
 
-/// Values of a bucket of the first level, and buckets of each level in one of the next.
-const FAN: u64 = 64;
-/// Levels of roll-ups, from 1: 64 and 4,096 values.
-pub(crate) const LEVELS: usize = 2;
+/// Values in a bucket of the first level, and buckets of each level in a bucket of the next.
+const FANS: [u64; LEVELS] = [64, 8, 8];
+/// Levels of roll-ups, from 1: 64, 512 and 4,096 values.
+pub(crate) const LEVELS: usize = 3;
 
 /// Sum of some consecutive values.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -80,7 +80,7 @@ impl Open {
                 }
                 None => (bucket, 1),
             };
-            if parts < FAN {
+            if parts < FANS[level] {
                 self.filling[level] = Some((sum, parts));
                 return;
             }
@@ -108,15 +108,15 @@ mod tests {
         let (open, full) = all((0..4_096 + 70).map(|i| (i * 50, i as f64)));
         let of = |level| full.iter().filter(|(l, _)| *l == level).map(|(_, bucket)| *bucket).collect::<Vec<_>>();
         let first = of(1);
-        let second = of(2);
-        assert_eq!((first.len(), second.len()), (65, 1));
-        assert!(first.iter().all(|bucket| bucket.count == 64) && second[0].count == 4_096);
+        let third = of(3);
+        assert_eq!((first.len(), of(2).len(), third.len()), (65, 8, 1));
+        assert!(first.iter().all(|bucket| bucket.count == 64) && of(2).iter().all(|bucket| bucket.count == 512));
         assert_eq!((first[1].first_step, first[1].last_step), (64 * 50, 127 * 50));
-        assert_eq!((second[0].low, second[0].high, second[0].last), (0.0, 4_095.0, Some(4_095.0)));
-        assert_eq!(second[0].sum, (0..4_096).sum::<i64>() as f64);
+        assert_eq!((third[0].low, third[0].high, third[0].last), (0.0, 4_095.0, Some(4_095.0)));
+        assert_eq!((third[0].count, third[0].sum), (4_096, (0..4_096).sum::<i64>() as f64));
         let left: Vec<_> =
             open.filling.iter().map(|filling| filling.map(|(bucket, parts)| (bucket.count, parts))).collect();
-        assert_eq!(left, [Some((6, 6)), Some((64, 1))]);
+        assert_eq!(left, [Some((6, 6)), Some((64, 1)), None]);
     }
 
     #[test]
@@ -137,13 +137,15 @@ mod tests {
     #[test]
     fn what_is_open_follows_from_what_is_stored() {
         let values = |range: std::ops::Range<i64>| range.map(|step| (step, step as f64));
-        for end in [10, 64, 100, 4_096, 5_000] {
+        for end in [10, 64, 100, 600, 4_096, 5_000] {
             let (open, full) = all(values(0..end));
             let mut again = Open::default();
             let mut none = Vec::new();
-            let after = full.iter().filter(|(level, _)| *level == 2).map(|(_, bucket)| bucket.last_step).max();
-            for (_, bucket) in full.iter().filter(|(level, bucket)| *level == 1 && Some(bucket.last_step) > after) {
-                again.add(1, *bucket, &mut none);
+            for level in (1..LEVELS).rev() {
+                let above = full.iter().filter(|(of, _)| *of == level + 1).map(|(_, bucket)| bucket.last_step).max();
+                for (_, bucket) in full.iter().filter(|(of, bucket)| *of == level && Some(bucket.last_step) > above) {
+                    again.add(level, *bucket, &mut none);
+                }
             }
             for (step, value) in values(end / 64 * 64..end) {
                 again.add(0, Bucket::of(step, Some(value)), &mut none);

@@ -206,6 +206,14 @@ impl Records for ScopedRecords {
         if self.sees_model(model).await? { self.all.versions(model).await } else { Ok(Vec::new()) }
     }
 
+    async fn has_model(&self, model: &ModelName) -> Result<bool> {
+        Ok(self.sees_model(model).await? && self.all.has_model(model).await?)
+    }
+
+    async fn version_of(&self, model: &ModelName, artifact: Digest) -> Result<Option<Version>> {
+        if self.sees_model(model).await? { self.all.version_of(model, artifact).await } else { Ok(None) }
+    }
+
     async fn history(&self, model: &ModelName, alias: Option<&Alias>) -> Result<Vec<Promotion>> {
         if self.sees_model(model).await? { self.all.history(model, alias).await } else { Ok(Vec::new()) }
     }

@@ -584,7 +584,10 @@ async fn versions_are_numbered_and_never_made_twice(place: &impl Place) {
     let versions = records.versions(&name).await.unwrap();
     assert_eq!(versions.iter().map(|v| v.version).collect::<Vec<_>>(), [1, 2, 3]);
     assert_eq!(versions[1].metrics, metrics(&[("latent_fid", 0.2), ("fid", 0.1)]), "metrics are added");
-    assert_eq!(records.version_of(&name, again).await.unwrap().unwrap().version, 2);
+    assert_eq!(records.version_of(&name, again).await.unwrap().as_ref(), versions.get(1));
+    assert_eq!(records.version_of(&name, vae).await.unwrap(), None);
+    assert!(records.has_model(&name).await.unwrap());
+    assert!(!records.has_model(&ModelName::new("none")).await.unwrap());
     let (model, _) = records.model(&name).await.unwrap().unwrap();
     assert_eq!((model.versions, model.best), (3, Some(2)));
     for (reference, version) in [("m@best", 2), ("m@latest", 3), ("m:1", 1)] {

@@ -88,7 +88,7 @@ impl Store {
             "imported": {"model": head.model, "version": head.version, "source": head.source},
         });
         // A file from elsewhere must not change which metric ranks an existing model.
-        if self.model(&name).await?.is_none()
+        if !self.has_model(&name).await?
             && let (Some(metric), mode @ ("min" | "max")) =
                 (head.source["metric"].as_str(), head.source["mode"].as_str().unwrap_or("min"))
         {

@@ -164,10 +164,11 @@ pub trait Records: Debug + Send + Sync {
     /// Returns a model's versions, oldest first.
     async fn versions(&self, model: &ModelName) -> Result<Vec<Version>>;
 
-    /// Returns the model's version with this artifact.
-    async fn version_of(&self, model: &ModelName, artifact: Digest) -> Result<Option<Version>> {
-        Ok(self.versions(model).await?.into_iter().find(|version| version.artifact == artifact))
-    }
+    /// Returns true if there is such a model. Does not read its versions.
+    async fn has_model(&self, model: &ModelName) -> Result<bool>;
+
+    /// Returns the model's version with this artifact. Reads no other version.
+    async fn version_of(&self, model: &ModelName, artifact: Digest) -> Result<Option<Version>>;
 
     /// Returns the moves of a model's aliases, or of one alias, oldest first.
     async fn history(&self, model: &ModelName, alias: Option<&Alias>) -> Result<Vec<Promotion>>;

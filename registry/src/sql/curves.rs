@@ -208,7 +208,7 @@ const VALUES: &str = "SELECT *, (SELECT CASE WHEN abs(value) <= 1.79769313486231
 
 /// The coarsest level that has enough buckets. Fewer buckets than pixels are drawn exactly, too.
 async fn level(conn: &mut Conn<'_>, segments: &[Segment], most: usize) -> Result<usize> {
-    for (level, enough) in [(2, most as u64), (1, most as u64 / 2)] {
+    for (level, enough) in [(3, most as u64), (2, most as u64), (1, most as u64 / 2)] {
         if count(conn, segments, level).await? >= enough.max(1) {
             return Ok(level);
         }

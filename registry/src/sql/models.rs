@@ -48,6 +48,27 @@ pub(super) async fn versions(conn: &mut Conn<'_>, model: &ModelName) -> Result<V
     rows.fetch_all(&mut *conn).await?.iter().map(|row| version(row, &mut aliases)).collect()
 }
 
+/// Returns true if there is such a model.
+pub(super) async fn exists(conn: &mut Conn<'_>, model: &ModelName) -> Result<bool, sqlx::Error> {
+    Ok(declared(conn, model).await?.is_some())
+}
+
+/// Returns the model's version with this artifact.
+pub(super) async fn version_of(
+    conn: &mut Conn<'_>,
+    model: &ModelName,
+    artifact: Digest,
+) -> Result<Option<Version>, sqlx::Error> {
+    let find = query("SELECT * FROM versions WHERE model = ? AND artifact = ?");
+    let find = find.bind(model.as_str()).bind(artifact.to_string());
+    let Some(row) = find.fetch_optional(&mut *conn).await? else { return Ok(None) };
+    let of = number(&row, "version")?;
+    let named = query("SELECT alias FROM aliases WHERE model = ? AND version = ? ORDER BY alias");
+    let named = named.bind(model.as_str()).bind(row.try_get::<i64, _>("version")?).fetch_all(&mut *conn).await?;
+    let names = named.iter().map(|row| row.try_get("alias")).collect::<Result<_, _>>()?;
+    version(&row, &mut BTreeMap::from([(of, names)])).map(Some)
+}
+
 async fn declared(
     conn: &mut Conn<'_>,
     model: &ModelName,

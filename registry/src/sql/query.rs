@@ -230,6 +230,14 @@ impl Records for SqlRecords {
         Ok(models::versions(&mut conn, model).await?)
     }
 
+    async fn has_model(&self, model: &ModelName) -> Result<bool> {
+        Ok(models::exists(&mut self.0.reader().await?.conn(), model).await?)
+    }
+
+    async fn version_of(&self, model: &ModelName, artifact: Digest) -> Result<Option<Version>> {
+        Ok(models::version_of(&mut self.0.reader().await?.conn(), model, artifact).await?)
+    }
+
     async fn history(&self, model: &ModelName, alias: Option<&Alias>) -> Result<Vec<Promotion>> {
         let mut reader = self.0.reader().await?;
         let mut conn = reader.conn();

@@ -27,6 +27,11 @@ const VALUES: u64 = 1_000_000;
 const BATCH: u64 = 10_000;
 const CURVES: usize = 20;
 const BUCKETS: usize = 800;
+/// Fewest bytes of a packed curve, and of a row in the list of runs.
+const CURVE: usize = BUCKETS * 4;
+const ROW: usize = 150;
+/// The stage that every run has begun: others have no curves yet.
+const STAGE: &str = "dataset";
 /// Starts of a server, and calls of each.
 const ROUNDS: usize = 9;
 /// Names the store in the process that serves it.
@@ -43,9 +48,9 @@ const LIST: &str =
 
 /// Copies the values of the first series to the run `?1`.
 const COPY: [&str; 5] = [
-    "INSERT INTO recorders (run, stage, task, attempt) VALUES (?1, 'vae', ?1 || '/vae', 1)",
+    "INSERT INTO recorders (run, stage, task, attempt) VALUES (?1, 'dataset', ?1 || '/dataset', 1)",
     "INSERT INTO recorded SELECT (SELECT max(id) FROM recorders), step, at_ms FROM recorded WHERE recorder = 1 AND ?1 != ''",
-    "INSERT INTO series (run, stage, task, attempt, key) VALUES (?1, 'vae', ?1 || '/vae', 1, 'loss')",
+    "INSERT INTO series (run, stage, task, attempt, key) VALUES (?1, 'dataset', ?1 || '/dataset', 1, 'loss')",
     "INSERT INTO metrics SELECT (SELECT max(id) FROM series), step, value FROM metrics WHERE series = 1 AND ?1 != ''",
     "INSERT INTO rollups SELECT (SELECT max(id) FROM series), level, last_step, first_step, count, odd, low, high, sum, last \
      FROM rollups WHERE series = 1 AND ?1 != ''",
@@ -93,7 +98,8 @@ async fn submit_runs(dir: &Path) -> Result<Vec<RunId>> {
     let mut runs = Vec::new();
     for seed in 0..CURVES {
         let text = format!(
-            "name: views\nseed: {seed}\ndataset: {{format: synthetic}}\nstages: {{vae: {{kind: train.vae}}}}\n"
+            "name: views\nseed: {seed}\ndataset: {{format: synthetic, clips: {}}}\nstages: {{vae: {{kind: train.vae}}}}\n",
+            100 + seed
         );
         let pipeline = pipeline::read("views.yaml", &text, &[]).map_err(|mistakes| mistakes.to_string())?;
         let pipeline = serde_json::to_value(pipeline)?;
@@ -116,7 +122,7 @@ async fn reopen(dir: &Path) -> Result<Store> {
 /// Stores a million values of the first run as a worker's batches are stored, and copies them to the others.
 async fn fill(dir: &Path, runs: &[RunId]) -> Result {
     let store = reopen(dir).await?;
-    let task = TaskId::of(&runs[0], &StageName::new("vae"), None);
+    let task = TaskId::of(&runs[0], &StageName::new(STAGE), None);
     let grant = Grant { task, attempt: Attempt(1), fence: Fence(1), worker: "w".into(), incarnation: Incarnation(1) };
     store.write(vec![Write::Fence { task: grant.task.clone(), fence: Fence(1) }]).await?;
     for first in (0..VALUES).step_by(usize::try_from(BATCH)?) {
@@ -151,7 +157,10 @@ fn median(times: &mut [Duration]) -> f64 {
 }
 
 /// Prints the first and the later times of a call, its bytes, and the memory that the first one takes.
-async fn view(dir: &Path, title: &str, path: &str) -> Result {
+///
+/// # Errors
+/// If the answer has fewer bytes than `least`: then it lacks what is measured.
+async fn view(dir: &Path, title: &str, path: &str, least: usize) -> Result {
     let accept = "accept: application/octet-stream\r\n";
     let (mut cold, mut warm, mut bytes, mut memory) = (Vec::new(), Vec::new(), 0, Vec::new());
     for _ in 0..ROUNDS {
@@ -169,6 +178,9 @@ async fn view(dir: &Path, title: &str, path: &str) -> Result {
         memory.push(server.resident_mb()? - before);
         let (took, length) = ask().await?;
         warm.push(took);
+        if length < least {
+            return Err(format!("{title}: {length} bytes; expected at least {least}").into());
+        }
         bytes = length;
         server.stop()?;
     }
@@ -186,23 +198,24 @@ async fn main() -> Result {
     let dir = tempfile::tempdir()?;
     let runs = submit_runs(dir.path()).await?;
     fill(dir.path(), &runs).await?;
-    let one = format!("/v1/metrics?run={}&stage=vae&key=loss&buckets={BUCKETS}", runs[0]);
+    let one = format!("/v1/metrics?run={}&stage={STAGE}&key=loss&buckets={BUCKETS}", runs[0]);
     let all: Vec<String> = runs.iter().map(|run| format!("run={run}")).collect();
-    let all = format!("/v1/metrics?{}&stage=vae&key=loss&buckets={BUCKETS}", all.join("&"));
-    view(dir.path(), "1,000,000 values in 800 buckets", &one).await?;
-    view(dir.path(), "64,000 of them", &format!("{one}&from=400000&to=464000")).await?;
-    view(dir.path(), "1,000,000 values by hours", &format!("{one}&x=hours")).await?;
-    view(dir.path(), "20 runs of 1,000,000 values", &all).await?;
+    let all = format!("/v1/metrics?{}&stage={STAGE}&key=loss&buckets={BUCKETS}", all.join("&"));
+    view(dir.path(), "1,000,000 values in 800 buckets", &one, CURVE).await?;
+    view(dir.path(), "64,000 of them", &format!("{one}&from=400000&to=464000"), CURVE).await?;
+    view(dir.path(), "1,000,000 values by hours", &format!("{one}&x=hours"), CURVE).await?;
+    view(dir.path(), "20 runs of 1,000,000 values", &all, CURVES * CURVE).await?;
     for count in [10_000, 100_000] {
         fill_list(dir.path(), count).await?;
-        for (what, query) in [
-            ("the newest", ""),
-            ("by change", "&sort=changed"),
-            ("failed ones of a pipeline", "&state=failed&pipeline=pipe3"),
-            ("with words of few", "&q=step%209800"),
-            ("with words of none", "&q=zebra"),
+        for (what, query, least) in [
+            ("the newest", "", 50 * ROW),
+            ("by change", "&sort=changed", 50 * ROW),
+            ("failed ones of a pipeline", "&state=failed&pipeline=pipe3", 38 * ROW),
+            ("with words of few", "&q=step%209800", ROW),
+            ("with words of none", "&q=zebra", 0),
         ] {
-            view(dir.path(), &format!("50 of {count} runs, {what}"), &format!("/v1/runs?limit=50{query}")).await?;
+            let title = format!("50 of {count} runs, {what}");
+            view(dir.path(), &title, &format!("/v1/runs?limit=50{query}"), least).await?;
         }
     }
     Ok(())

@@ -5,6 +5,7 @@
 //! bytes, then for each series of the head its columns one after the other as `f32`. All numbers are little-endian; `x` counts from the
 //! series' `x0`. The column `nan` is missing where all of it is zero. A finite value that `f32` cannot hold is its largest number.
 
+use std::pin::pin;
 use std::sync::Arc;
 
 use access::Caller;
@@ -12,6 +13,7 @@ use axum::extract::State;
 use axum::http::{HeaderMap, header};
 use axum::response::{IntoResponse, Response};
 use axum::{Extension, Json};
+use futures::{StreamExt as _, TryStreamExt as _, stream};
 use protocol::{RunId, StageName, limits};
 use registry::{Axis, Buckets, Window};
 use schemars::JsonSchema;
@@ -24,6 +26,9 @@ use super::failure::Failure;
 use super::queries::{PACKED, accepts_packed};
 use super::records::StageCurves;
 use super::turn::turn;
+
+/// Runs of one call whose curves are read at the same time.
+const AT_ONCE: usize = 2;
 
 /// The answer to `GET /v1/metrics`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -149,9 +154,16 @@ pub(crate) async fn curves(
     let records = actor_handle.records_for(caller.sees());
     let keys = (!keys.is_empty()).then_some(keys.as_slice());
     let mut curves = Curves { x: window.axis, series: Vec::new() };
-    for run in runs {
-        let stages = records.buckets(&run, stage.as_ref(), keys, &window).await?;
-        curves.series.extend(CurveSeries::of(&run, stages));
+    let records = &records;
+    let stage = stage.as_ref();
+    let window = &window;
+    let read = |run| async move {
+        let stages = records.buckets(&run, stage, keys, window).await?;
+        Result::<_, Failure>::Ok(CurveSeries::of(&run, stages))
+    };
+    let mut found = pin!(stream::iter(runs).map(read).buffered(AT_ONCE));
+    while let Some(series) = found.try_next().await? {
+        curves.series.extend(series);
         let most = limits::CURVE_CELLS / window.buckets;
         if curves.series.len() > most {
             let message =
