@@ -32,6 +32,7 @@ mod registry;
 mod released;
 mod results;
 mod running;
+mod shares;
 mod showpieces;
 mod stand_by;
 mod storage;

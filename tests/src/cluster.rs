@@ -18,6 +18,8 @@ use crate::{Bench, PATIENCE, Running, signal, wait_for, wait_within};
 pub const TOKEN: &str = "a-token-of-tests-only";
 /// The token of all workers, which allows nothing else.
 pub const WORKER_TOKEN: &str = "a-token-of-workers-of-tests-only";
+/// The token of another user, who may submit. Its runs are of another group.
+pub const OTHER_TOKEN: &str = "a-token-of-another-of-tests-only";
 /// Minimum time of a training step, in milliseconds. 400 steps take at least ten seconds, so a test can act in the
 /// middle.
 const PACE: &str = "25";
@@ -163,7 +165,8 @@ impl Cluster {
     fn spawn_server(&self, who: &str, address: SocketAddr, more: &[&str]) -> Running {
         let address = address.to_string();
         let tokens = self.bench.path().join("tokens");
-        fs::write(&tokens, format!("admin admin {TOKEN}\nworkers worker {WORKER_TOKEN}\n")).expect("a token file");
+        let lines = format!("admin admin {TOKEN}\nworkers worker {WORKER_TOKEN}\nother submit {OTHER_TOKEN}\n");
+        fs::write(&tokens, lines).expect("a token file");
         fs::set_permissions(&tokens, fs::Permissions::from_mode(0o600)).expect("ours");
         let tokens = tokens.display().to_string();
         let mut arguments = vec!["serve", "--bind", &address, "--token-file", &tokens];
@@ -294,13 +297,21 @@ impl Cluster {
     /// Submits a pipeline and returns the run's name.
     #[track_caller]
     pub fn submit(&self, config: &Path, more: &[&str]) -> String {
+        self.submit_as(TOKEN, config, more)
+    }
+
+    /// Like [`submit`](Self::submit), with another token.
+    #[track_caller]
+    pub fn submit_as(&self, token: &str, config: &Path, more: &[&str]) -> String {
         let (config, url) = (config.display().to_string(), self.url());
         let mut arguments = vec!["submit", &config, "--server", &url, "-o", "json"];
         if !self.address.ip().is_loopback() {
             arguments.push("--insecure");
         }
         arguments.extend_from_slice(more);
-        let said = self.bench.run(&arguments).expect_code(0);
+        let mut command = self.bench.command(&arguments);
+        command.env("STRIDE_TOKEN", token);
+        let said = Running::start(command).wait().expect_code(0);
         said.json()["run"].as_str().expect("a run").to_owned()
     }
 
