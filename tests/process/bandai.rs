@@ -118,6 +118,8 @@ fn the_recipe_trains_on_what_was_fetched() {
     for stage in ["fid_teacher_val", "fid_val", "fid_teacher", "fid_test"] {
         sets.push(format!("stages.{stage}.repeats=1"));
     }
+    // After a few updates no motion shows its sentence.
+    sets.push("stages.release.promote.require=[]".to_owned());
     let arguments: Vec<&str> = sets.iter().flat_map(|set| ["--set", set.as_str()]).collect();
     let report = bench.pipeline("bandai.yaml", &arguments);
     let states = states(&report);

@@ -267,7 +267,7 @@ fn next_command(model: &str, store: &Path) -> String {
         _ => format!(" --store {}", client::shown(store)),
     };
     format!(
-        "\n{model} is ready. Try:\n  trainer generate \"a person walks in a circle\" --model {model} -o walk.gif{store}"
+        "\n{model} is ready. Try:\n  trainer generate \"a person walks\" --model {model} -o walk.gif{store}"
     )
 }
 
