@@ -69,10 +69,11 @@ pub(crate) struct Open {
 }
 
 impl Open {
-    /// Takes up a bucket of `level` that is stored, or a value as one of level 0. Adds those that are full now to `full`, each with its level.
+    /// Takes up a bucket of `level` that is stored, or a value as one of level 0. Adds those that are full now to `full`,
+    /// each with its level.
     pub(crate) fn add(&mut self, level: usize, bucket: Bucket, full: &mut Vec<(usize, Bucket)>) {
         let mut bucket = bucket;
-        for level in level..LEVELS {
+        for (level, &fan) in FANS.iter().enumerate().skip(level) {
             let (sum, parts) = match self.filling[level].take() {
                 Some((mut sum, parts)) => {
                     sum.merge(&bucket);
@@ -80,7 +81,7 @@ impl Open {
                 }
                 None => (bucket, 1),
             };
-            if parts < FANS[level] {
+            if parts < fan {
                 self.filling[level] = Some((sum, parts));
                 return;
             }
