@@ -143,7 +143,7 @@ mutation paused-if-interrupted trainer/coordinator/src/state/run.rs 's/self\.par
 mutation every-word-is-known trainer/motion/src/vocabulary.rs 's/!self\.words\.contains_key\(&word\) && //; s/!unknown\.contains\(&word\)/false \&\& !unknown.contains(\&word)/' motion:lib:vocabulary
 mutation parts-of-a-killed-process-stay registry/src/retention.rs 's/place\.ask\(BlobStore::give_up_unfinished\)/place.ask(|_| Ok::<u64, BlobError>(0))/' registry:retention:upload
 mutation upload-without-a-record registry/src/blob/objects/multipart.rs 's/store\.put\(&record, text\.into\(\)\)\.await\.map\(\|_\| \(\)\)/Ok(drop(text))/' registry:conformance:parts_that
-mutation held-until-the-restart registry/src/store/mod.rs 's/self\.order\(Order::Hold \{ task: task\.clone\(\), digest \}\)\.await\?;//' registry:retention:upload
+mutation held-until-the-restart registry/src/store/orders.rs 's/self\.order\(Order::Hold \{ task: task\.clone\(\), digest \}\)\.await\?;//' registry:retention:upload
 mutation digesting-goes-on trainer/motion/src/files.rs 's/if !go_on\(\) \{/if false \&\& !go_on() {/' motion:lib:data_access
 mutation ended-states-stay trainer/coordinator/src/decide/outcome.rs 's/(keep, )at_end: true/$1at_end: false/' coordinator:decisions:ended
 exit $missed

@@ -18,7 +18,8 @@ use serde::Deserialize;
 use tar::{Archive, EntryType};
 use zstd::stream::read::Decoder;
 
-use super::{Bundle, BundleError, CARD, FILES, FORMAT, HEAD, Head, MANIFEST, MANIFESTS_BYTES, TEXT_BYTES, WINDOW_LOG};
+use super::format::{CARD, HEAD, MANIFEST};
+use super::{Bundle, BundleError, FILES, FORMAT, Head, MANIFESTS_BYTES, TEXT_BYTES, WINDOW_LOG};
 
 /// Bytes of one read.
 const PIECE: usize = 1 << 16;

@@ -7,7 +7,8 @@ use protocol::Manifest;
 use tar::{EntryType, Header};
 use zstd::stream::write::Encoder;
 
-use super::{CARD, HEAD, Head, MANIFEST};
+use super::Head;
+use super::format::{CARD, HEAD, MANIFEST};
 
 /// A fast level: weights hardly compress.
 const LEVEL: i32 = 3;

@@ -10,8 +10,9 @@ use protocol::artifact::Role;
 use protocol::message::ApiError;
 use protocol::{Manifest, ModelName, Owner};
 
+use super::answer::error;
 use super::export::{Source, whole, whole_file};
-use super::{Answer, Data, error};
+use super::{Answer, Data};
 use crate::bundle::{self, BundleError, Head, ImportError, Writer};
 use crate::{Store, Version};
 

@@ -12,9 +12,10 @@ use reqwest::header::CONTENT_LENGTH;
 use reqwest::{Body, Method, Response};
 use tokio::io::AsyncReadExt as _;
 
+use super::answer::error;
 use super::args::Operation;
 use super::export::{self, Source};
-use super::{Answer, Command, Data, OutputArg, Verb, bundles, error, print, read, run};
+use super::{Answer, Command, Data, OutputArg, Verb, bundles, print, read, run};
 use crate::catalog::CatalogPlace;
 use crate::migrate::{self, MoveError};
 use crate::{Holder, OpenError, ReadStore, Store};

@@ -10,7 +10,7 @@ use protocol::message::ApiError;
 use protocol::{Digest, FileEntry, Manifest};
 use sha2::{Digest as _, Sha256};
 
-use super::error;
+use super::answer::error;
 use crate::Version;
 
 /// A source of blobs.

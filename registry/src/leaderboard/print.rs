@@ -5,7 +5,8 @@ use comfy_table::{ContentArrangement, Table, presets};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use super::{Better, COLUMNS, Column, Comparison, Leaderboard, Measure, PAPER_COLUMNS, Row, Verdict};
+use super::column::{COLUMNS, Column, PAPER_COLUMNS};
+use super::{Better, Comparison, Leaderboard, Measure, Row, Verdict};
 
 /// Format of a table.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, ValueEnum, JsonSchema)]
