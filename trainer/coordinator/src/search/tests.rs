@@ -2,11 +2,11 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use protocol::Steps;
-use protocol::stage::{DistillPcm, EvaluateLatentFid};
-use protocol::sweep::{Domain, Rungs};
+use protocol::stage::{DistillPcm, EvaluateLatentFid, Mode, StageSettings};
+use protocol::sweep::{Domain, Rungs, SearchKind, Sweep, Values};
+use protocol::{Seed, Steps};
 
-use super::*;
+use super::{Score, Search, Ticket};
 
 fn sweep(search: SearchKind, trials: usize) -> Sweep {
     let grid = [
