@@ -183,7 +183,10 @@ const ALSO_IN: [(&str, &[&str]); 6] = [
         ],
     ),
     // The papers' rows stand beside models of published data only.
-    ("DataOpen", &["pipeline/src/read.rs", "pipeline/src/reference.rs", "local/cost.rs", "registry/src/cli/ranking.rs"]),
+    (
+        "DataOpen",
+        &["pipeline/src/read.rs", "pipeline/src/reference.rs", "local/cost.rs", "registry/src/cli/ranking.rs"],
+    ),
     ("DataFeatures", &["local/cost.rs"]),
     (
         "TextEmbed",

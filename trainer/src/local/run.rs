@@ -266,9 +266,7 @@ fn next_command(model: &str, store: &Path) -> String {
         Some(".stride") => String::new(),
         _ => format!(" --store {}", client::shown(store)),
     };
-    format!(
-        "\n{model} is ready. Try:\n  trainer generate \"a person walks\" --model {model} -o walk.gif{store}"
-    )
+    format!("\n{model} is ready. Try:\n  trainer generate \"a person walks\" --model {model} -o walk.gif{store}")
 }
 
 fn report(view: &RunView, whys: &Whys, pipeline: &Pipeline, end: &End, options: &Options) -> u8 {
