@@ -195,7 +195,7 @@ const ALSO_IN: [(&str, &[&str]); 6] = [
             "pipeline/src/reference.rs",
             "local/hub_names.rs",
             "local/plan.rs",
-            "parts/text/mod.rs",
+            "parts/text/named.rs",
             "parts/text/published.rs",
         ],
     ),

@@ -2,7 +2,8 @@
 
 use burn::tensor::Tensor;
 
-use super::{cross_entropy, host};
+use super::cross_entropy;
+use crate::device::host;
 use crate::kernels::Dropout;
 use crate::networks::{Gpt, GptConfig};
 use crate::quantizer::first_largest;

@@ -3,7 +3,9 @@
 
 use burn::tensor::Tensor;
 
-use super::{Uniforms, cosine, grid, guided, gumbel_draw, host, keep_top, probability};
+use super::logits::guided;
+use super::{Uniforms, cosine, grid, gumbel_draw, keep_top, probability};
+use crate::device::host;
 use crate::kernels::Dropout;
 use crate::networks::{MaskedTransformer, MomaskConfig};
 use crate::quantizer::NO_CODE;

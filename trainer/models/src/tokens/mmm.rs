@@ -2,7 +2,8 @@
 
 use burn::tensor::Tensor;
 
-use super::{Uniforms, cosine, gumbel_draw, host, probability};
+use super::{Uniforms, cosine, gumbel_draw, probability};
+use crate::device::host;
 use crate::kernels::Dropout;
 use crate::networks::{Mmm, MmmCondition, MmmConfig};
 

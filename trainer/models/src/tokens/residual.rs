@@ -2,7 +2,9 @@
 
 use burn::tensor::Tensor;
 
-use super::{Uniforms, guided, gumbel_draw, host, keep_top};
+use super::logits::guided;
+use super::{Uniforms, gumbel_draw, keep_top};
+use crate::device::host;
 use crate::kernels::Dropout;
 use crate::networks::{MomaskConfig, ResidualTransformer};
 use crate::quantizer::NO_CODE;

@@ -18,8 +18,9 @@ use motion::dataset::{denormalise, normalise};
 use protocol::Manifest;
 use protocol::stage::{DataFormat, Family, Sampler, Solver};
 
+use super::model::expect_format;
 use super::steering::Steering;
-use super::{expect_format, weights};
+use super::weights;
 use crate::artifacts::{self, DenoiserMeta, VaeMeta};
 use crate::context::StageError;
 

@@ -16,7 +16,8 @@ use protocol::stage::{DataFormat, TokenizerNetwork};
 use protocol::{ArtifactKind, Digest, Manifest};
 use serde::{Deserialize, Serialize};
 
-use super::{expect_format, weights};
+use super::model::expect_format;
+use super::weights;
 use crate::artifacts::{self, Draft, HostTensor, MODEL_FILE, Tensors, to_meta};
 use crate::context::{AttemptContext, ContextError, StageError};
 
