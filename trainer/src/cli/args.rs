@@ -37,3 +37,12 @@ pub(super) struct BlobArgs {
     #[arg(long, env = "STRIDE_BLOBS", value_name = "PLACE")]
     pub(super) blobs: Option<Place>,
 }
+
+/// The command as typed, for messages that suggest how to continue.
+pub(super) fn command_line() -> String {
+    let quoted = std::env::args().skip(1).map(|argument| {
+        let plain = |c: char| c.is_ascii_alphanumeric() || "-_./=@:,+".contains(c);
+        if argument.chars().all(plain) { argument } else { format!("'{}'", argument.replace('\'', "'\\''")) }
+    });
+    std::iter::once("trainer".to_owned()).chain(quoted).collect::<Vec<_>>().join(" ")
+}
