@@ -273,6 +273,10 @@ pub(crate) async fn needed(place: &BlobCalls, rows: &Rows) -> Result<BTreeSet<Di
     Ok(marked)
 }
 
+fn is_damaged_manifest(blobs: &BlobStore, digest: Digest) -> bool {
+    matches!(blobs.manifest(digest), Err(ManifestError::Blob(BlobError::Corrupt { .. })))
+}
+
 /// Returns the plan and the blobs that may be removed.
 async fn plan(place: &BlobCalls, rows: &Rows, ages: &Ages) -> Result<(Plan, Vec<Entry>), QueryError> {
     let all = place.list().await?;
@@ -280,13 +284,10 @@ async fn plan(place: &BlobCalls, rows: &Rows, ages: &Ages) -> Result<(Plan, Vec<
     let is_there = |digest| all.contains_key(&digest);
     mark(place, rows, is_there, rows.roots.keys().copied().collect(), &mut marked).await?;
     // No row relies on these blobs yet, so a damaged one does not stop the collection.
-    let is_damaged = |blobs: &BlobStore, digest: &Digest| {
-        matches!(blobs.manifest(*digest), Err(ManifestError::Blob(BlobError::Corrupt { .. })))
-    };
     let of_rows = rows.held.clone();
     let held = move |blobs: &BlobStore| {
         let held: BTreeSet<Digest> = blobs.held().into_iter().chain(of_rows).collect();
-        held.into_iter().partition(|digest| is_damaged(blobs, digest))
+        held.into_iter().partition(|digest| is_damaged_manifest(blobs, *digest))
     };
     let (damaged, held): (Vec<Digest>, Vec<Digest>) = place.ask(held).await;
     mark(place, rows, is_there, held, &mut marked).await?;

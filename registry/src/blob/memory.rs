@@ -87,12 +87,11 @@ impl Backend for Memory {
     }
 
     fn list(&self) -> Result<Vec<Entry>, BlobError> {
-        let entry = |(digest, blob): (&Digest, &Blob)| Entry {
-            digest: *digest,
-            bytes: blob.bytes.len() as u64,
-            put_ms: blob.put_ms,
-        };
-        Ok(self.lock().blobs.iter().map(entry).collect())
+        let mut entries = Vec::new();
+        for (digest, blob) in &self.lock().blobs {
+            entries.push(Entry { digest: *digest, bytes: blob.bytes.len() as u64, put_ms: blob.put_ms });
+        }
+        Ok(entries)
     }
 
     fn is_empty(&self) -> Result<bool, BlobError> {

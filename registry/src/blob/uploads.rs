@@ -259,11 +259,14 @@ impl Arriving {
         // Recorded before the blob exists, so that a collection in between keeps it.
         self.store.hold(&self.holder.0, self.digest);
         let stored = self.store.commit(upload, self.digest);
-        let may_be_later =
-            |e: &BlobError| matches!(e, BlobError::Unreachable(_) | BlobError::Unavailable(_) | BlobError::Storage(_));
-        self.waits = stored.as_ref().is_err_and(may_be_later);
+        self.waits = stored.as_ref().is_err_and(may_pass);
         stored.map(|()| true)
     }
+}
+
+/// Returns true if the same request may succeed later.
+fn may_pass(error: &BlobError) -> bool {
+    matches!(error, BlobError::Unreachable(_) | BlobError::Unavailable(_) | BlobError::Storage(_))
 }
 
 impl Drop for Arriving {

@@ -241,8 +241,6 @@ impl Reading {
     }
 
     fn finish(self) -> Result<Bundle> {
-        let missing =
-            |name: &str| BundleError::Damaged(format!("the bundle has no `{name}`: it is truncated or not a bundle"));
         let head = self.head.ok_or_else(|| missing(HEAD))?;
         let (manifest, model) = self.manifest.ok_or_else(|| missing(MANIFEST))?;
         if let Some(name) = manifest.files.keys().find(|name| !self.seen.contains(*name)) {
@@ -320,18 +318,24 @@ fn small(name: &str, bytes: u64, most: u64, from: &mut impl Read) -> Result<Vec<
     Ok(content)
 }
 
+fn missing(name: &str) -> BundleError {
+    BundleError::Damaged(format!("the bundle has no `{name}`: it is truncated or not a bundle"))
+}
+
+fn malformed_head(error: serde_json::Error) -> BundleError {
+    BundleError::Entry { entry: HEAD.into(), why: format!("it cannot be parsed: {error}") }
+}
+
 fn head(content: &[u8]) -> Result<Head> {
     #[derive(Deserialize)]
     struct Format {
         format: u64,
     }
-    let malformed =
-        |e: serde_json::Error| BundleError::Entry { entry: HEAD.into(), why: format!("it cannot be parsed: {e}") };
-    let Format { format } = serde_json::from_slice(content).map_err(malformed)?;
+    let Format { format } = serde_json::from_slice(content).map_err(malformed_head)?;
     if format != u64::from(FORMAT) {
         return Err(BundleError::Newer { found: format });
     }
-    let head: Head = serde_json::from_slice(content).map_err(malformed)?;
+    let head: Head = serde_json::from_slice(content).map_err(malformed_head)?;
     if !is_name(head.model.as_str()) {
         let why = format!("`model` is {:?}, which is not a model name", printable(head.model.as_str()));
         return Err(BundleError::Entry { entry: HEAD.into(), why });

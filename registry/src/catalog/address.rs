@@ -2,7 +2,7 @@
 
 use std::fmt;
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::str::FromStr;
 
 use reqwest::Url;
@@ -25,15 +25,14 @@ pub struct PostgresAddress {
 impl PostgresAddress {
     /// Returns the options of a connection. Reads the file of the password each time, so that it may be changed.
     pub(crate) fn options(&self) -> Result<PgConnectOptions, String> {
-        let unreadable =
-            |path: &Path, e: std::io::Error| format!("cannot read the password in `{}`: {e}", path.display());
         // The parser's error may quote the address.
         let options: PgConnectOptions =
             self.url.as_str().parse().map_err(|_| format!("`{self}` is not an address of PostgreSQL"))?;
         let options = match &self.password_file {
             None => options,
             Some(path) => {
-                let password = fs::read_to_string(path).map_err(|e| unreadable(path, e))?;
+                let password = fs::read_to_string(path)
+                    .map_err(|e| format!("cannot read the password in `{}`: {e}", path.display()))?;
                 options.password(password.trim_end_matches(['\n', '\r']))
             }
         };
@@ -53,14 +52,16 @@ impl PostgresAddress {
 
     /// Returns true if both name the same database.
     pub(crate) fn is_same_database(&self, other: &Self) -> bool {
-        let place = |address: &Self| {
-            let url = &address.url;
-            let query = |key: &str| url.query_pairs().find(|(k, _)| k == key).map(|(_, value)| value.into_owned());
-            let host = query("host").or_else(|| url.host_str().map(str::to_owned));
-            let port = query("port").or_else(|| url.port().map(|port| port.to_string()));
-            (host, port.unwrap_or_else(|| "5432".into()), url.path().to_owned(), query("options"))
-        };
-        place(self) == place(other)
+        self.place() == other.place()
+    }
+
+    /// Returns host, port, path and options, which tell databases apart.
+    fn place(&self) -> (Option<String>, String, String, Option<String>) {
+        let url = &self.url;
+        let query = |key: &str| url.query_pairs().find(|(k, _)| k == key).map(|(_, value)| value.into_owned());
+        let host = query("host").or_else(|| url.host_str().map(str::to_owned));
+        let port = query("port").or_else(|| url.port().map(|port| port.to_string()));
+        (host, port.unwrap_or_else(|| "5432".into()), url.path().to_owned(), query("options"))
     }
 }
 

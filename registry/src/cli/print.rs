@@ -310,11 +310,15 @@ fn drawn(manifest: &Manifest) -> Vec<(&'static str, String)> {
 
 /// Lists the parts that each part was made for.
 fn made_for(fits: &BTreeMap<Role, Parts>) -> Option<(&'static str, String)> {
-    let one = |(role, parts): (&Role, &Parts)| {
-        let each = parts.iter().map(|(role, digest)| format!("{role}={}", digest.short()));
-        format!("{role} for {}", each.collect::<Vec<_>>().join(" and "))
-    };
-    (!fits.is_empty()).then(|| ("fits", list(fits.iter().map(one))))
+    if fits.is_empty() {
+        return None;
+    }
+    let mut all = Vec::new();
+    for (role, parts) in fits {
+        let parts: Vec<String> = parts.iter().map(|(role, digest)| format!("{role}={}", digest.short())).collect();
+        all.push(format!("{role} for {}", parts.join(" and ")));
+    }
+    Some(("fits", all.join(", ")))
 }
 
 /// Lists the versions that a control part was made for.

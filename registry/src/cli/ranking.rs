@@ -10,14 +10,14 @@ use crate::ReadStore;
 use crate::leaderboard::{self, Leaderboard};
 use crate::versions::Version;
 
+/// Kind of the artifacts with clips.
+const DATASET: &str = "dataset";
+
 /// Returns the data format of a version's motions; the papers' datasets have the same names.
 async fn format_of(store: &ReadStore, version: &Version) -> Option<String> {
     let manifest = manifest(store, version.artifact).await.ok()?;
     ModelMeta::read(&manifest).ok().map(|model| model.format.name().to_owned())
 }
-
-/// Kind of the artifacts with clips.
-const DATASET: &str = "dataset";
 
 /// Returns true if the version learned from clips that no published table was measured on: procedural ones or recordings.
 async fn is_of_other_data(store: &ReadStore, version: &Version) -> Result<bool, Refused> {

@@ -12,6 +12,9 @@ use crate::retention::GRACE_MS;
 use crate::versions::{Expect, Gate, ModelRef, Promotion};
 use crate::{QueryError, ReadStore, Store, audit, fsck, leaderboard};
 
+/// Limit of shown lines of the audit log.
+const MOST_LINES: usize = 10_000;
+
 /// Runs a command on a store that this process holds, on behalf of `actor`.
 pub async fn run(command: Command, store: &Store, actor: &str) -> Answer {
     answer(command, store, Some((store, actor))).await.unwrap_or_else(|refused| *refused.0)
@@ -139,6 +142,3 @@ async fn forget_leftovers(store: &Store, before_ms: i64) -> Result<Vec<(RunId, F
     }
     Ok(runs)
 }
-
-/// Limit of shown lines of the audit log.
-const MOST_LINES: usize = 10_000;

@@ -1,4 +1,4 @@
-//! Models, versions and artifacts by their names, with what `show` and `lineage` tell of them.
+//! Looks up models, versions and artifacts by their names, for `show`, `lineage` and other commands.
 
 use std::collections::BTreeMap;
 
@@ -9,6 +9,9 @@ use protocol::{Digest, Manifest, ModelName};
 use super::answer::{Data, Refused, invalid};
 use crate::versions::{BEST, LATEST, Model, ModelRef, Version};
 use crate::{QueryError, ReadStore};
+
+/// Number of versions searched for bases of a control part.
+pub const MOST_BASES: usize = 1_000;
 
 pub(super) async fn lineage(store: &ReadStore, reference: &str) -> Result<Data, Refused> {
     let digest = match reference.parse::<Digest>() {
@@ -55,9 +58,6 @@ pub(super) async fn manifest(store: &ReadStore, digest: Digest) -> Result<Manife
     let blobs = store.blobs().clone();
     store.ask_blobs(move || blobs.manifest(digest)).await.map_err(|e| QueryError::Blob(e.to_string()))
 }
-
-/// Number of versions searched for bases of a control part.
-pub const MOST_BASES: usize = 1_000;
 
 pub(super) async fn show(store: &ReadStore, text: &str) -> Result<Data, Refused> {
     let reference: ModelRef = text.parse().map_err(invalid)?;

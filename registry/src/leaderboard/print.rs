@@ -47,8 +47,6 @@ impl Leaderboard {
             };
             columns.iter().zip(&best).map(cell).collect()
         };
-        let label =
-            |row: &Row| if row.published { format!("{} [{}]", row.label, row.source) } else { row.label.clone() };
         match style {
             Style::Text => {
                 let head = std::iter::once(self.title.clone()).chain(heads);
@@ -100,6 +98,11 @@ impl Leaderboard {
             Better::NearReal | Better::Neither => None,
         }
     }
+}
+
+/// The label of a row; a published one names its paper.
+fn label(row: &Row) -> String {
+    if row.published { format!("{} [{}]", row.label, row.source) } else { row.label.clone() }
 }
 
 impl Comparison {

@@ -22,11 +22,12 @@ pub struct Leaderboard {
 
 fn rows(version: &Version) -> Vec<Row> {
     let source = format!("{}:{}", version.model, version.version);
-    let row = |(stage, measures): (Option<String>, _)| {
+    let mut rows = Vec::new();
+    for (stage, measures) in measured(version) {
         let label = stage.map_or_else(|| source.clone(), |stage| format!("{source} ({stage})"));
-        Row { label, source: source.clone(), published: false, measures }
-    };
-    measured(version).into_iter().map(row).collect()
+        rows.push(Row { label, source: source.clone(), published: false, measures });
+    }
+    rows
 }
 
 /// Builds the rows of `versions`, the best by `metric` first, and adds published rows of the data format `published`,
@@ -54,13 +55,12 @@ pub fn leaderboard(title: String, versions: &[Version], metric: Option<&str>, pu
 
 /// Builds a table of named evaluations in the given order; `None` if no metric has a column.
 pub fn evaluations(title: &str, all: impl IntoIterator<Item = (String, BTreeMap<String, f64>)>) -> Option<Leaderboard> {
-    let row = |(label, metrics): (String, BTreeMap<String, f64>)| Row {
-        source: label.clone(),
-        label,
-        published: false,
-        measures: measures(&metrics),
-    };
-    let mut rows: Vec<Row> = all.into_iter().map(row).collect();
-    rows.retain(|row| COLUMNS.iter().any(|column| row.measures.contains_key(column.key)));
+    let mut rows = Vec::new();
+    for (label, metrics) in all {
+        let measures = measures(&metrics);
+        if COLUMNS.iter().any(|column| measures.contains_key(column.key)) {
+            rows.push(Row { source: label.clone(), label, published: false, measures });
+        }
+    }
     (!rows.is_empty()).then(|| Leaderboard { title: title.to_owned(), rows })
 }

@@ -147,6 +147,14 @@ where
     Ok(found)
 }
 
+/// The task whose fence decides on a write.
+fn fenced_task(write: &Write) -> Option<&TaskId> {
+    match write {
+        Write::Fence { task, .. } => Some(task),
+        other => other.grant().map(|grant| &grant.task),
+    }
+}
+
 /// The fences of an order's tasks, as of its transaction.
 struct Fences {
     known: BTreeMap<TaskId, Fence>,
@@ -155,12 +163,8 @@ struct Fences {
 
 impl Fences {
     async fn read(conn: &mut Conn<'_>, writes: &[Write]) -> Result<Self> {
-        let of = |write: &Write| match write {
-            Write::Fence { task, .. } => Some(task.clone()),
-            other => other.grant().map(|grant| grant.task.clone()),
-        };
-        let tasks: BTreeSet<TaskId> = writes.iter().filter_map(of).collect();
-        let tasks: Vec<&TaskId> = tasks.iter().collect();
+        let tasks: BTreeSet<&TaskId> = writes.iter().filter_map(fenced_task).collect();
+        let tasks: Vec<&TaskId> = tasks.into_iter().collect();
         let known = by_task::<i64>(conn, "SELECT task, fence FROM fences WHERE task IN (", &tasks).await?;
         let known = known.into_iter().map(|(task, fence)| (task, Fence(fence.unsigned_abs()))).collect();
         Ok(Self { known, raised: BTreeSet::new() })

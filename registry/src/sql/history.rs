@@ -124,12 +124,14 @@ fn history_row(row: &Row) -> Result<HistoryRow, QueryError> {
 /// Times of a run's stages by name, of those that were begun in its name.
 pub(super) async fn stage_times(conn: &mut Conn<'_>, of_run: &RunId) -> Result<BTreeMap<StageName, Times>, QueryError> {
     let find = query("SELECT stage, started_ms, ended_ms FROM stage_times WHERE run = ?").bind(of_run.as_str());
-    let times = |row: &Row| -> Result<(StageName, Times), QueryError> {
+    let mut times = BTreeMap::new();
+    for row in find.fetch_all(conn).await? {
+        let stage = StageName::new(row.try_get::<String, _>("stage")?);
         let started_ms = row.try_get("started_ms")?;
         let ended_ms = row.try_get("ended_ms")?;
-        Ok((StageName::new(row.try_get::<String, _>("stage")?), Times { created_ms: None, started_ms, ended_ms }))
-    };
-    find.fetch_all(conn).await?.iter().map(times).collect()
+        times.insert(stage, Times { created_ms: None, started_ms, ended_ms });
+    }
+    Ok(times)
 }
 
 /// Times of runs by name.
@@ -137,11 +139,13 @@ pub(super) async fn run_times(conn: &mut Conn<'_>, runs: &[RunId]) -> Result<BTr
     let find = "SELECT run, created_ms, (SELECT min(started_ms) FROM stage_times WHERE stage_times.run = runs.run) AS started_ms, \
                 CASE WHEN state IN ('finished', 'failed', 'cancelled') THEN {greatest}(updated_ms, coalesce((SELECT max(ended_ms) FROM stage_times WHERE stage_times.run = runs.run), 0)) END AS ended_ms \
                 FROM runs WHERE run IN {texts ?}";
-    let times = |row: &Row| -> Result<(RunId, Times), QueryError> {
+    let mut times = BTreeMap::new();
+    for row in query(find).bind(json(&runs)).fetch_all(conn).await? {
+        let run = RunId::new(row.try_get::<String, _>("run")?);
         let created_ms = row.try_get("created_ms")?;
         let started_ms = row.try_get("started_ms")?;
-        let times = Times { created_ms, started_ms, ended_ms: row.try_get("ended_ms")? };
-        Ok((RunId::new(row.try_get::<String, _>("run")?), times))
-    };
-    query(find).bind(json(&runs)).fetch_all(conn).await?.iter().map(times).collect()
+        let ended_ms = row.try_get("ended_ms")?;
+        times.insert(run, Times { created_ms, started_ms, ended_ms });
+    }
+    Ok(times)
 }

@@ -131,14 +131,11 @@ fn lines(batch: &Row) -> Result<Vec<LogRow>, QueryError> {
     let worker = WorkerId::new(batch.try_get::<String, _>("worker")?);
     let attempt = Attempt(batch.try_get::<i64, _>("attempt")?.unsigned_abs());
     let at_ms = batch.try_get("at_ms")?;
-    let row = |(place, text): (usize, String)| LogRow {
-        id: id + place as i64,
-        task: task.clone(),
-        attempt,
-        worker: worker.clone(),
-        line: line.unsigned_abs() + place as u64,
-        at_ms,
-        text,
-    };
-    Ok(texts.into_iter().enumerate().map(row).collect())
+    let mut rows = Vec::new();
+    for (place, text) in texts.into_iter().enumerate() {
+        let id = id + place as i64;
+        let line = line.unsigned_abs() + place as u64;
+        rows.push(LogRow { id, task: task.clone(), attempt, worker: worker.clone(), line, at_ms, text });
+    }
+    Ok(rows)
 }

@@ -15,10 +15,12 @@ pub(super) static OF_SQLITE: LazyLock<Migrator> = LazyLock::new(|| migrator(&SQL
 pub(super) static OF_POSTGRES: LazyLock<Migrator> = LazyLock::new(|| migrator(&POSTGRES));
 
 fn migrator(embedded: &[Embedded]) -> Migrator {
-    let migration = |(version, description, sql): &Embedded| {
-        Migration::new(*version, Cow::Borrowed(*description), MigrationType::Simple, sql.into_sql_str(), false)
-    };
-    Migrator::with_migrations(embedded.iter().map(migration).collect())
+    let mut migrations = Vec::new();
+    for (version, description, sql) in embedded {
+        let description = Cow::Borrowed(*description);
+        migrations.push(Migration::new(*version, description, MigrationType::Simple, sql.into_sql_str(), false));
+    }
+    Migrator::with_migrations(migrations)
 }
 
 /// Returns the number of the newest migration.

@@ -108,8 +108,9 @@ pub(super) async fn history(
 ) -> Result<Vec<Promotion>, sqlx::Error> {
     let find = query("SELECT * FROM promotions WHERE model = ?1 AND (?2 IS NULL OR alias = ?2) ORDER BY id");
     let rows = find.bind(model.as_str()).bind(alias.map(Alias::as_str)).fetch_all(&mut *conn).await?;
-    let entry = |row: &Row| -> Result<Promotion, sqlx::Error> {
-        Ok(Promotion {
+    let mut history = Vec::new();
+    for row in &rows {
+        history.push(Promotion {
             id: row.try_get("id")?,
             at_ms: row.try_get("at_ms")?,
             model: model.clone(),
@@ -120,7 +121,7 @@ pub(super) async fn history(
             actor: row.try_get("actor")?,
             reason: row.try_get("reason")?,
             gates: serde_json::from_str(row.try_get("gates")?).unwrap_or_default(),
-        })
-    };
-    rows.iter().map(entry).collect()
+        });
+    }
+    Ok(history)
 }

@@ -114,12 +114,14 @@ impl Records for SqlRecords {
         let find = "SELECT key, run, stage FROM executions WHERE key IN {texts ?1} \
                     UNION ALL SELECT key, run, stage FROM stage_results WHERE key IN {texts ?1}";
         let rows = query(find).bind(json(&keys)).fetch_all(&mut conn).await?;
-        let source = |row: &Row| -> Result<_> {
-            let (run, stage): (String, String) = (row.try_get("run")?, row.try_get("stage")?);
-            Ok((digest(row, "key")?, (RunId::new(run), StageName::new(stage))))
-        };
-        // A finished value replaces an archived execution of the same key.
-        rows.iter().map(source).collect()
+        let mut sources = BTreeMap::new();
+        for row in &rows {
+            let run = RunId::new(row.try_get::<String, _>("run")?);
+            let stage = StageName::new(row.try_get::<String, _>("stage")?);
+            // A finished value replaces an archived execution of the same key.
+            sources.insert(digest(row, "key")?, (run, stage));
+        }
+        Ok(sources)
     }
 
     async fn archived_execution(&self, key: Digest) -> Result<Option<String>> {

@@ -51,15 +51,16 @@ pub(super) fn run_row(row: &Row) -> Result<RunRow> {
 
 pub(super) async fn checkpoints(conn: &mut Conn<'_>, task: &TaskId) -> Result<Vec<CheckpointRow>> {
     let find = query("SELECT * FROM checkpoints WHERE task = ? ORDER BY step DESC, id DESC").bind(task.as_str());
-    let checkpoint = |row: &Row| -> Result<CheckpointRow> {
-        Ok(CheckpointRow {
+    let mut checkpoints = Vec::new();
+    for row in find.fetch_all(&mut *conn).await? {
+        checkpoints.push(CheckpointRow {
             task: task.clone(),
             attempt: Attempt(row.try_get::<i64, _>("attempt")?.unsigned_abs()),
             step: row.try_get::<i64, _>("step")?.unsigned_abs(),
-            manifest: digest(row, "manifest")?,
+            manifest: digest(&row, "manifest")?,
             metrics: numbers(row.try_get("metrics")?),
             at_ms: row.try_get("at_ms")?,
-        })
-    };
-    find.fetch_all(&mut *conn).await?.iter().map(checkpoint).collect()
+        });
+    }
+    Ok(checkpoints)
 }

@@ -24,15 +24,18 @@ pub(super) async fn of_steps(conn: &mut Conn<'_>, recorder: i64, steps: &[i64]) 
                 LEFT JOIN recorded AS after ON after.recorder = ?1 AND after.step = \
                 (SELECT min(step) FROM recorded WHERE recorder = ?1 AND step >= step.value) ORDER BY step.key";
     let rows = query(find).bind(recorder).bind(json(&steps)).fetch_all(&mut *conn).await?;
-    let time = |row: &Row| -> Result<f64> {
+    let mut times = Vec::new();
+    for row in &rows {
         let step: i64 = row.try_get("step")?;
-        Ok(match (batch(row, "step_before", "ms_before")?, batch(row, "step_after", "ms_after")?) {
+        let before = batch(row, "step_before", "ms_before")?;
+        let after = batch(row, "step_after", "ms_after")?;
+        times.push(match (before, after) {
             (Some((_, ms)), None) | (None, Some((_, ms))) => ms,
             (Some(before), Some(after)) => between(before, after, step as f64),
             (None, None) => 0.0,
-        })
-    };
-    rows.iter().map(time).collect()
+        });
+    }
+    Ok(times)
 }
 
 /// The step that a try had reached at a time, the last one if it is the `end` of a range; `None` if that is after its last values.

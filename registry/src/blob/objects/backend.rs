@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use checkpoint::BlobError;
 use futures::TryStreamExt as _;
-use object_store::{Error, ObjectMeta, ObjectStoreExt as _, PutMode, PutOptions};
+use object_store::{Error, ObjectStoreExt as _, PutMode, PutOptions};
 use protocol::Digest;
 use tokio::sync::Semaphore;
 
@@ -95,9 +95,10 @@ impl Backend for Objects {
         let path = self.0.remote.blob(digest);
         let wanted = path.clone();
         let removing = async move {
-            let late =
-                || Error::Generic { store: "blobs", source: "the server did not answer the removal in time".into() };
-            tokio::time::timeout(REMOVAL, store.delete(&wanted)).await.unwrap_or_else(|_| Err(late()))
+            let removed = tokio::time::timeout(REMOVAL, store.delete(&wanted)).await;
+            removed.unwrap_or_else(|_| {
+                Err(Error::Generic { store: "blobs", source: "the server did not answer the removal in time".into() })
+            })
         };
         match self.0.remote.wait(removing) {
             Ok(()) | Err(Error::NotFound { .. }) => drop(self.0.puts().remove(&digest)),
@@ -118,11 +119,12 @@ impl Backend for Objects {
     }
 
     fn list(&self) -> Result<Vec<Entry>, BlobError> {
-        let entry = |meta: &ObjectMeta| {
-            let digest = self.0.remote.digest(&meta.location)?;
-            Some(Entry { digest, bytes: meta.size, put_ms: self.0.put_ms(digest, meta) })
-        };
-        Ok(self.0.list("sha256")?.iter().filter_map(entry).collect())
+        let mut entries = Vec::new();
+        for meta in self.0.list("sha256")? {
+            let Some(digest) = self.0.remote.digest(&meta.location) else { continue };
+            entries.push(Entry { digest, bytes: meta.size, put_ms: self.0.put_ms(digest, &meta) });
+        }
+        Ok(entries)
     }
 
     fn is_empty(&self) -> Result<bool, BlobError> {

@@ -164,15 +164,18 @@ impl Multipart {
 
     /// Describes the uploads that have not ended, without this process's own.
     pub(super) fn unfinished(&self) -> Result<Vec<String>, BlobError> {
-        let describe = |(record, content): (Path, Option<Unfinished>)| match content {
-            Some(content) => {
-                let object = Path::from(content.object);
-                let begun = clock::format_ms(content.begun_ms);
-                format!("an upload in parts to `{}` began at {begun} and has not ended", self.remote.shown(&object))
-            }
-            None => format!("`{}` is not the record of an upload and is left alone", self.remote.shown(&record)),
-        };
-        Ok(self.left()?.into_iter().map(describe).collect())
+        let mut described = Vec::new();
+        for (record, content) in self.left()? {
+            described.push(match content {
+                Some(content) => {
+                    let object = self.remote.shown(&Path::from(content.object));
+                    let begun = clock::format_ms(content.begun_ms);
+                    format!("an upload in parts to `{object}` began at {begun} and has not ended")
+                }
+                None => format!("`{}` is not the record of an upload and is left alone", self.remote.shown(&record)),
+            });
+        }
+        Ok(described)
     }
 
     /// Ends the uploads of other processes and returns their number.
