@@ -9,10 +9,6 @@ const TELLING: [&str; 6] = ["fid", "latent_fid", "recognised", "r_precision_top1
 pub(crate) fn note(state: RunState, stages: &[StageView]) -> String {
     let main = || stages.iter().filter(|stage| stage.of.is_none() && stage.is_asked_for());
     let failed = |stage: &&StageView| stage.state == StageState::Failed;
-    let said = |stage: &StageView| {
-        let line = stage.message.as_deref().and_then(|message| message.lines().next()).unwrap_or_default();
-        format!("{}: {line}", stage.name)
-    };
     if state == RunState::Failed
         && let Some(broken) = main().find(failed).or_else(|| stages.iter().find(failed))
     {
@@ -34,6 +30,12 @@ pub(crate) fn note(state: RunState, stages: &[StageView]) -> String {
         return at_work.join(", ");
     }
     main().find(|stage| stage.state == StageState::Ready && stage.message.is_some()).map(said).unwrap_or_default()
+}
+
+/// The first line of a stage's message, with the stage's name.
+fn said(stage: &StageView) -> String {
+    let line = stage.message.as_deref().and_then(|message| message.lines().next()).unwrap_or_default();
+    format!("{}: {line}", stage.name)
 }
 
 /// The metric of a stage that says most.

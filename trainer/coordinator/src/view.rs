@@ -46,7 +46,8 @@ pub struct WorkerView {
 impl State {
     /// Views of all workers.
     pub fn worker_views(&self) -> Vec<WorkerView> {
-        let view = |(name, worker): (&WorkerId, &Worker)| {
+        let mut views = Vec::new();
+        for (name, worker) in &self.workers {
             let task = self.held_by(name).map(|(_, task)| task.id.clone());
             let state = match (worker.presence, &task) {
                 (Presence::Here, None) => "idle",
@@ -55,7 +56,7 @@ impl State {
                 (Presence::Silent, _) => "silent",
                 (Presence::Gone, _) => "gone",
             };
-            WorkerView {
+            views.push(WorkerView {
                 worker: name.clone(),
                 incarnation: worker.incarnation,
                 pid: worker.pid,
@@ -64,9 +65,9 @@ impl State {
                 state: state.to_owned(),
                 task,
                 labels: worker.labels.clone(),
-            }
-        };
-        self.workers.iter().map(view).collect()
+            });
+        }
+        views
     }
 
     /// The complete set of assignments of a worker process.

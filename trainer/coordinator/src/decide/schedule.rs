@@ -48,12 +48,10 @@ pub(crate) fn schedule(cx: &mut Deciding<'_>) {
     if cx.state.draining {
         return;
     }
-    let is_open = |state: &State, key: &Digest| {
-        state.executions.get(key).is_some_and(|execution| execution.state == ExecutionState::Open)
-    };
     // A gang becomes too large only if another run asks for fewer workers, which touches its execution.
     for key in cx.touched.clone() {
-        if is_open(cx.state, &key) {
+        let execution = cx.state.executions.get(&key);
+        if execution.is_some_and(|execution| execution.state == ExecutionState::Open) {
             change_gangs(cx, key, |_, _, _| Vec::new());
         }
     }

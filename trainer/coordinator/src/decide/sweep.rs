@@ -209,15 +209,12 @@ impl State {
         let settings = stage.sweep.as_ref().expect("the stage has a sweep");
         let search = &sweep.search;
         let over = search.is_over();
-        let waiting = |(trial, values): (usize, &protocol::sweep::Values)| TrialView {
-            trial,
-            values: values.clone(),
-            state: TrialState::Waiting,
-            steps: 0,
-            results: Vec::new(),
-            message: sweep.failures.get(&trial).cloned(),
-        };
-        let mut trials: Vec<TrialView> = search.trials().iter().enumerate().map(waiting).collect();
+        let mut trials = Vec::new();
+        for (trial, values) in search.trials().iter().enumerate() {
+            let message = sweep.failures.get(&trial).cloned();
+            let state = TrialState::Waiting;
+            trials.push(TrialView { trial, values: values.clone(), state, steps: 0, results: Vec::new(), message });
+        }
         for (n, ticket) in search.tickets().iter().enumerate() {
             let Ticket::Rung { trial, rung } = *ticket else { continue };
             let view = &mut trials[trial];

@@ -1,24 +1,21 @@
 //! All points of a space of choices, in the order of the settings' names; the last setting varies fastest.
 
 use protocol::sweep::{Domain, MAX_TRIALS, Sweep, Values};
+use serde_json::Value;
 
 pub(super) fn points(sweep: &Sweep) -> Vec<Values> {
     let mut points = vec![Values::new()];
     for (path, domain) in &sweep.space {
         let Domain::Choice(choices) = domain else { continue };
-        let with = |point: &Values| {
-            choices
-                .iter()
-                .map(|value| {
-                    point
-                        .iter()
-                        .map(|(k, v)| (k.clone(), v.clone()))
-                        .chain([(path.clone(), value.clone())])
-                        .collect::<Values>()
-                })
-                .collect::<Vec<_>>()
-        };
-        points = points.iter().flat_map(with).take(MAX_TRIALS).collect();
+        let longer = points.iter().flat_map(|point| choices.iter().map(|value| with(point, path, value)));
+        points = longer.take(MAX_TRIALS).collect();
     }
     points
+}
+
+/// A point with one more setting.
+fn with(point: &Values, path: &str, value: &Value) -> Values {
+    let mut point = point.clone();
+    point.insert(path.to_owned(), value.clone());
+    point
 }

@@ -125,12 +125,15 @@ impl Search {
     /// The changes since `before`.
     pub fn since(&self, before: &Self) -> Progress {
         let tickets = self.tickets[before.tickets.len()..].to_vec();
-        let new = |(ticket, score): (usize, &Option<Score>)| {
-            let score = (*score)?;
-            let is_new = self.tickets[ticket] != Ticket::Idle && before.score(ticket).is_none();
-            is_new.then_some((ticket, score))
-        };
-        let scores = self.scores.iter().enumerate().filter_map(new).collect();
+        let mut scores = Vec::new();
+        for (ticket, score) in self.scores.iter().enumerate() {
+            if let Some(score) = score
+                && self.tickets[ticket] != Ticket::Idle
+                && before.score(ticket).is_none()
+            {
+                scores.push((ticket, *score));
+            }
+        }
         Progress { tickets, scores, folded: self.folded }
     }
 

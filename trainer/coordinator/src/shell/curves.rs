@@ -53,12 +53,14 @@ pub struct CurveSeries {
 impl CurveSeries {
     /// The curves of a run, by stage, by key.
     pub fn of(run: &RunId, stages: StageCurves) -> Vec<Self> {
-        let series = |stage: StageName, key: String, columns: Buckets| {
-            let total = columns.count.iter().sum();
-            Self { run: run.clone(), stage, key, total, columns }
-        };
-        let stages = stages.into_iter();
-        stages.flat_map(|(stage, keys)| keys.into_iter().map(move |(key, it)| series(stage.clone(), key, it))).collect()
+        let mut series = Vec::new();
+        for (stage, keys) in stages {
+            for (key, columns) in keys {
+                let total = columns.count.iter().sum();
+                series.push(Self { run: run.clone(), stage: stage.clone(), key, total, columns });
+            }
+        }
+        series
     }
 }
 

@@ -91,15 +91,16 @@ fn default_runs() -> u32 {
     50
 }
 
+fn state_named(word: &str) -> Result<RunState, Failure> {
+    let expected = "`running`, `paused`, `finished`, `failed` or `cancelled`";
+    RunState::named(word).ok_or_else(|| Failure::invalid(format!("`state` names `{word}`; expected {expected}")))
+}
+
 impl RunsQuery {
     fn read(self) -> Result<RunListQuery, Failure> {
         let Self { state, pipeline, owner, q, sort, after, limit } = self;
-        let known = |word: &str| {
-            let expected = "`running`, `paused`, `finished`, `failed` or `cancelled`";
-            RunState::named(word)
-                .ok_or_else(|| Failure::invalid(format!("`state` names `{word}`; expected {expected}")))
-        };
-        let states = state.split(',').filter(|word| !word.is_empty()).map(known).collect::<Result<_, _>>()?;
+        let words = state.split(',').filter(|word| !word.is_empty());
+        let states = words.map(state_named).collect::<Result<_, _>>()?;
         if limit == 0 {
             return Err(Failure::invalid("`limit` is 0; expected at least 1".to_owned()));
         }

@@ -307,12 +307,13 @@ impl Records {
             [] => BTreeMap::new(),
             left => self.store.sources(left).await.map_err(WriteError::from)?,
         };
-        let source = |(name, key): (StageName, Digest)| {
+        let mut sources = Vec::new();
+        for (name, key) in begun {
             let known = executions.get(&key).map(|execution| (execution.run.clone(), execution.stage.clone()));
             let source = known.or_else(|| stored.get(&key).cloned()).unwrap_or_else(|| (run.clone(), name.clone()));
-            (name, source)
-        };
-        Ok(begun.into_iter().map(source).collect())
+            sources.push((name, source));
+        }
+        Ok(sources)
     }
 }
 
