@@ -132,6 +132,7 @@ mutation too-few-lose-their-state trainer/coordinator/src/decide/attempts.rs 's/
 mutation failing-lead-ends-the-try trainer/coordinator/src/decide/outcome.rs 's/&& self\.state\.goes_on_without/\&\& !self.state.goes_on_without/' coordinator:decisions:gangs
 mutation no-shares trainer/coordinator/src/decide/shares.rs 's/if groups\.len\(\) < 2/if groups.len() < 200/' coordinator:decisions:shares
 mutation gangs-give-nothing trainer/coordinator/src/decide/shares.rs 's/own \+ 2/own + 200/' coordinator:decisions:shares
+mutation unused-shares-come-again trainer/coordinator/src/decide/shares.rs 's/now\.since\(\*at\) < share_again_ms/now.since(*at) < share_again_ms \/ 1000/' coordinator:decisions:shares
 mutation shares-for-ever trainer/coordinator/src/decide/shares.rs 's/idle_ms > state\.policy\.share_ms/idle_ms > state.policy.share_ms * 100/' coordinator:decisions:shares
 mutation joins-without-reaching worker/src/prepare.rs 's/for Member \{ worker, peer_address, \.\. \} in &task\.peers \{/for Member { worker, peer_address, .. } in task.peers.iter().take(0) {/' worker:lib:prepare
 mutation only-whole-frames-count worker/src/gang/link.rs 's/if count > 0 \{/if count > 1 << 20 {/' worker:lib:relay

@@ -45,6 +45,8 @@ pub struct Policy {
     pub forget_ms: u64,
     /// Time without work after which a worker is not kept for the group whose share it is. Milliseconds.
     pub share_ms: u64,
+    /// Time for which a group gets no member of another group's gang after it has let one idle. Milliseconds.
+    pub share_again_ms: u64,
     /// Number of decisions between snapshots of the state. A snapshot deletes the facts before it.
     pub snapshot_every: u64,
     /// Maximum number of active runs; further submissions are refused.
@@ -74,6 +76,7 @@ impl Default for Policy {
             backoff_max_ms: 30_000,
             forget_ms: 3_600_000,
             share_ms: 120_000,
+            share_again_ms: 1_800_000,
             snapshot_every: 4_000,
             live_runs: 20_000,
             grants: GrantOrder::ByName,

@@ -30,7 +30,6 @@ use crate::decide::deciding::Deciding;
 use crate::decide::shares::Shares;
 use crate::fact::Fact;
 use crate::policy::GrantOrder;
-use crate::state::State;
 use crate::state::evidence;
 use crate::state::execution::{ExecutionState, StageExecution};
 use crate::state::gang::{self, Change};
@@ -38,6 +37,7 @@ use crate::state::queue::{Need, open_member};
 use crate::state::shared::Map;
 use crate::state::task::{Lease, Task};
 use crate::state::worker::{Presence, Worker};
+use crate::state::{Idle, State};
 
 /// Maximum number of gangs that idle workers prepare for. More than that occur in sweeps, where the remaining gangs get
 /// their turn later.
@@ -107,7 +107,7 @@ fn end_backoffs(cx: &mut Deciding<'_>) {
 /// Notes since when workers are idle, while they are divided.
 fn note_idle(cx: &mut Deciding<'_>, shares: &Shares) {
     let now = cx.now();
-    let State { unused, heard, .. } = cx.state;
+    let State { unused, heard, policy, .. } = cx.state;
     if !shares.are_divided() {
         heard.idle = Map::default();
         return;
@@ -117,9 +117,14 @@ fn note_idle(cx: &mut Deciding<'_>, shares: &Shares) {
         heard.idle.remove_mut(&name);
     }
     for name in unused.iter() {
-        if !heard.idle.contains_key(name) {
-            heard.idle.insert_mut(name.clone(), now);
+        let known = heard.idle.get(name).cloned().unwrap_or(Idle { since: now, kept_for: None });
+        if let Some(group) = &known.kept_for
+            && now.since(known.since) > policy.share_ms
+        {
+            heard.declined.insert_mut(group.clone(), now);
         }
+        let kept_for = shares.owner(name).cloned().or(known.kept_for);
+        heard.idle.insert_mut(name.clone(), Idle { since: known.since, kept_for });
     }
 }
 

@@ -6,7 +6,8 @@
 //! served in its order, without shares.
 //!
 //! A group whose worker stays idle for longer than [`Policy::share_ms`](crate::policy::Policy::share_ms), for instance
-//! because it cannot fetch the inputs, loses its claim to it.
+//! because it cannot fetch the inputs, loses its claim to it. For [`Policy::share_again_ms`](crate::policy::Policy::share_again_ms),
+//! no gang gives up a member for that group.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -14,19 +15,24 @@ use protocol::{Digest, Group, WorkerId};
 
 use super::deciding::Deciding;
 use crate::demand::slots;
-use crate::state::State;
+use crate::policy::Policy;
 use crate::state::execution::StageExecution;
 use crate::state::queue::{Need, Rank};
 use crate::state::task::{Lease, Part};
 use crate::state::worker::{Presence, Worker};
+use crate::state::{Idle, State};
 use crate::time::Millis;
 
 /// Executions of one need whose room for workers is added up.
 const COUNTED: usize = 64;
 
-/// The idle workers of each group. Empty if only one group's work waits.
+/// The idle workers of each group.
 #[derive(Debug, Default)]
-pub(crate) struct Shares(BTreeMap<WorkerId, Group>);
+pub(crate) struct Shares {
+    /// The work of several groups waits.
+    are_divided: bool,
+    kept_for: BTreeMap<WorkerId, Group>,
+}
 
 /// Work of a group that waits for workers.
 struct Claim<'a> {
@@ -45,24 +51,30 @@ impl Shares {
         if groups.len() < 2 {
             return Self::default();
         }
-        Self(divided(state, now, &mut claims, &mut held(state)))
+        Self { are_divided: true, kept_for: divided(state, now, &mut claims, &mut held(state)) }
     }
 
     /// Returns true if workers are divided.
     pub(crate) fn are_divided(&self) -> bool {
-        !self.0.is_empty()
+        self.are_divided
+    }
+
+    /// The group that a worker is kept for.
+    pub(crate) fn owner(&self, worker: &WorkerId) -> Option<&Group> {
+        self.kept_for.get(worker)
     }
 
     /// Returns true if work of `group` may take an idle worker.
     pub(crate) fn allow(&self, worker: &WorkerId, group: &Group) -> bool {
-        self.0.get(worker).is_none_or(|owner| owner == group)
+        self.kept_for.get(worker).is_none_or(|owner| owner == group)
     }
 }
 
 impl Deciding<'_> {
-    /// Takes members from gangs of groups with many workers, for groups with few. Returns true if it took one.
+    /// Takes members from gangs of groups with many workers, for groups with few. Returns true if it took one, or if an
+    /// idle worker is no longer kept.
     pub(crate) fn share(&mut self) -> bool {
-        let mut taken = false;
+        let mut taken = self.state.share_is_over(self.now());
         while let Some((key, i, worker)) = self.state.member_to_give(self.now()) {
             taken = true;
             self.state.visits += 1;
@@ -79,6 +91,7 @@ impl State {
     /// The member of a gang that waiting work of another group should get.
     pub(crate) fn member_to_give(&self, now: Millis) -> Option<(Digest, usize, WorkerId)> {
         let mut claims = claims(self);
+        claims.retain(|claim| !self.declines(&claim.need.group, now));
         if claims.is_empty() {
             return None;
         }
@@ -103,6 +116,23 @@ impl State {
             let own = held.get(&claim.need.group).copied().unwrap_or_default();
             self.giver(claim, own, &held)
         })
+    }
+
+    /// Returns true if a group has let a worker idle for too long and this is not noted yet.
+    pub(crate) fn share_is_over(&self, now: Millis) -> bool {
+        self.heard.idle.values().any(|idle| {
+            let end = idle.since.after(self.policy.share_ms);
+            let is_noted = |group| self.heard.declined.get(group).is_some_and(|at| *at > end);
+            now > end && idle.kept_for.as_ref().is_some_and(|group| !is_noted(group))
+        })
+    }
+
+    /// Returns true if the group has lately let a worker idle that was kept for it.
+    fn declines(&self, group: &Group, now: Millis) -> bool {
+        let Policy { share_ms, share_again_ms, .. } = self.policy;
+        let lately = self.heard.declined.get(group).is_some_and(|at| now.since(*at) < share_again_ms);
+        let is_unused = |idle: &Idle| idle.kept_for.as_ref() == Some(group) && now.since(idle.since) > share_ms;
+        lately || self.heard.idle.values().any(is_unused)
     }
 
     /// A member that a gang can spare for `claim`, whose group has `own` workers: of the group with the most workers.
@@ -169,7 +199,7 @@ fn divided(
     let mut given = BTreeMap::new();
     for name in &state.unused {
         let Some(worker) = state.workers.get(name).filter(|worker| worker.presence == Presence::Here) else { continue };
-        let idle_ms = state.heard.idle.get(name).map_or(0, |since| now.since(*since));
+        let idle_ms = state.heard.idle.get(name).map_or(0, |idle| now.since(idle.since));
         if idle_ms > state.policy.share_ms {
             continue;
         }

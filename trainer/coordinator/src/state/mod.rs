@@ -33,7 +33,7 @@ pub mod worker;
 use std::sync::Arc;
 
 use protocol::message::Progress;
-use protocol::{Digest, Fence, Incarnation, TaskId, WorkerId};
+use protocol::{Digest, Fence, Group, Incarnation, TaskId, WorkerId};
 
 use self::evidence::Words;
 use self::execution::StageExecution;
@@ -46,6 +46,15 @@ use crate::time::Millis;
 
 pub use self::apply::UnknownObject;
 
+/// A worker without a task, while workers are divided among groups.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Idle {
+    /// Time of its last task.
+    pub since: Millis,
+    /// The group whose share it is, or was last.
+    pub kept_for: Option<Group>,
+}
+
 /// Data from polls. It is lost with the process, which does no harm.
 #[derive(Debug, Clone, Default)]
 pub struct Heard {
@@ -56,7 +65,9 @@ pub struct Heard {
     /// The highest reported memory of a worker's process by task, in bytes.
     pub memory: Map<TaskId, u64>,
     /// Times since when workers hold no task, while they are divided among groups.
-    pub idle: Map<WorkerId, Millis>,
+    pub idle: Map<WorkerId, Idle>,
+    /// Times at which groups last let a worker idle that was kept for them.
+    pub declined: Map<Group, Millis>,
     /// Reports of gang members about their state and about each other. A worker that loses its task also loses its
     /// report.
     pub words: Arc<Words>,

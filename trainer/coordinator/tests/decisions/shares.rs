@@ -50,10 +50,11 @@ fn beat(coordinator: &mut PureCoordinator) {
     for name in NAMES {
         let Some(worker) = coordinator.state.workers.get(&name.into()) else { continue };
         let incarnation = worker.incarnation;
+        let ready = worker.ready.iter().cloned().collect();
         let doing = coordinator
             .assignment(name)
             .map(|held| Doing { holds: Some(7), ..Doing::new(held.grant, Progress::default()) });
-        let poll = Poll { incarnation, doing: doing.into_iter().collect(), ready: Vec::new(), version: 0 };
+        let poll = Poll { incarnation, doing: doing.into_iter().collect(), ready, version: 0 };
         coordinator.hear(Observation::Poll { worker: name.into(), poll });
     }
     coordinator.now += 1_000;
@@ -134,10 +135,22 @@ fn a_worker_that_its_group_does_not_use_goes_back() {
     finish_small(&mut coordinator, &yours);
     beat(&mut coordinator);
     assert_eq!(holding(&coordinator, [&mine, &yours]), [3, 0], "it is kept for the training that it prepares");
-    coordinator.now += Policy::default().share_ms;
-    beat(&mut coordinator);
     let idle = NAMES.into_iter().find(|name| coordinator.assignment(name).is_none()).expect("an idle one");
-    coordinator.quick = true;
-    let asked = coordinator.asked(idle);
-    assert!(asked.iter().any(|prepare| prepare.task.as_str().starts_with(mine.as_str())), "{asked:?}");
+    let prepares = coordinator.asked(idle).into_iter().map(|prepare| prepare.task);
+    let tasks = prepares.filter(|task| task.as_str().starts_with(mine.as_str())).collect();
+    let incarnation = coordinator.state.workers[&idle.into()].incarnation;
+    coordinator.happen(Event::WorkerReady { worker: idle.into(), incarnation, tasks }).expect("taken");
+    let kept = Policy::default().share_ms / 1_000 - 5;
+    for _ in 0..kept {
+        beat(&mut coordinator);
+    }
+    assert_eq!(holding(&coordinator, [&mine, &yours]), [3, 0], "it is kept, although it could join the other gang");
+    for _ in 0..10 {
+        beat(&mut coordinator);
+    }
+    assert_eq!(holding(&coordinator, [&mine, &yours]), [4, 0]);
+    for _ in 0..300 {
+        beat(&mut coordinator);
+        assert_eq!(holding(&coordinator, [&mine, &yours]), [4, 0], "a group that lets workers idle gets no other one");
+    }
 }

@@ -66,13 +66,14 @@ pub(super) fn working(stage: &StageView, curve: &Curve, now: Instant) -> String 
     parts.join("  ")
 }
 
-/// The most important metrics.
-const FIRST: [&str; 3] = ["loss", "fid", "r_precision_top3"];
+/// The most important metrics. `skipped` is the number of clips left out of a dataset.
+const FIRST: [&str; 4] = ["skipped", "loss", "fid", "r_precision_top3"];
 
 /// The first few metrics, such as `loss 0.1834  grad_norm 0.71`, without the ends of confidence intervals.
 fn values(stage: &StageView, count: usize) -> String {
     let end = |key: &str| key.ends_with(".lower") || key.ends_with(".upper");
     let first = FIRST.iter().filter_map(|key| stage.metrics.get_key_value(*key));
+    let first = first.filter(|(key, value)| *key != "skipped" || **value > 0.0);
     // A key such as `accuracy/backwards` is a part of another value.
     let others =
         stage.metrics.iter().filter(|(key, _)| !FIRST.contains(&key.as_str()) && !end(key) && !key.contains('/'));
