@@ -18,7 +18,7 @@ use crate::{Bench, PATIENCE, Running, signal, wait_for, wait_within};
 pub const TOKEN: &str = "a-token-of-tests-only";
 /// The token of all workers, which allows nothing else.
 pub const WORKER_TOKEN: &str = "a-token-of-workers-of-tests-only";
-/// The token of another user, who may submit. Its runs are of another group.
+/// The token of another user, who may submit and promote. Its runs are of another group.
 pub const OTHER_TOKEN: &str = "a-token-of-another-of-tests-only";
 /// Minimum time of a training step, in milliseconds. 400 steps take at least ten seconds, so a test can act in the
 /// middle.
@@ -165,7 +165,7 @@ impl Cluster {
     fn spawn_server(&self, who: &str, address: SocketAddr, more: &[&str]) -> Running {
         let address = address.to_string();
         let tokens = self.bench.path().join("tokens");
-        let lines = format!("admin admin {TOKEN}\nworkers worker {WORKER_TOKEN}\nother submit {OTHER_TOKEN}\n");
+        let lines = format!("admin admin {TOKEN}\nworkers worker {WORKER_TOKEN}\nother submit,promote {OTHER_TOKEN}\n");
         fs::write(&tokens, lines).expect("a token file");
         fs::set_permissions(&tokens, fs::Permissions::from_mode(0o600)).expect("ours");
         let tokens = tokens.display().to_string();

@@ -46,8 +46,7 @@ pub enum Data {
         /// For each part of a model, the parts it was made for.
         #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
         fits: BTreeMap<Role, Parts>,
-        /// Versions that a control part was made for, as `MODEL:VERSION`, among the newest
-        /// [`MOST_BASES`](super::MOST_BASES).
+        /// Versions that a control part was made for, as `MODEL:VERSION`, among the newest thousand.
         #[serde(default, skip_serializing_if = "Vec::is_empty")]
         bases: Vec<String>,
     },
