@@ -44,7 +44,7 @@ pub struct Head {
 /// A bundle that was read and verified.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Bundle {
-    /// Its description.
+    /// Model, version, metrics and origin, as the bundle states them.
     pub head: Head,
     /// The model's manifest.
     pub manifest: Manifest,

@@ -120,11 +120,17 @@ impl State {
 
     /// Returns true if a group has let a worker idle for too long and this is not noted yet.
     pub(crate) fn share_is_over(&self, now: Millis) -> bool {
-        self.heard.idle.values().any(|idle| {
+        self.kept_idle().any(|idle| {
             let end = idle.since.after(self.policy.share_ms);
             let is_noted = |group| self.heard.declined.get(group).is_some_and(|at| *at > end);
             now > end && idle.kept_for.as_ref().is_some_and(|group| !is_noted(group))
         })
+    }
+
+    /// The workers that are idle and here. One that fell silent is not at its group's disposal.
+    fn kept_idle(&self) -> impl Iterator<Item = &Idle> {
+        let is_here = |name: &&WorkerId| self.workers.get(name).is_some_and(|it| it.presence == Presence::Here);
+        self.unused.iter().filter(is_here).filter_map(|name| self.heard.idle.get(name))
     }
 
     /// Returns true if the group has lately let a worker idle that was kept for it.
@@ -132,7 +138,7 @@ impl State {
         let Policy { share_ms, share_again_ms, .. } = self.policy;
         let lately = self.heard.declined.get(group).is_some_and(|at| now.since(*at) < share_again_ms);
         let is_unused = |idle: &Idle| idle.kept_for.as_ref() == Some(group) && now.since(idle.since) > share_ms;
-        lately || self.heard.idle.values().any(is_unused)
+        lately || self.kept_idle().any(is_unused)
     }
 
     /// A member that a gang can spare for `claim`, whose group has `own` workers: of the group with the most workers.

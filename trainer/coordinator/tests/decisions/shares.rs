@@ -47,7 +47,12 @@ fn finish_small(coordinator: &mut PureCoordinator, run: &RunId) {
 
 /// All members report that they hold the state, and time passes.
 fn beat(coordinator: &mut PureCoordinator) {
-    for name in NAMES {
+    beat_of(coordinator, NAMES);
+}
+
+/// The same for some of the members.
+fn beat_of(coordinator: &mut PureCoordinator, names: impl IntoIterator<Item = &'static str>) {
+    for name in names {
         let Some(worker) = coordinator.state.workers.get(&name.into()) else { continue };
         let incarnation = worker.incarnation;
         let ready = worker.ready.iter().cloned().collect();
@@ -124,6 +129,27 @@ fn runs_of_one_group_and_gangs_at_their_minimum_keep_their_workers() {
     let yours = submit(&mut coordinator, "you", 2, 1);
     beat(&mut coordinator);
     assert_eq!(holding(&coordinator, [&mine, &yours]), [4, 0]);
+}
+
+/// A worker that falls silent while it is kept costs no decision at every tick.
+#[test]
+fn a_kept_worker_that_falls_silent_costs_no_decisions() {
+    let (mut coordinator, _mine) = trains("me", 1);
+    let yours = submit(&mut coordinator, "you", 2, 1);
+    coordinator.quick = false;
+    finish_small(&mut coordinator, &yours);
+    beat(&mut coordinator);
+    let kept = NAMES.into_iter().find(|name| coordinator.assignment(name).is_none()).expect("an idle one");
+    let lease = Policy::default().lease_ms / 1_000;
+    let over = Policy::default().share_ms / 1_000 + lease;
+    for _ in 0..over {
+        beat_of(&mut coordinator, NAMES.into_iter().filter(|name| *name != kept));
+    }
+    let before = coordinator.state.seq;
+    for _ in 0..30 {
+        beat_of(&mut coordinator, NAMES.into_iter().filter(|name| *name != kept));
+    }
+    assert_eq!(coordinator.state.seq, before);
 }
 
 /// A worker that never prepares for the other group's gang does not stay idle.
