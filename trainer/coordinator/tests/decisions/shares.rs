@@ -134,7 +134,7 @@ fn runs_of_one_group_and_gangs_at_their_minimum_keep_their_workers() {
 /// A worker that falls silent while it is kept costs no decision at every tick.
 #[test]
 fn a_kept_worker_that_falls_silent_costs_no_decisions() {
-    let (mut coordinator, _mine) = trains("me", 1);
+    let (mut coordinator, _mine) = trains("me", 3);
     let yours = submit(&mut coordinator, "you", 2, 1);
     coordinator.quick = false;
     finish_small(&mut coordinator, &yours);
