@@ -61,16 +61,16 @@ mutation() {
     git checkout --quiet -- .
 }
 
-mutation leniency-times-ten trainer/coordinator/src/observe.rs 's/then\.after\(overslept\)\.min\(at\)/then.after(overslept * 10)/' coordinator
-mutation back-off-times-ten trainer/coordinator/src/policy.rs 's/(self\.backoff_ms)\.saturating_mul/$1.saturating_mul(10).saturating_mul/' coordinator
-mutation heard-is-lost trainer/coordinator/src/batch.rs 's/(Ask::Observation\(\.\.\) =>) [^,]*,/$1 {}/' coordinator
-mutation cancelled-shards-forgotten registry/src/sql/retention.rs "s/state = 'finished'/state IN ('finished', 'cancelled')/g" "registry coordinator"
-mutation synchronous-off registry/src/sql/sqlite.rs 's/SqliteSynchronous::Full/SqliteSynchronous::Off/' registry
-mutation no-sync-of-a-blob registry/src/blob/fs.rs 's/self\.part\.file\.sync\(\)/Ok::<(), io::Error>(())/' "registry coordinator"
-mutation no-sync-of-its-folder registry/src/blob/fs.rs 's/folder\.disk\.sync_dir\(shard\)/Ok::<(), io::Error>(())/' "registry coordinator"
-mutation no-sync-of-the-operating-system registry/src/blob/disk.rs 's/(fn sync\(&mut self\) -> io::Result<\(\)> \{\s+)self\.sync_all\(\)/$1Ok(())/' registry
-mutation grace-0 registry/src/retention.rs 's/60 \* 60 \* 1000/0/' "registry coordinator"
-mutation no-touch registry/src/blob/store.rs 's/let touched = self\.backend\(\)\.touch\(digest\)\?;/let touched = stat;/' registry
+mutation leniency-times-ten trainer/coordinator/src/observe.rs 's/then\.after\(overslept\)\.min\(at\)/then.after(overslept * 10)/' coordinator:decisions
+mutation back-off-times-ten trainer/coordinator/src/policy.rs 's/(self\.backoff_ms)\.saturating_mul/$1.saturating_mul(10).saturating_mul/' coordinator:decisions
+mutation heard-is-lost trainer/coordinator/src/batch.rs 's/(Ask::Observation\(\.\.\) =>) [^,]*,/$1 {}/' coordinator:decisions:batches
+mutation cancelled-shards-forgotten registry/src/sql/retention.rs "s/state = 'finished'/state IN ('finished', 'cancelled')/g" registry:retention
+mutation synchronous-off registry/src/sql/sqlite.rs 's/SqliteSynchronous::Full/SqliteSynchronous::Off/' registry:lib:sqlite
+mutation no-sync-of-a-blob registry/src/blob/fs.rs 's/self\.part\.file\.sync\(\)/Ok::<(), io::Error>(())/' registry:power_loss
+mutation no-sync-of-its-folder registry/src/blob/fs.rs 's/folder\.disk\.sync_dir\(shard\)/Ok::<(), io::Error>(())/' registry:power_loss
+mutation no-sync-of-the-operating-system registry/src/blob/disk.rs 's/(fn sync\(&mut self\) -> io::Result<\(\)> \{\s+)self\.sync_all\(\)/$1Ok(())/' "registry:disk registry:lib:disk registry"
+mutation grace-0 registry/src/retention.rs 's/60 \* 60 \* 1000/0/' "registry:retention registry"
+mutation no-touch registry/src/blob/store.rs 's/let touched = self\.backend\(\)\.touch\(digest\)\?;/let touched = stat;/' registry:conformance
 mutation constant-nonce worker/src/gang/handshake.rs 's/getrandom::fill\(&mut bytes\)/getrandom::fill(&mut bytes[..0])/' worker:lib:gang
 mutation token-over-plain-http trainer/access/src/connection.rs 's/find\(\|address\| !address\.is_local\(\)\)/find(|address| address.is_local())/' access:lib
 mutation pipe-as-token-file trainer/access/src/file.rs 's/if file\.metadata\(\)\?\.is_file\(\)/if true/' access:lib
