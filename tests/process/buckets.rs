@@ -3,8 +3,12 @@
 use std::fs;
 
 use cluster_tests::bucket::{Bucket, NAME};
+use cluster_tests::cluster::Cluster;
 use cluster_tests::documented::{run_by, words};
 use cluster_tests::{Bench, Running, Said, digests, states, wait_for};
+use protocol::limits::SMALL_BLOB_BYTES;
+
+use crate::cluster::{VAE, config, equals_reference};
 
 const TRAINER: &str = env!("CARGO_BIN_EXE_trainer");
 
@@ -38,12 +42,40 @@ fn a_run_on_a_bucket_that_is_killed_and_goes_on_gives_the_digests_of_a_folder() 
     assert_eq!(report["run"], interrupted["run"]);
     bench.run(&["registry", "fsck"]).expect_code(0);
     assert!(bucket.objects().join("runs/first/sha256").is_dir() && !bench.store().join("blobs/sha256").exists());
-    // The killed process left at most one part. It is removed once its worker has been absent for ten minutes.
-    assert!(fs::read_dir(bench.store().join("staging")).expect("a folder").count() <= 1, "nothing is kept twice");
+    // Each of the two killed workers left at most one part. It is removed once its worker has been absent for ten minutes.
+    assert!(fs::read_dir(bench.store().join("staging")).expect("a folder").count() <= 2, "nothing is kept twice");
 
     let again = bench.pipeline("smoke.yaml", &until);
     assert!(states(&again).values().all(|state| matches!(state.as_str(), "cached" | "skipped")), "{again:#}");
     bench.run(&["registry", "fsck"]).expect_code(0);
+}
+
+/// Workers without credentials read and write the bucket by signed requests. The server carries no bytes of blobs above
+/// 64 KiB, and the digests are those of an undisturbed run on a folder.
+#[test]
+fn workers_pass_blobs_by_the_server() {
+    let bucket = Bucket::start();
+    let mut cluster = Cluster::on_bucket(TRAINER, &bucket, "direct");
+    for name in ["w1", "w2"] {
+        cluster.join(name);
+    }
+    let run = cluster.submit(&config(), &VAE);
+    let view = cluster.wait_end(&run);
+    equals_reference(&cluster, &run, &view);
+
+    let large = walk(&bucket.objects().join("direct/sha256"))
+        .iter()
+        .filter(|path| fs::metadata(path).expect("an object").len() > SMALL_BLOB_BYTES)
+        .count();
+    assert!(large >= 3, "{large} large blobs: nothing was tested");
+    let numbers = cluster.get("/metrics").expect("the server's numbers");
+    let numbers = numbers.as_str().expect("a text");
+    let carried: Vec<&str> = numbers.lines().filter(|line| line.starts_with("stride_blob_bytes_total")).collect();
+    assert!(carried.iter().any(|line| line.contains("small")), "manifests pass through the server: {numbers}");
+    assert!(!carried.iter().any(|line| line.contains("large")), "{carried:?}");
+    assert!(walk(&bucket.objects().join("direct/arriving")).is_empty(), "what was sent has its name");
+    cluster.kill_server();
+    cluster.bench().run(&["registry", "fsck"]).expect_code(0);
 }
 
 /// Sampled: nothing; two quickstarts with `STRIDE_LONG_TESTS=1`. They use the optimised build that `TRAINER=path`

@@ -12,6 +12,7 @@ use std::time::{Duration, Instant};
 use nix::sys::signal::Signal;
 use serde_json::Value;
 
+use crate::bucket::Bucket;
 use crate::{Bench, PATIENCE, Running, signal, wait_for, wait_within};
 
 /// The coordinator's admin token.
@@ -29,7 +30,7 @@ const PACE: &str = "25";
 pub struct Reply {
     /// HTTP status.
     pub status: u16,
-    /// The body; `null` if it is not JSON.
+    /// The body; a text if it is not JSON.
     pub body: Value,
 }
 
@@ -81,6 +82,13 @@ impl Cluster {
         Self::serving_with(bench, Self::free_address(), arguments)
     }
 
+    /// Like [`start`](Self::start), with its blobs in a bucket. Workers get no credentials of the bucket.
+    pub fn on_bucket(trainer: &str, bucket: &Bucket, prefix: &str) -> Self {
+        let bench = Bench::new(trainer).with_token(TOKEN).with_environment(bucket.environment());
+        fs::create_dir_all(bench.path().join("logs")).expect("a folder for logs");
+        Self::serving_with(bench, Self::free_address(), &["--blobs", &Bucket::url(prefix)])
+    }
+
     fn serving_with(bench: Bench, address: SocketAddr, arguments: &[&str]) -> Self {
         let of_servers = arguments.iter().map(|argument| (*argument).to_owned()).collect();
         let (server, stand_by, second, workers) = (None, None, None, BTreeMap::new());
@@ -125,7 +133,12 @@ impl Cluster {
             }
         };
         match arguments.first() {
-            Some(&"worker") => command.env("STRIDE_TOKEN", WORKER_TOKEN),
+            Some(&"worker") => {
+                for name in self.bench.environment() {
+                    command.env_remove(name);
+                }
+                command.env("STRIDE_TOKEN", WORKER_TOKEN)
+            }
             // The server has a file with both tokens.
             _ => command.env_remove("STRIDE_TOKEN"),
         };
@@ -281,7 +294,8 @@ impl Cluster {
         let end = answer.windows(4).position(|w| w == b"\r\n\r\n");
         let end = end.ok_or_else(|| io::Error::new(io::ErrorKind::UnexpectedEof, "no head"))? + 4;
         let status = String::from_utf8_lossy(&answer[9..12]).parse().map_err(io::Error::other)?;
-        Ok(Reply { status, body: serde_json::from_slice(&answer[end..]).unwrap_or(Value::Null) })
+        let text = || Value::String(String::from_utf8_lossy(&answer[end..]).into_owned());
+        Ok(Reply { status, body: serde_json::from_slice(&answer[end..]).unwrap_or_else(|_| text()) })
     }
 
     /// Sends a call with a JSON body.

@@ -80,6 +80,11 @@ impl Bench {
         Self { environment: environment.into_iter().collect(), ..self }
     }
 
+    /// Names of the environment variables of every command.
+    pub fn environment(&self) -> impl Iterator<Item = &'static str> {
+        self.environment.iter().map(|(name, _)| *name)
+    }
+
     /// Sets the token of every command and server.
     #[must_use]
     pub fn with_token(self, token: &'static str) -> Self {

@@ -8,13 +8,16 @@ use std::time::Duration;
 use access::{Server, Token, explain};
 use bytes::Bytes;
 use protocol::message::{ApiError, DesiredAssignments, Gone, Grant, Join, Joined, Poll};
-use protocol::proof::{BlobStored, GRANT_HEADER, PROCESS_HEADER, Process, RECEIPT_HEADER, SECRET_HEADER};
+use protocol::proof::{
+    BlobStored, DIRECT_HEADER, GRANT_HEADER, PROCESS_HEADER, Process, RECEIPT_HEADER, SECRET_HEADER,
+};
 use protocol::{Digest, WorkerId};
 use reqwest::{RequestBuilder, Response, StatusCode};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use tokio::runtime::Handle;
 
+use crate::direct::Direct;
 use crate::event_count::lock;
 use crate::failpoints;
 
@@ -73,6 +76,8 @@ impl CallError {
 #[derive(Debug, Clone)]
 pub(crate) struct Client {
     server: Server,
+    /// Requests to the place of the blobs itself.
+    pub(crate) direct: Arc<Direct>,
     runtime: Handle,
     /// The secret of this process. Drawn at its start, and held in memory only.
     secret: Token,
@@ -101,7 +106,7 @@ const LONG: Duration = Duration::from_secs(600);
 impl Client {
     pub(crate) fn new(server: Server, runtime: Handle) -> Self {
         let secret = failpoints::secret().unwrap_or_else(Token::random);
-        Self { server, runtime, secret, process: Arc::default() }
+        Self { server, direct: Arc::default(), runtime, secret, process: Arc::default() }
     }
 
     /// The coordinator's address.
@@ -156,7 +161,8 @@ impl Client {
         self.post(path, &credential.secret, what, SHORT).await.map(drop)
     }
 
-    /// Asks how much of a blob the coordinator has. Shows the receipt of an earlier upload, if there is one.
+    /// Asks how much of a blob the coordinator has, and for a signed request that sends it. Shows the receipt of an earlier
+    /// upload, if there is one.
     pub(crate) async fn staged(
         &self,
         credential: &Credential,
@@ -168,7 +174,16 @@ impl Client {
         if let Some(receipt) = receipt {
             request = request.header(RECEIPT_HEADER, receipt);
         }
+        if self.direct.is_used() {
+            request = request.header(DIRECT_HEADER, "1");
+        }
         answer(self.send(request).await?).await
+    }
+
+    /// Reports that a blob was sent by a signed request.
+    pub(crate) async fn sent(&self, credential: &Credential, digest: Digest) -> Result<BlobStored, CallError> {
+        let request = self.request(reqwest::Method::POST, &format!("/v1/blobs/{digest}/sent"), LONG);
+        answer(self.send(in_the_name_of(request, credential)?).await?).await
     }
 
     /// Sends a part that begins at `offset` of a blob of `bytes` bytes.
@@ -186,8 +201,14 @@ impl Client {
         answer(self.send(request.body(part)).await?).await
     }
 
-    /// Requests a blob from `offset` to its end.
-    pub(crate) async fn get_blob(&self, digest: Digest, offset: u64) -> Result<Download, CallError> {
+    /// Requests a blob from `offset` to its end, from the place of the blobs if the coordinator redirects there.
+    /// `through_server` forbids that.
+    pub(crate) async fn get_blob(
+        &self,
+        digest: Digest,
+        offset: u64,
+        through_server: bool,
+    ) -> Result<Download, CallError> {
         let mut request = self.request(reqwest::Method::GET, &format!("/v1/blobs/{digest}"), LONG);
         if offset > 0 {
             request = request.header("range", format!("bytes={offset}-"));
@@ -195,9 +216,20 @@ impl Client {
         if let Some(process) = &*lock(&self.process) {
             request = request.header(PROCESS_HEADER, header(process)?).header(SECRET_HEADER, self.secret.secret());
         }
-        let response = self.send(request).await?;
+        if !through_server && self.direct.is_used() {
+            request = request.header(DIRECT_HEADER, "1");
+        }
+        let sent = self.server.send(request).await;
+        if let Ok(answer) = &sent
+            && answer.status() == StatusCode::TEMPORARY_REDIRECT
+        {
+            let place = answer.headers().get("location").and_then(|place| place.to_str().ok()).unwrap_or_default();
+            let response = self.direct.get(place, offset).await.map_err(CallError::Away)?;
+            return Ok(Download { response, direct: Some(Arc::clone(&self.direct)) });
+        }
+        let response = check(sent).await?;
         match (offset, response.status()) {
-            (0, _) | (_, StatusCode::PARTIAL_CONTENT) => Ok(Download(response)),
+            (0, _) | (_, StatusCode::PARTIAL_CONTENT) => Ok(Download { response, direct: None }),
             (_, status) => {
                 Err(CallError::Refused(format!("the coordinator answered {status} to a part of blob {digest}")))
             }
@@ -218,17 +250,24 @@ impl Client {
 
 /// A blob that is being downloaded.
 #[derive(Debug)]
-pub(crate) struct Download(Response);
+pub(crate) struct Download {
+    response: Response,
+    /// Present if the bytes come from the place of the blobs.
+    direct: Option<Arc<Direct>>,
+}
 
 impl Download {
-    /// The number of bytes to come, if the coordinator reports it.
+    /// The number of bytes to come, if it is known.
     pub(crate) fn length(&self) -> Option<u64> {
-        self.0.content_length()
+        self.response.content_length()
     }
 
     /// The next bytes; `None` after the last.
     pub(crate) async fn next(&mut self) -> Result<Option<Bytes>, CallError> {
-        self.0.chunk().await.map_err(|e| CallError::Away(explain(&e)))
+        match &self.direct {
+            Some(direct) => direct.next(&mut self.response).await.map_err(CallError::Away),
+            None => self.response.chunk().await.map_err(|error| CallError::Away(explain(&error))),
+        }
     }
 }
 

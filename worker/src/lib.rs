@@ -18,6 +18,7 @@ mod cache;
 mod cli;
 mod client;
 mod context;
+mod direct;
 mod event_count;
 pub mod failpoints;
 mod gang;

@@ -211,7 +211,7 @@ fn go_on(
     news: &mut News,
 ) -> Result<(), Stopped> {
     let offset = arriving.as_ref().map_or(0, Arriving::written);
-    let mut download = unless_news(client, news, client.get_blob(digest, offset))?;
+    let mut download = unless_news(client, news, client.get_blob(digest, offset, false))?;
     let arriving = match arriving {
         Some(arriving) => arriving,
         None => arriving.insert(cache.arriving(digest, download.length())?),

@@ -1,6 +1,7 @@
 //! A worker against a fake coordinator that can be made to misbehave.
 
 mod blobs;
+mod direct;
 mod fake;
 mod prepare;
 

@@ -6,6 +6,7 @@ use std::io::Read;
 
 use checkpoint::BlobError;
 use protocol::Digest;
+use protocol::proof::SignedRequest;
 
 /// A blob in a listing.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -79,6 +80,33 @@ pub trait Backend: Send + Sync + fmt::Debug {
     /// Returns the current problem of the place, as seen in the last calls.
     fn problem(&self) -> Option<Problem> {
         None
+    }
+
+    /// Signs a request that reads a blob from the place. `None` if the place takes no signed requests.
+    fn sign_read(&self, digest: Digest) -> Option<SignedRequest> {
+        let _ = digest;
+        None
+    }
+    /// Signs a request that stores a blob under a name of 64 hexadecimal digits beside the blobs, unless that is taken. The
+    /// place refuses other bytes than those that hash to `digest`. `None` if the place takes no such requests.
+    fn sign_write(&self, name: &str, digest: Digest) -> Option<SignedRequest> {
+        let _ = (name, digest);
+        None
+    }
+    /// Returns true if a signed request has stored a blob under `name`, and the place attests that it hashes to `digest`.
+    fn has_arrived(&self, name: &str, digest: Digest) -> bool {
+        let _ = (name, digest);
+        false
+    }
+    /// Gives a blob that has arrived the name of its digest, without reading it here.
+    fn settle(&self, name: &str, digest: Digest) -> Result<Stat, BlobError> {
+        let _ = name;
+        Err(BlobError::NotFound(digest))
+    }
+    /// Deletes a blob that has arrived, if it exists.
+    fn forget_arrived(&self, name: &str) -> Result<(), BlobError> {
+        let _ = name;
+        Ok(())
     }
 
     /// Opens a staging area under a name of 64 hexadecimal digits and replaces an older one of that name. A backend

@@ -6,11 +6,11 @@ use std::time::Instant;
 
 use checkpoint::BlobError;
 use protocol::digest::Hasher;
+use protocol::limits::SMALL_BLOB_BYTES;
 use protocol::{Digest, Incarnation, TaskId, WorkerId};
 
 use super::backend::Staged;
 use super::holds::Holds;
-use super::seen::SMALL_BYTES;
 
 /// An upload that is hashed as it arrives. Dropping it deletes the bytes.
 #[derive(Debug)]
@@ -39,7 +39,7 @@ impl Upload {
         self.staged.write(bytes)?;
         self.hasher.update(bytes);
         self.written = written;
-        self.content = self.content.take().filter(|_| written <= SMALL_BYTES).map(|mut content| {
+        self.content = self.content.take().filter(|_| written <= SMALL_BLOB_BYTES).map(|mut content| {
             content.extend_from_slice(bytes);
             content
         });

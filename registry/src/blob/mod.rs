@@ -10,6 +10,7 @@
 
 mod backend;
 mod begun;
+mod direct;
 pub mod disk;
 mod disk_error;
 pub mod fs;

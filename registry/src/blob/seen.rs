@@ -5,8 +5,6 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use protocol::Digest;
 
-/// Length limit of blobs whose bytes are cached; manifests are shorter.
-pub(super) const SMALL_BYTES: u64 = 64 << 10;
 /// Limits of the cache. When one is reached, the cache is emptied.
 const BLOBS: usize = 1 << 16;
 const BYTES: usize = 32 << 20;

@@ -88,7 +88,7 @@ impl BlobStore {
     }
 
     /// Returns the backend.
-    pub(crate) fn place(&self) -> Arc<dyn Backend> {
+    pub fn place(&self) -> Arc<dyn Backend> {
         Arc::clone(&self.0.backend)
     }
 
@@ -110,11 +110,11 @@ impl BlobStore {
         &self.0.seen
     }
 
-    fn known(&self) -> MutexGuard<'_, Known> {
+    pub(super) fn known(&self) -> MutexGuard<'_, Known> {
         self.0.known.lock()
     }
 
-    fn removal(&self, digest: Digest) -> &RwLock<()> {
+    pub(super) fn removal(&self, digest: Digest) -> &RwLock<()> {
         let byte = u8::from_str_radix(&digest.hex()[..2], 16).unwrap_or_default();
         &self.0.removals[usize::from(byte)]
     }
@@ -133,7 +133,7 @@ impl BlobStore {
     }
 
     /// Refuses a blob that was found damaged and not written since.
-    fn not_damaged(&self, digest: Digest) -> Result<Stat, BlobError> {
+    pub(super) fn not_damaged(&self, digest: Digest) -> Result<Stat, BlobError> {
         let stat = self.must_stat(digest)?;
         match self.known().finding(digest, &stat.stamp) {
             Some(Finding::Damaged(found)) => {

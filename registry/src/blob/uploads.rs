@@ -45,12 +45,12 @@ pub enum ResumeError {
 }
 
 /// Returns the unique name of an upload's staging file, equal in every process.
-fn name((holder, digest): &(Holder, Digest)) -> String {
+pub(super) fn staged_name((holder, digest): &(Holder, Digest)) -> String {
     let (task, worker, incarnation) = holder;
     Digest::of(format!("{task}\n{worker}\n{incarnation}\n{digest}").as_bytes()).hex()
 }
 
-fn holder(grant: &Grant) -> Holder {
+pub(super) fn holder(grant: &Grant) -> Holder {
     (grant.task.clone(), grant.worker.clone(), grant.incarnation)
 }
 
@@ -105,7 +105,7 @@ impl BlobStore {
         if of_holder >= PER_HOLDER {
             return Err(ResumeError::TooMany(of_holder));
         }
-        match self.backend().stage_as(&name(&place), bytes) {
+        match self.backend().stage_as(&staged_name(&place), bytes) {
             Ok(staged) => {
                 all.insert(place, Begun { upload: None, waits: false, bytes: Some(bytes), touched: Instant::now() });
                 Ok(arriving(Upload::new(staged, bytes)))
@@ -129,7 +129,7 @@ impl BlobStore {
             hasher.update(part);
             written += part.len() as u64;
         };
-        let staged = self.backend().staged_as(&name(place), &mut read)?;
+        let staged = self.backend().staged_as(&staged_name(place), &mut read)?;
         let mut all = lock(&self.uploads().begun);
         // Another request may already be writing to it.
         if all.get(place).is_none_or(|begun| begun.waits) {
@@ -145,7 +145,7 @@ impl BlobStore {
     /// Deletes an upload and its bytes.
     fn discard(&self, all: &mut HashMap<(Holder, Digest), Begun>, place: &(Holder, Digest)) {
         all.remove(place);
-        if let Err(error) = self.backend().unstage(&name(place)) {
+        if let Err(error) = self.backend().unstage(&staged_name(place)) {
             tracing::warn!(%error, "cannot delete the staged bytes of an upload");
         }
     }
@@ -192,7 +192,7 @@ impl BlobStore {
             return released;
         }
         // No request has asked for the other uploads of an earlier process.
-        let known: BTreeSet<String> = all.keys().map(name).collect();
+        let known: BTreeSet<String> = all.keys().map(staged_name).collect();
         if let Err(error) = self.backend().unstage_but(&known) {
             tracing::warn!(%error, "cannot delete the staged bytes of old uploads");
         }

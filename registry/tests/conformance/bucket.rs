@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use checkpoint::{BlobError, Blobs};
 use cluster_tests::bucket::{Bucket, KEY, NAME, SECRET};
-use object_store::aws::{AmazonS3Builder, S3ConditionalPut};
+use object_store::aws::{AmazonS3, AmazonS3Builder, S3ConditionalPut};
 use object_store::{BackoffConfig, RetryConfig};
 use protocol::Digest;
 use registry::blob::objects::{Bucket as AnyBucket, Objects, Remote};
@@ -13,15 +13,22 @@ use registry::blob::{Backend, BlobStore};
 
 use super::{common, objects};
 
+#[path = "signed.rs"]
+mod signed;
+
 /// A client like that of `Remote::connect`, except for its credentials and a retry time of one second.
 fn client(bucket: &Bucket, name: &str, secret: &str) -> Arc<dyn AnyBucket> {
+    Arc::new(s3(bucket, name, secret))
+}
+
+fn s3(bucket: &Bucket, name: &str, secret: &str) -> AmazonS3 {
     let _ = rustls::crypto::ring::default_provider().install_default();
     let backoff = BackoffConfig { max_backoff: Duration::from_millis(200), ..BackoffConfig::default() };
     let retry = RetryConfig { backoff, max_retries: 4, retry_timeout: Duration::from_secs(1) };
     let builder = AmazonS3Builder::new().with_endpoint(bucket.endpoint()).with_allow_http(true);
     let builder = builder.with_region("us-east-1").with_bucket_name(name);
     let builder = builder.with_access_key_id(KEY).with_secret_access_key(secret);
-    Arc::new(builder.with_conditional_put(S3ConditionalPut::ETagMatch).with_retry(retry).build().unwrap())
+    builder.with_conditional_put(S3ConditionalPut::ETagMatch).with_retry(retry).build().unwrap()
 }
 
 /// Opens the blobs at a prefix through a client, with a separate store folder.

@@ -16,6 +16,9 @@ pub const BATCH_ENTRIES: usize = 10_000;
 pub const SUBMISSION_BYTES: usize = 8 << 20;
 /// Largest size of a blob, in bytes. Earlier builds stored a file as one blob.
 pub const BLOB_BYTES: usize = 8 << 30;
+/// Largest size in bytes of a small blob. It is sent in one call, passes through the server even where others pass it by,
+/// and may be cached as a whole.
+pub const SMALL_BLOB_BYTES: u64 = 64 << 10;
 /// Size in bytes of the blobs of a file, except its last one. It is part of the digest of an artifact with a longer
 /// file, so a change of it changes what a stage gives.
 pub const CHUNK_BYTES: u64 = 1 << 30;

@@ -13,6 +13,7 @@
 //! computes them again from a key of its own.
 
 use std::collections::BTreeMap;
+use std::fmt;
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -25,6 +26,8 @@ pub const SECRET_HEADER: &str = "x-stride-secret";
 pub const GRANT_HEADER: &str = "x-stride-grant";
 /// Header with the receipt of an earlier upload of the same blob.
 pub const RECEIPT_HEADER: &str = "x-stride-receipt";
+/// Header of a caller that follows a redirect to the place of the blobs. Its value is ignored.
+pub const DIRECT_HEADER: &str = "x-stride-direct";
 /// Header with the [`Process`] that reads a blob, as JSON.
 pub const PROCESS_HEADER: &str = "x-stride-process";
 
@@ -48,7 +51,25 @@ pub struct Vouched<T> {
     pub receipts: BTreeMap<Digest, String>,
 }
 
-/// Answer to `PUT /v1/blobs/{digest}` and `GET /v1/blobs/{digest}/staged`.
+/// A request to the place of the blobs, signed by the server. It needs no credentials until its signature expires.
+#[derive(Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+pub struct SignedRequest {
+    /// Address with the signature.
+    pub url: String,
+    /// Headers that are part of the signature and must be sent as they are.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub headers: BTreeMap<String, String>,
+}
+
+/// Without the signature.
+impl fmt::Debug for SignedRequest {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let place = self.url.split('?').next().unwrap_or_default();
+        f.debug_struct("SignedRequest").field("place", &place).finish_non_exhaustive()
+    }
+}
+
+/// Answer to `PUT /v1/blobs/{digest}`, `GET /v1/blobs/{digest}/staged` and `POST /v1/blobs/{digest}/sent`.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct BlobStored {
     /// Name of the blob.
@@ -60,4 +81,7 @@ pub struct BlobStored {
     /// Proves that this process uploaded the blob for this task. `None` until it is stored, and for a blob of the task's inputs.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub receipt: Option<String>,
+    /// A request that stores the whole blob. Only if the caller asks by [`DIRECT_HEADER`] and no byte has arrived.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub direct: Option<SignedRequest>,
 }

@@ -8,14 +8,14 @@ use std::time::{Duration, Instant};
 use axum::Router;
 use axum::body::Bytes;
 use axum::extract::{DefaultBodyLimit, Json, Path, State};
-use axum::http::{HeaderMap, StatusCode};
+use axum::http::{HeaderMap, Method, StatusCode};
 use axum::response::{IntoResponse, Response};
-use axum::routing::{get, post, put};
+use axum::routing::{any, get, post, put};
 use protocol::message::{
     ApiError, Assignment, CommitCheckpoint, DesiredAssignments, Grant, Join, Joined, LogBatch, MetricBatch,
     PROTOCOL_VERSION, Poll, Prepare, ReportOutcome, TaskOutcome,
 };
-use protocol::proof::{GRANT_HEADER, PROCESS_HEADER, SECRET_HEADER, SHORTEST_SECRET};
+use protocol::proof::{DIRECT_HEADER, GRANT_HEADER, PROCESS_HEADER, SECRET_HEADER, SHORTEST_SECRET};
 use protocol::{Digest, Incarnation};
 
 use crate::event_count::lock;
@@ -46,6 +46,8 @@ pub(super) struct FakeState {
     pub(super) last_poll: Option<Poll>,
     pub(super) blobs: HashMap<Digest, Vec<u8>>,
     pub(super) staged: HashMap<Digest, Vec<u8>>,
+    /// Blobs that signed requests have stored.
+    pub(super) arrived: HashMap<Digest, Vec<u8>>,
     pub(super) metrics: Metrics,
     /// Places of values that are not finite.
     pub(super) odd: BTreeSet<(u64, String)>,
@@ -96,6 +98,14 @@ pub(super) struct Fake {
     pub(super) lose_at: AtomicU64,
     /// All blobs are damaged in the store.
     pub(super) rotten: AtomicBool,
+    /// Offers signed requests to its own place of blobs.
+    pub(super) offers_place: AtomicBool,
+    /// The place answers 403 to all requests.
+    pub(super) place_refuses: AtomicBool,
+    /// The place stores and sends a flipped bit.
+    pub(super) place_damages: AtomicBool,
+    /// Requests that the place has answered.
+    pub(super) placed: AtomicU64,
     /// Bytes of transferred blobs, or the number of requests for damaged ones.
     pub(super) received: AtomicU64,
 }
@@ -123,6 +133,13 @@ impl Fake {
             *lock(&self.refused_at) = Some(Instant::now());
             ([("retry-after", BUSY_S.to_string())], refuse(StatusCode::TOO_MANY_REQUESTS, "busy")).into_response()
         })
+    }
+
+    /// Address of a blob at the place of the blobs, for a worker that asks for it.
+    fn place(&self, digest: Digest, headers: &HeaderMap) -> Option<String> {
+        let host = headers["host"].to_str().expect("a host");
+        let asks = headers.contains_key(DIRECT_HEADER) && self.offers_place.load(Ordering::SeqCst);
+        asks.then(|| format!("http://{host}/place/{digest}"))
     }
 
     pub(super) fn desired(&self, change: impl FnOnce(&mut FakeState)) {
@@ -296,11 +313,51 @@ async fn put_blob(
     }
 }
 
-async fn staged(State(fake): State<Arc<Fake>>, Path(digest): Path<Digest>) -> Response {
+async fn staged(State(fake): State<Arc<Fake>>, Path(digest): Path<Digest>, headers: HeaderMap) -> Response {
     let coordinator = lock(&fake.coordinator);
     let stored = coordinator.blobs.contains_key(&digest);
     let staged = coordinator.staged.get(&digest).map_or(0, Vec::len);
-    Json(serde_json::json!({ "digest": digest, "stored": stored, "staged": staged })).into_response()
+    let mut answer = serde_json::json!({ "digest": digest, "stored": stored, "staged": staged });
+    if let Some(url) = fake.place(digest, &headers).filter(|_| !stored && staged == 0) {
+        answer["direct"] = serde_json::json!({ "url": url, "headers": { "x-signed": digest } });
+    }
+    Json(answer).into_response()
+}
+
+/// A signed request to the place of the blobs. It carries no token and no secret.
+async fn place(
+    State(fake): State<Arc<Fake>>,
+    method: Method,
+    Path(digest): Path<Digest>,
+    headers: HeaderMap,
+    body: Bytes,
+) -> Response {
+    assert!(!headers.contains_key("authorization") && !headers.contains_key(SECRET_HEADER), "{headers:?}");
+    if fake.place_refuses.load(Ordering::SeqCst) {
+        return StatusCode::FORBIDDEN.into_response();
+    }
+    fake.placed.fetch_add(1, Ordering::SeqCst);
+    let damages = fake.place_damages.load(Ordering::SeqCst);
+    let mut coordinator = lock(&fake.coordinator);
+    if method == Method::PUT {
+        assert_eq!(headers["x-signed"], digest.to_string());
+        let mut bytes = body.to_vec();
+        bytes[0] ^= u8::from(damages);
+        coordinator.arrived.insert(digest, bytes);
+        return StatusCode::OK.into_response();
+    }
+    let mut bytes = coordinator.blobs[&digest].clone();
+    bytes[0] ^= u8::from(damages);
+    bytes.into_response()
+}
+
+/// Takes over a blob from its place if its bytes are right.
+async fn sent(State(fake): State<Arc<Fake>>, Path(digest): Path<Digest>) -> Response {
+    let mut coordinator = lock(&fake.coordinator);
+    let arrived = coordinator.arrived.remove(&digest).filter(|bytes| Digest::of(bytes) == digest);
+    let stored = arrived.is_some();
+    coordinator.blobs.extend(arrived.map(|bytes| (digest, bytes)));
+    Json(serde_json::json!({ "digest": digest, "stored": stored, "staged": 0 })).into_response()
 }
 
 /// Sends a blob from byte N on. An answer that is to be cut breaks off in the middle.
@@ -312,6 +369,9 @@ async fn get_blob(State(fake): State<Arc<Fake>>, Path(digest): Path<Digest>, hea
     if fake.rotten.load(Ordering::SeqCst) {
         fake.received.fetch_add(1, Ordering::SeqCst);
         return refuse(StatusCode::CONFLICT, "damaged");
+    }
+    if let Some(url) = fake.place(digest, &headers) {
+        return (StatusCode::TEMPORARY_REDIRECT, [("location", url)]).into_response();
     }
     lock(&fake.coordinator).fetched.push(digest);
     if fake.stuck.load(Ordering::SeqCst) {
@@ -351,6 +411,8 @@ pub(super) fn router(fake: Arc<Fake>) -> Router {
         .route("/v1/outcomes", post(outcome))
         .route("/v1/blobs/{digest}", put(put_blob).get(get_blob))
         .route("/v1/blobs/{digest}/staged", get(staged))
+        .route("/v1/blobs/{digest}/sent", post(sent))
+        .route("/place/{digest}", any(place))
         .layer(DefaultBodyLimit::disable())
         .with_state(fake)
 }

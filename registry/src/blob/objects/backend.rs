@@ -7,9 +7,11 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use checkpoint::BlobError;
+use fail::fail_point;
 use futures::TryStreamExt as _;
 use object_store::{Error, ObjectStoreExt as _, PutMode, PutOptions};
 use protocol::Digest;
+use protocol::proof::SignedRequest;
 use tokio::sync::Semaphore;
 
 use super::multipart::{Multipart, PART_BYTES};
@@ -150,11 +152,46 @@ impl Backend for Objects {
     }
 
     fn unfinished(&self) -> Result<Vec<String>, BlobError> {
-        self.0.multipart.unfinished()
+        let mut found = self.0.multipart.unfinished()?;
+        found.extend(
+            self.0.abandoned()?.iter().map(|path| format!("`{}` was sent and never used", self.0.remote.shown(path))),
+        );
+        Ok(found)
     }
 
     fn give_up_unfinished(&self) -> Result<u64, BlobError> {
-        self.0.multipart.give_up()
+        let abandoned = self.0.abandoned()?;
+        for path in &abandoned {
+            self.0.remote.forget(path)?;
+        }
+        Ok(self.0.multipart.give_up()? + abandoned.len() as u64)
+    }
+
+    fn sign_read(&self, digest: Digest) -> Option<SignedRequest> {
+        self.0.remote.sign_read(&self.0.remote.blob(digest))
+    }
+
+    fn sign_write(&self, name: &str, digest: Digest) -> Option<SignedRequest> {
+        let remote = &self.0.remote;
+        if remote.takes_signed_puts() { remote.sign_write(&remote.arriving(name), digest) } else { None }
+    }
+
+    fn has_arrived(&self, name: &str, digest: Digest) -> bool {
+        self.0.remote.attests(&self.0.remote.arriving(name), digest)
+    }
+
+    fn settle(&self, name: &str, digest: Digest) -> Result<Stat, BlobError> {
+        let store = self.0.store();
+        let (from, to) = (self.0.remote.arriving(name), self.0.remote.blob(digest));
+        let path = to.clone();
+        let copied = self.0.remote.wait_long(async move { store.copy(&from, &to).await });
+        copied.map_err(|e| self.0.remote.error("copy a sent blob to", &path, &e))?;
+        fail_point!("blob::after_rename");
+        self.touch(digest)
+    }
+
+    fn forget_arrived(&self, name: &str) -> Result<(), BlobError> {
+        self.0.remote.forget(&self.0.remote.arriving(name))
     }
 
     fn problem(&self) -> Option<Problem> {

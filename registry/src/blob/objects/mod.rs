@@ -5,6 +5,8 @@
 //! PREFIX/sha256/ab/cdef...  a blob
 //! PREFIX/quarantine/...     damaged blobs that were put aside
 //! PREFIX/uploads/...        uploads in parts that have not ended
+//! PREFIX/arriving/...       blobs that workers have sent by signed requests and that have no name yet
+//! PREFIX/SIGNED             a line that shows whether the server checks what a signed request stores
 //! ```
 //!
 //! The store's folder keeps the database, the lock and arriving blobs. A blob is sent when all of it has arrived and
@@ -18,6 +20,7 @@ mod multipart;
 mod ranges;
 mod remote;
 mod requests;
+mod signed;
 mod staged;
 
 pub use self::backend::Objects;

@@ -1,8 +1,8 @@
 //! Requests to an object store, and the messages when they fail.
 
 use std::fmt;
-use std::sync::Arc;
 use std::sync::mpsc;
+use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
 use checkpoint::BlobError;
@@ -11,7 +11,8 @@ use object_store::azure::{AzureConfigKey, MicrosoftAzureBuilder};
 use object_store::gcp::{GoogleCloudStorageBuilder, GoogleConfigKey};
 use object_store::multipart::MultipartStore;
 use object_store::path::Path;
-use object_store::{BackoffConfig, ClientConfigKey, Error, ObjectStore, RetryConfig};
+use object_store::signer::Signer;
+use object_store::{BackoffConfig, ClientConfigKey, Error, ObjectStore, ObjectStoreExt as _, RetryConfig};
 use protocol::Digest;
 use tokio::runtime::Runtime;
 
@@ -94,11 +95,15 @@ impl<S: ObjectStore + MultipartStore> Bucket for S {}
 
 /// A prefix in a bucket, with its own runtime for requests, so that calls may block in any thread.
 pub struct Remote {
-    url: String,
+    pub(super) url: String,
     kind: &'static Kind,
     bucket: String,
     prefix: String,
     pub(super) store: Arc<dyn Bucket>,
+    /// Signs requests of workers.
+    pub(super) signer: Option<Arc<dyn Signer>>,
+    /// Answer of the server to a first signed put; `None` before it.
+    pub(super) takes_puts: OnceLock<bool>,
     health: Health,
     /// `None` only while it is dropped.
     runtime: Option<Runtime>,
@@ -135,8 +140,9 @@ impl Remote {
         };
         let connect = ClientConfigKey::ConnectTimeout;
         let request = ClientConfigKey::Timeout;
-        let store: Arc<dyn Bucket> = match kind.scheme {
-            "s3" => Arc::new(
+        match kind.scheme {
+            "s3" => Self::signing(
+                url,
                 AmazonS3Builder::from_env()
                     .with_bucket_name(bucket)
                     .with_conditional_put(S3ConditionalPut::ETagMatch)
@@ -146,7 +152,8 @@ impl Remote {
                     .build()
                     .map_err(|e| wrong(&e))?,
             ),
-            "gs" => Arc::new(
+            "gs" => Self::signing(
+                url,
                 GoogleCloudStorageBuilder::from_env()
                     .with_bucket_name(bucket)
                     .with_config(GoogleConfigKey::Client(connect), CONNECT)
@@ -155,7 +162,8 @@ impl Remote {
                     .build()
                     .map_err(|e| wrong(&e))?,
             ),
-            _ => Arc::new(
+            _ => Self::signing(
+                url,
                 MicrosoftAzureBuilder::from_env()
                     .with_container_name(bucket)
                     .with_config(AzureConfigKey::Client(connect), CONNECT)
@@ -164,8 +172,15 @@ impl Remote {
                     .build()
                     .map_err(|e| wrong(&e))?,
             ),
-        };
-        Self::over(url, store)
+        }
+    }
+
+    /// Makes the place that `url` names, over an object store that signs requests.
+    pub fn signing(url: &str, store: impl Bucket + Signer) -> Result<Self, BlobError> {
+        let store = Arc::new(store);
+        let mut remote = Self::over(url, Arc::clone(&store) as Arc<dyn Bucket>)?;
+        remote.signer = Some(store);
+        Ok(remote)
     }
 
     /// Makes the place that `url` names, over any object store.
@@ -185,6 +200,8 @@ impl Remote {
             bucket: bucket.to_owned(),
             prefix: prefix.to_owned(),
             store,
+            signer: None,
+            takes_puts: OnceLock::new(),
             health: Health::default(),
             runtime: Some(runtime),
         })
@@ -198,6 +215,21 @@ impl Remote {
     pub(super) fn blob(&self, digest: Digest) -> Path {
         let hex = digest.hex();
         self.path(&format!("sha256/{}/{}", &hex[..2], &hex[2..]))
+    }
+
+    /// Returns the path of a blob that a signed request stores.
+    pub(super) fn arriving(&self, name: &str) -> Path {
+        self.path(&format!("arriving/{name}"))
+    }
+
+    /// Deletes an object, if it exists.
+    pub(super) fn forget(&self, path: &Path) -> Result<(), BlobError> {
+        let store = Arc::clone(&self.store);
+        let wanted = path.clone();
+        match self.wait(async move { store.delete(&wanted).await }) {
+            Ok(()) | Err(Error::NotFound { .. }) => Ok(()),
+            Err(e) => Err(self.error("remove", path, &e)),
+        }
     }
 
     /// Returns the digest in an object's name, if the object is a blob.
@@ -244,7 +276,13 @@ impl Remote {
         ended
     }
 
-    fn run<T: Send + 'static>(
+    /// Returns true for buckets of the S3 protocol.
+    pub(super) fn is_s3(&self) -> bool {
+        self.kind.scheme == "s3"
+    }
+
+    /// Runs a request that says nothing about the health of the store, and blocks until it ends.
+    pub(super) fn run<T: Send + 'static>(
         &self,
         request: impl Future<Output = Result<T, Error>> + Send + 'static,
     ) -> Result<T, Error> {

@@ -20,6 +20,9 @@ use crate::clock;
 /// Number of parts under way at once, over all blobs, or as many bytes of small ones. Bounds the memory for sending.
 pub(super) const PARTS: usize = 4;
 
+/// Time after which a blob that a worker has sent is no longer expected to be used.
+const ABANDONED_MS: i64 = 24 * 3600 * 1000;
+
 #[derive(Debug)]
 pub(super) struct Inner {
     pub(super) remote: Arc<Remote>,
@@ -71,6 +74,13 @@ impl Inner {
         let wanted = path.clone();
         let listed = self.remote.wait(async move { store.list(Some(&wanted)).try_collect().await });
         listed.map_err(|e| self.remote.error("list", &path, &e))
+    }
+
+    /// Lists the blobs that were sent by a signed request and not used within [`ABANDONED_MS`].
+    pub(super) fn abandoned(&self) -> Result<Vec<Path>, BlobError> {
+        let before = clock::now_ms() - ABANDONED_MS;
+        let sent = self.list("arriving")?.into_iter();
+        Ok(sent.filter(|meta| meta.last_modified.timestamp_millis() < before).map(|meta| meta.location).collect())
     }
 
     /// Sends `bytes` bytes, in one request if they are few. Returns `false` if the name was taken.

@@ -17,7 +17,9 @@ use protocol::message::{
     self, CommitCheckpoint, DesiredAssignments, Gone, Join, Joined, Listing, LogBatch, MetricBatch, Poll,
     ReportOutcome, RunSummary, RunView,
 };
-use protocol::proof::{BlobStored, GRANT_HEADER, PROCESS_HEADER, RECEIPT_HEADER, SECRET_HEADER, Vouched};
+use protocol::proof::{
+    BlobStored, DIRECT_HEADER, GRANT_HEADER, PROCESS_HEADER, RECEIPT_HEADER, SECRET_HEADER, Vouched,
+};
 use registry::cli::{Answer, Command};
 use registry::{HistoryRow, LogRow};
 
@@ -71,15 +73,18 @@ type Headers = &'static [(&'static str, bool, &'static str)];
 
 const PROCESS: Headers = &[(SECRET_HEADER, true, "Secret of the worker's process")];
 const GRANT: Headers = &[(SECRET_HEADER, true, "Secret of the grant")];
+const GRANTED: Headers = &[(SECRET_HEADER, true, "Secret of the grant"), (GRANT_HEADER, true, "The grant as JSON")];
 const UPLOAD: Headers = &[
     (SECRET_HEADER, true, "Secret of the grant"),
     (GRANT_HEADER, true, "The grant as JSON"),
     (RECEIPT_HEADER, false, "Receipt of an earlier upload"),
+    (DIRECT_HEADER, false, "Asks for a signed request that stores the blob"),
 ];
 const DOWNLOAD: Headers = &[
     ("range", false, "The first byte: `bytes=N-`"),
     (PROCESS_HEADER, false, "The worker's process as JSON"),
     (SECRET_HEADER, false, "Secret of the worker's process"),
+    (DIRECT_HEADER, false, "The caller follows a redirect (307) to the place of the blobs"),
 ];
 const SUBMISSION: Headers =
     &[(queries::IDEMPOTENCY_KEY, false, "A submission that is sent twice with one key makes one run")];
@@ -113,6 +118,8 @@ fn table() -> Vec<Entry> {
             described::<Nothing, Bytes, Json<BlobStored>>("Uploads a blob, or a part of one").with(UPLOAD)),
         entry("GET",  "/v1/blobs/{digest}/staged", &[Worker],       CALL,                     LONG,  uploads::staged,
             described::<Nothing, Nothing, Json<BlobStored>>("Tells how much of a blob has arrived").with(UPLOAD)),
+        entry("POST", "/v1/blobs/{digest}/sent",   &[Worker],       CALL,                     LONG,  uploads::sent,
+            described::<Nothing, Nothing, Json<BlobStored>>("Takes over a blob that a signed request has stored").with(GRANTED)),
         entry("GET",  "/v1/blobs/{digest}",        &[Read, Worker], CALL,                     LONG,  uploads::get_blob,
             described::<Nothing, Nothing, Bytes>("Downloads a blob, or its rest").with(DOWNLOAD)),
         entry("GET",  "/v1/demand",                &[Launch],       CALL,                     SHORT, demand::demand,

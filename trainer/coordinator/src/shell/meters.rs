@@ -6,6 +6,7 @@ use axum::http::StatusCode;
 use prometheus_client::metrics::counter::Counter;
 use prometheus_client::metrics::family::Family;
 use prometheus_client::metrics::histogram::{Histogram, exponential_buckets};
+use protocol::limits::SMALL_BLOB_BYTES;
 
 pub(super) type Labels = Vec<(&'static str, String)>;
 
@@ -17,6 +18,7 @@ pub(crate) struct Meters {
     pub(super) values: Counter,
     pub(super) lines: Counter,
     pub(super) messages: Family<Labels, Counter>,
+    pub(super) blob_bytes: Family<Labels, Counter>,
 }
 
 impl Default for Meters {
@@ -28,6 +30,7 @@ impl Default for Meters {
             values: Counter::default(),
             lines: Counter::default(),
             messages: Family::default(),
+            blob_bytes: Family::default(),
         }
     }
 }
@@ -50,6 +53,13 @@ impl Meters {
     /// Counts a try to deliver a message to a webhook, by its result.
     pub(crate) fn sent(&self, result: &str) {
         self.messages.get_or_create(&vec![("result", result.to_owned())]).inc();
+    }
+
+    /// Counts `bytes` bytes of a blob of `whole` bytes that this server receives (`in`) or sends (`out`).
+    pub(crate) fn carried(&self, direction: &str, whole: u64, bytes: u64) {
+        let size = if whole > SMALL_BLOB_BYTES { "large" } else { "small" };
+        let labels = vec![("direction", direction.to_owned()), ("size", size.to_owned())];
+        self.blob_bytes.get_or_create(&labels).inc_by(bytes);
     }
 
     pub(crate) fn recorded(&self, values: usize, lines: usize) {

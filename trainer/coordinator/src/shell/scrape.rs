@@ -61,6 +61,8 @@ fn registry(actor_handle: &ActorHandle) -> Registry {
     registry.register_with_unit("commit", help, Unit::Seconds, meters.commits.clone());
     registry.register("values", "Values that workers have recorded", meters.values.clone());
     registry.register("lines", "Log lines that workers have written", meters.lines.clone());
+    let help = "Bytes of blobs that pass through the server";
+    registry.register_with_unit("blob", help, Unit::Bytes, meters.blob_bytes.clone());
     registry.register("messages", "Messages to webhooks by result", meters.messages.clone());
 
     let runs = Family::<Labels, Gauge>::default();

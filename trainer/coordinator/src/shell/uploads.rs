@@ -14,7 +14,7 @@ use axum::response::Response;
 use checkpoint::BlobError;
 use futures::{StreamExt as _, stream};
 use protocol::message::{CommitCheckpoint, Grant, LogBatch, MetricBatch, ReportOutcome, TaskOutcome};
-use protocol::proof::{BlobStored, RECEIPT_HEADER, Vouched};
+use protocol::proof::{BlobStored, DIRECT_HEADER, RECEIPT_HEADER, SignedRequest, Vouched};
 use protocol::{Digest, RunId, limits};
 use registry::blob::{Arriving, PART_BYTES, ResumeError};
 use registry::{Store, Write, WriteError};
@@ -189,6 +189,7 @@ pub(crate) async fn staged(
     let blobs = actor_handle.store.blobs().clone();
     let reach = Arc::clone(&actor_handle.reach);
     let has_receipt = receipt.is_some();
+    let asks_direct = headers.contains_key(DIRECT_HEADER);
     let store = &actor_handle.store;
     let looked = blobs.clone();
     // The existence of other blobs is not revealed: the worker either has their bytes or has no use for them.
@@ -199,9 +200,33 @@ pub(crate) async fn staged(
     let looked = ask(store, move || -> Result<_, Failure> {
         let stored = is_known && blobs.reuse(digest)?;
         let receipt = receipt.filter(|_| stored);
-        Ok(Json(BlobStored { digest, stored, staged: blobs.staged(&grant, digest)?, receipt }))
+        let staged = blobs.staged(&grant, digest)?;
+        let direct = if asks_direct && !stored && staged == 0 { blobs.sign_write(&grant, digest) } else { None };
+        Ok(Json(BlobStored { digest, stored, staged, receipt, direct }))
     });
     looked.await
+}
+
+/// Stores a blob that a worker has sent by a signed request, and returns its receipt. The place of the blobs attests the
+/// bytes; the worker's word decides nothing.
+pub(crate) async fn sent(
+    State(actor_handle): State<Arc<ActorHandle>>,
+    Path(digest): Path<String>,
+    proof: Proof,
+    headers: HeaderMap,
+) -> Result<Json<BlobStored>, Failure> {
+    let grant = granted(&actor_handle, &proof, &headers)?;
+    let digest = named(&digest)?;
+    let store = &actor_handle.store;
+    let receipt = actor_handle.secrets.receipt(&proof.caller.name, &grant, digest);
+    let (blobs, asked) = (store.blobs().clone(), grant.clone());
+    let stored = ask(store, move || Ok::<_, BlobError>(blobs.has_arrived(&asked, digest))).await?;
+    if stored {
+        store.hold(&grant.task, digest).await?;
+        let blobs = store.blobs().clone();
+        ask(store, move || blobs.take_over(&grant, digest)).await?;
+    }
+    Ok(Json(BlobStored { digest, stored, staged: 0, receipt: stored.then_some(receipt), direct: None }))
 }
 
 /// Stores a blob, or the next part of one, while it arrives.
@@ -234,11 +259,12 @@ pub(crate) async fn put_blob(
         let arriving = ask(store, move || blobs.take_up(&grant, digest, offset, bytes)).await?;
         let arriving = receive(store, arriving, body).await?;
         let staged = arriving.written();
+        actor_handle.meters.carried("in", bytes, staged.saturating_sub(offset));
         if arriving.is_complete() {
             store.hold(&task, digest).await.map_err(unheld)?;
         }
         let stored = ask(store, move || arriving.finish()).await.map_err(ResumeError::Blob)?;
-        Ok(Json(BlobStored { digest, stored, staged, receipt: stored.then_some(receipt) }))
+        Ok(Json(BlobStored { digest, stored, staged, receipt: stored.then_some(receipt), direct: None }))
     };
     stored.await.map_err(|error: Unstored| {
         if let Unstored::Resume(ResumeError::Blob(BlobError::Storage(message))) = &error {
@@ -327,7 +353,7 @@ impl From<Unstored> for Failure {
 }
 
 /// Sends a blob, or the rest of one from `range: bytes=N-`. The last bytes of a damaged blob are never sent; the answer
-/// is aborted.
+/// is aborted. A caller that follows a redirect reads from the place of the blobs, and verifies the bytes itself.
 pub(crate) async fn get_blob(
     State(actor_handle): State<Arc<ActorHandle>>,
     Path(digest): Path<String>,
@@ -338,6 +364,12 @@ pub(crate) async fn get_blob(
     let from = from(&headers)?;
     if !proof.caller.scopes.allow(Scope::Read) {
         check_read(&actor_handle, &proof, &headers, digest).await?;
+    }
+    if headers.contains_key(DIRECT_HEADER) {
+        let blobs = actor_handle.store.blobs().clone();
+        if let Some(signed) = ask(&actor_handle.store, move || blobs.sign_read(digest)).await? {
+            return redirect(signed);
+        }
     }
     let blobs = actor_handle.store.blobs().clone();
     let opened = ask(&actor_handle.store, move || -> Result<_, Failure> {
@@ -358,6 +390,7 @@ pub(crate) async fn get_blob(
     let (first, reader) = opened.await?;
     let bytes = reader.bytes();
     let length = bytes - from.unwrap_or_default();
+    actor_handle.meters.carried("out", bytes, length);
     let rest = stream::try_unfold((reader, actor_handle.store.clone()), |(mut reader, store)| async {
         let (part, reader) = ask(&store, move || Ok::<_, BlobError>((reader.next_part()?, reader))).await?;
         Ok::<_, BlobError>(part.map(|part| (part, (reader, store))))
@@ -374,6 +407,15 @@ pub(crate) async fn get_blob(
         }
         *response.status_mut() = StatusCode::PARTIAL_CONTENT;
     }
+    Ok(response)
+}
+
+fn redirect(signed: SignedRequest) -> Result<Response, Failure> {
+    let mut response = Response::new(Body::empty());
+    *response.status_mut() = StatusCode::TEMPORARY_REDIRECT;
+    let unfit = |_| Failure::invalid("the place of the blobs has an address that fits into no header".to_owned());
+    response.headers_mut().insert(header::LOCATION, HeaderValue::try_from(signed.url).map_err(unfit)?);
+    response.headers_mut().insert(header::CACHE_CONTROL, HeaderValue::from_static("no-store"));
     Ok(response)
 }
 

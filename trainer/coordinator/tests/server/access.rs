@@ -70,6 +70,7 @@ fn expected(method: &str, path: &str) -> &'static [Scope] {
         ("POST", "/v1/metrics" | "/v1/logs" | "/v1/checkpoints" | "/v1/outcomes") => &[Worker],
         ("GET", "/v1/blobs/{digest}") => &[Read, Worker],
         ("PUT", "/v1/blobs/{digest}") | ("GET", "/v1/blobs/{digest}/staged") => &[Worker],
+        ("POST", "/v1/blobs/{digest}/sent") => &[Worker],
         ("GET", "/v1/demand") => &[Launch],
         ("POST", "/v1/registry") => &[Read, Promote, Admin],
         other => panic!("{other:?} is not in this table: say who may call it"),

@@ -164,7 +164,8 @@ fn cases(lab: &Lab, kind: &Kind, method: &'static str, path: &'static str) -> Op
         ("POST", "/v1/workers" | "/v1/workers/{worker}/poll" | "/v1/workers/{worker}/gone")
         | ("POST", "/v1/metrics" | "/v1/logs" | "/v1/checkpoints" | "/v1/outcomes")
         | ("PUT", "/v1/blobs/{digest}")
-        | ("GET", "/v1/blobs/{digest}/staged") => return None,
+        | ("GET", "/v1/blobs/{digest}/staged")
+        | ("POST", "/v1/blobs/{digest}/sent") => return None,
         other => panic!("{other:?} is in the table of calls and has no rule here: say whose objects it names"),
     }
     Some(cases)

@@ -86,7 +86,7 @@ impl Known {
         let incarnation = Incarnation(random.below(6) as u64);
         let post = |path: &str| server.request(Method::POST, path).header(SECRET_HEADER, &secret);
         let header = serde_json::to_string(&grant).unwrap();
-        match random.below(10) {
+        match random.below(11) {
             0 => post("/v1/workers").json(&join_of(&name)),
             1 => {
                 let progress = Progress { done: 99, total: 99, unit: "fuzz".into(), ..Progress::default() };
@@ -117,6 +117,10 @@ impl Known {
             }
             8 => {
                 let request = server.request(Method::GET, &format!("/v1/blobs/{digest}/staged"));
+                request.header(GRANT_HEADER, header).header(SECRET_HEADER, secret)
+            }
+            9 => {
+                let request = server.request(Method::POST, &format!("/v1/blobs/{digest}/sent"));
                 request.header(GRANT_HEADER, header).header(SECRET_HEADER, secret)
             }
             _ => {

@@ -69,9 +69,10 @@ fn request(server: &Server, method: &str, path: &str, object: &Object, actor: &A
             let grant = serde_json::to_string(&grant).unwrap();
             ask(Method::PUT).header(GRANT_HEADER, grant).header(SECRET_HEADER, own).body("matrix")
         }
-        ("GET", path) if path.ends_with("/staged") => {
+        ("GET" | "POST", path) if path.ends_with("/staged") || path.ends_with("/sent") => {
             let grant = serde_json::to_string(&grant).unwrap();
-            ask(Method::GET).header(GRANT_HEADER, grant).header(SECRET_HEADER, own)
+            let method = if method == "GET" { Method::GET } else { Method::POST };
+            ask(method).header(GRANT_HEADER, grant).header(SECRET_HEADER, own)
         }
         ("GET", path) if path.starts_with("/v1/blobs/") => {
             let header = serde_json::to_string(&object.worker.process).unwrap();

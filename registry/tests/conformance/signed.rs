@@ -1,0 +1,157 @@
+//! Requests that are signed for workers, on a server that checks signatures.
+
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::time::SystemTime;
+
+use object_store::path::Path;
+use object_store::signer::{Method, Signer as _};
+use protocol::proof::SignedRequest;
+use tokio::runtime::Runtime;
+
+use super::*;
+
+/// The blobs of a store whose server signs requests, and a worker without credentials.
+struct Site {
+    bucket: Bucket,
+    store: BlobStore,
+    _dir: tempfile::TempDir,
+    http: Runtime,
+}
+
+/// The status and the body of an answer.
+type Answer = (u16, Vec<u8>);
+
+impl Site {
+    fn start() -> Self {
+        let bucket = Bucket::start();
+        let dir = tempfile::tempdir().unwrap();
+        let remote = Remote::signing(&Bucket::url("p"), s3(&bucket, NAME, SECRET)).unwrap();
+        let store = BlobStore::new(Objects::open(Arc::new(remote), dir.path()).unwrap());
+        let http = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+        Self { bucket, store, _dir: dir, http }
+    }
+
+    fn send(&self, method: reqwest::Method, signed: &SignedRequest, body: &[u8]) -> Answer {
+        self.http.block_on(async {
+            let mut request = reqwest::Client::new().request(method, &signed.url).body(body.to_vec());
+            for (name, value) in &signed.headers {
+                request = request.header(name, value);
+            }
+            let answer = request.send().await.unwrap();
+            (answer.status().as_u16(), answer.bytes().await.unwrap().to_vec())
+        })
+    }
+
+    fn put(&self, signed: &SignedRequest, body: &[u8]) -> u16 {
+        self.send(reqwest::Method::PUT, signed, body).0
+    }
+
+    /// The objects that signed requests have stored and that have no name yet.
+    fn arriving(&self) -> Vec<std::path::PathBuf> {
+        files(&self.bucket.objects().join("p/arriving"))
+    }
+}
+
+#[test]
+fn a_signed_put_stores_the_right_bytes_once() {
+    let site = Site::start();
+    let (grant, whole) = (common::grant("r/s", 1), bytes(300_000));
+    let digest = Digest::of(&whole);
+    let signed = site.store.sign_write(&grant, digest).expect("this server reports checksums");
+    assert!(!site.store.has_arrived(&grant, digest));
+    assert_eq!(site.put(&signed, &whole), 200);
+    assert_eq!(site.put(&signed, &whole), 412, "once");
+    assert!(site.store.has_arrived(&grant, digest));
+    assert_eq!(site.store.size(digest).unwrap(), None, "it has no name before its worker reports it");
+
+    // Neither another task nor another process can claim it.
+    let others = [common::grant("r/other", 1), protocol::message::Grant { worker: "w9".into(), ..grant.clone() }];
+    assert!(others.iter().all(|other| !site.store.has_arrived(other, digest)));
+
+    site.store.take_over(&grant, digest).unwrap();
+    assert!(site.store.get(digest).unwrap() == whole);
+    assert!(site.arriving().is_empty());
+    // A lost answer is repeated: the blob exists, so nothing is copied.
+    site.store.take_over(&grant, digest).unwrap();
+
+    let read = site.store.sign_read(digest).unwrap().expect("reads are signed");
+    assert_eq!(site.send(reqwest::Method::GET, &read, b""), (200, whole));
+    let small = site.store.put(b"small").unwrap();
+    assert_eq!(site.store.sign_read(small).unwrap(), None, "one call is quicker");
+    let absent = site.store.sign_read(Digest::of(b"absent")).unwrap_err();
+    assert!(matches!(absent, BlobError::NotFound(_)), "{absent}");
+}
+
+#[test]
+fn what_is_not_as_it_was_signed_is_refused() {
+    let site = Site::start();
+    let (grant, whole) = (common::grant("r/s", 1), bytes(300_000));
+    let digest = Digest::of(&whole);
+    let signed = site.store.sign_write(&grant, digest).unwrap();
+    let with = |name: &str, value: Option<&str>| {
+        let mut headers = signed.headers.clone();
+        match value {
+            Some(value) => headers.insert(name.to_owned(), value.to_owned()),
+            None => headers.remove(name),
+        };
+        SignedRequest { headers, ..signed.clone() }
+    };
+    let elsewhere = |from: &str, to: &str| SignedRequest { url: signed.url.replace(from, to), ..signed.clone() };
+    let checksum = signed.headers["x-amz-checksum-sha256"].clone();
+    let other = checksum.chars().rev().collect::<String>();
+    for (what, tampered) in [
+        ("another checksum", with("x-amz-checksum-sha256", Some(&other))),
+        ("no checksum", with("x-amz-checksum-sha256", None)),
+        ("no condition", with("if-none-match", None)),
+        ("another name", elsewhere("p/arriving/", "p/arriving/0")),
+        ("a blob's name", elsewhere("p/arriving/", "p/sha256/")),
+        ("a longer validity", elsewhere("X-Amz-Expires=300", "X-Amz-Expires=3000")),
+    ] {
+        assert_ne!(tampered, signed, "{what}");
+        let status = site.put(&tampered, &whole);
+        assert!((400..500).contains(&status), "{what}: {status}");
+    }
+    let (status, _) =
+        site.send(reqwest::Method::GET, &SignedRequest { headers: BTreeMap::new(), ..signed.clone() }, b"");
+    assert_eq!(status, 403, "a put is no read");
+    assert!(site.arriving().is_empty(), "{:?}", site.arriving());
+
+    // This server refuses other bytes, but keeps them. They are attested by nothing.
+    assert_eq!(site.put(&signed, b"other bytes"), 400);
+    assert!(!site.store.has_arrived(&grant, digest));
+    assert_eq!(site.store.size(digest).unwrap(), None);
+}
+
+#[test]
+fn an_expired_signature_is_refused() {
+    let site = Site::start();
+    let whole = bytes(300_000);
+    let digest = site.store.put(&whole).unwrap();
+    let read = site.store.sign_read(digest).unwrap().unwrap();
+    let place = read.url.split('?').next().unwrap();
+    let path = Path::from(place.split_once(NAME).unwrap().1);
+    let client = s3(&site.bucket, NAME, SECRET);
+    let url = site.http.block_on(client.signed_url(Method::GET, &path, Duration::from_secs(1))).unwrap();
+    let signed = SignedRequest { url: url.into(), ..read };
+    assert_eq!(site.send(reqwest::Method::GET, &signed, b"").0, 200);
+    std::thread::sleep(Duration::from_millis(2100));
+    assert_eq!(site.send(reqwest::Method::GET, &signed, b"").0, 403);
+}
+
+/// What a worker sent and never reported is listed after a day, and a collection removes it.
+#[test]
+fn what_was_sent_and_never_used_is_removed() {
+    let site = Site::start();
+    let (grant, whole) = (common::grant("r/s", 1), bytes(300_000));
+    let signed = site.store.sign_write(&grant, Digest::of(&whole)).unwrap();
+    assert_eq!(site.put(&signed, &whole), 200);
+    assert!(site.store.unfinished().unwrap().is_empty(), "its worker may report it yet");
+
+    let yesterday = SystemTime::now() - Duration::from_secs(25 * 3600);
+    File::options().write(true).open(&site.arriving()[0]).unwrap().set_modified(yesterday).unwrap();
+    let left = site.store.unfinished().unwrap();
+    assert!(left.len() == 1 && left[0].contains("p/arriving/") && left[0].contains("never used"), "{left:?}");
+    assert_eq!(site.store.place().give_up_unfinished().unwrap(), 1);
+    assert!(site.arriving().is_empty() && site.store.unfinished().unwrap().is_empty());
+}
