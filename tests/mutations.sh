@@ -66,8 +66,8 @@ mutation back-off-times-ten trainer/coordinator/src/policy.rs 's/(self\.backoff_
 mutation heard-is-lost trainer/coordinator/src/batch.rs 's/(Ask::Observation\(\.\.\) =>) [^,]*,/$1 {}/' coordinator:decisions:batches
 mutation cancelled-shards-forgotten registry/src/sql/retention.rs "s/state = 'finished'/state IN ('finished', 'cancelled')/g" registry:retention
 mutation synchronous-off registry/src/sql/sqlite.rs 's/SqliteSynchronous::Full/SqliteSynchronous::Off/' registry:lib:sqlite
-mutation no-sync-of-a-blob registry/src/blob/fs.rs 's/self\.part\.file\.sync\(\)/Ok::<(), io::Error>(())/' registry:power_loss
-mutation no-sync-of-its-folder registry/src/blob/fs.rs 's/folder\.disk\.sync_dir\(shard\)/Ok::<(), io::Error>(())/' registry:power_loss
+mutation no-sync-of-a-blob registry/src/blob/fs.rs 's/self\.part\.file\.sync\(\)/Ok::<(), io::Error>(())/' registry:conformance
+mutation no-sync-of-its-folder registry/src/blob/fs.rs 's/folder\.disk\.sync_dir\(shard\)/Ok::<(), io::Error>(())/' registry:conformance
 mutation no-sync-of-the-operating-system registry/src/blob/disk.rs 's/(fn sync\(&mut self\) -> io::Result<\(\)> \{\s+)self\.sync_all\(\)/$1Ok(())/' "registry:disk registry:lib:disk registry"
 mutation grace-0 registry/src/retention.rs 's/60 \* 60 \* 1000/0/' "registry:retention registry"
 mutation no-touch registry/src/blob/store.rs 's/let touched = self\.backend\(\)\.touch\(digest\)\?;/let touched = stat;/' registry:conformance
@@ -97,6 +97,10 @@ mutation receipt-of-every-process trainer/coordinator/src/shell/secrets.rs 's/\(
 mutation manifest-of-foreign-blobs trainer/coordinator/src/shell/vouching.rs 's/return Ok\(Some\((next|file\.digest)\)\);/continue;/g' coordinator:server:workers
 mutation mention-of-foreign-blobs trainer/coordinator/src/shell/vouching.rs 's/if leads_somewhere && seen\.insert\(other\)/if leads_somewhere \&\& seen.insert(other) \&\& queue.len() > 99/' coordinator:server:workers
 mutation staged-of-everybody trainer/coordinator/src/shell/uploads.rs 's/let has_receipt = receipt\.is_some\(\)/let has_receipt = receipt.is_none()/' coordinator:server:workers
+mutation sent-on-a-workers-word trainer/coordinator/src/shell/uploads.rs 's/blobs\.has_arrived\(&asked, digest\)/asked.fence.0 > 0 || blobs.has_arrived(\&asked, digest)/' coordinator:server:workers
+mutation sent-by-anybody registry/src/blob/direct.rs 's/staged_name\(&\(holder\(grant\), digest\)\)/{ let _ = (grant, staged_name, holder); digest.hex() }/' registry:conformance:signed
+mutation a-signed-put-of-any-bytes registry/src/blob/objects/signed.rs 's/&\[\(CHECKSUM, &checksum\(digest\)\), \(IF_NONE_MATCH, "\*"\)\]/\&[(IF_NONE_MATCH, "*")]/' registry:conformance:signed
+mutation a-signed-put-that-overwrites registry/src/blob/objects/signed.rs 's/, \(IF_NONE_MATCH, "\*"\)\]/, (IF_NONE_MATCH, "*")][..1]/' registry:conformance:signed
 mutation worker-reads-everything trainer/coordinator/src/shell/uploads.rs 's/if !proof\.caller\.scopes\.allow\(Scope::Read\)/if proof.caller.scopes.allow(Scope::Promote)/' coordinator:server:workers
 mutation poll-in-anothers-name trainer/coordinator/src/observe.rs 's/if \(&said\.grant\.worker, said\.grant\.incarnation\) != \(&worker, poll\.incarnation\)/if said.grant.worker.as_str().is_empty()/' coordinator:server:workers
 mutation promotion-without-scope trainer/access/src/tokens.rs 's/if !allow\(Scope::Promote\)/if false/' "access:lib coordinator:server:owners::promotion"

@@ -11,8 +11,9 @@ use crate::documented::{bash, programs};
 const TRAINER: &str = env!("CARGO_BIN_EXE_trainer");
 
 /// Beginnings of examples that this test leaves out: the reason, and the test that runs the command.
-const ELSEWHERE: [(&str, &str, &str); 18] = [
+const ELSEWHERE: [(&str, &str, &str); 19] = [
     ("trainer data fetch", "a network", "tests/process/bandai.rs"),
+    ("trainer data push", "a live server", "tests/process/push.rs"),
     ("trainer demo", "models of its own", "tests/process/demo.rs"),
     ("trainer doctor", "a server that is away", "tests/process/documented.rs"),
     ("trainer import", "weights of others", "tests/process/released.rs"),

@@ -134,6 +134,11 @@ impl Client {
         self.read(self.server.request(Method::POST, path).json(body)).await
     }
 
+    /// Addresses of the server, separated by commas.
+    pub(crate) fn urls(&self) -> String {
+        self.server.urls()
+    }
+
     pub(crate) async fn submit(&self, submit: &Submit) -> Result<RunId> {
         Ok(self.post::<coordinator::shell::Submitted>("/v1/runs", submit).await?.run)
     }

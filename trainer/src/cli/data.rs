@@ -1,4 +1,5 @@
-//! `trainer data`: inspects recordings and names their motions, writes sample recordings and fetches published ones.
+//! `trainer data`: inspects recordings and names their motions, writes sample recordings, fetches published ones and
+//! brings data to a server.
 
 use std::path::{Path, PathBuf};
 
@@ -14,6 +15,7 @@ use protocol::Seed;
 use serde_json::json;
 
 use super::datasets::{self, FetchArgs, ListArgs};
+use super::push::{self, PushArgs};
 use crate::report::print::{self, Output};
 use crate::report::problem::{Problem, Result};
 
@@ -34,6 +36,9 @@ pub(crate) enum DataVerb {
     /// Fetches a published set, checks every file, and adds captions and splits; run it again to continue
     #[command(after_help = "Example:\n  trainer data fetch bandai --accept-licence")]
     Fetch(FetchArgs),
+    /// Computes the stages of a pipeline that read files, on this machine, for a server whose workers do not have the files
+    #[command(after_help = "Example:\n  trainer data push configs/bandai.yaml --server https://stride:7700")]
+    Push(Box<PushArgs>),
 }
 
 impl DataVerb {
@@ -43,6 +48,7 @@ impl DataVerb {
             Self::Sample(_) | Self::Captions(_) => Output::Table,
             Self::List(args) => args.output,
             Self::Fetch(args) => args.output,
+            Self::Push(args) => args.output,
         }
     }
 }
@@ -89,13 +95,14 @@ enum SampleFormat {
     Bvh,
 }
 
-pub(crate) fn data(verb: &DataVerb) -> Result<u8> {
+pub(crate) async fn data(verb: DataVerb) -> Result<u8> {
     match verb {
-        DataVerb::Inspect(args) => inspect(args),
-        DataVerb::Captions(args) => write_captions(args),
-        DataVerb::Sample(args) => sample(args),
-        DataVerb::List(args) => Ok(datasets::list(args)),
-        DataVerb::Fetch(args) => datasets::fetch(args),
+        DataVerb::Inspect(args) => inspect(&args),
+        DataVerb::Captions(args) => write_captions(&args),
+        DataVerb::Sample(args) => sample(&args),
+        DataVerb::List(args) => Ok(datasets::list(&args)),
+        DataVerb::Fetch(args) => datasets::fetch(&args),
+        DataVerb::Push(args) => push::push(*args).await,
     }
 }
 

@@ -97,7 +97,7 @@ async fn perform(verb: Verb) -> Result<u8> {
         Verb::Pause(args) => remote::control(args, "pause").await,
         Verb::Resume(args) => resume(args).await,
         Verb::Generate(args) => generate::generate(*args).await,
-        Verb::Data(verb) => data::data(&verb),
+        Verb::Data(verb) => data::data(verb).await,
         Verb::Gallery(args) => gallery::gallery(*args).await,
         Verb::Export(args) => export::export(&args),
         Verb::Import(args) => import::import(*args, command_line()).await,

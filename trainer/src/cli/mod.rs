@@ -22,6 +22,7 @@ mod metrics;
 mod model;
 mod out;
 mod plan;
+mod push;
 mod refused;
 mod remote;
 mod resume;

@@ -147,7 +147,8 @@ pub(crate) async fn submit(args: SubmitArgs) -> Result<u8> {
     Ok(exit_code(view.state))
 }
 
-fn exit_code(state: RunState) -> u8 {
+/// Exit code of a command that waited for a run.
+pub(super) fn exit_code(state: RunState) -> u8 {
     match state {
         RunState::Finished | RunState::Running | RunState::Paused => 0,
         RunState::Failed => exit::FAILED,

@@ -192,13 +192,14 @@ impl Fleet {
 }
 
 /// The end of a file's text after offset `from`.
-fn last_words(path: &Path, from: u64) -> String {
+pub(crate) fn last_words(path: &Path, from: u64) -> String {
     let bytes = std::fs::read(path).unwrap_or_default();
     let from = usize::try_from(from).unwrap_or(usize::MAX).clamp(bytes.len().saturating_sub(LAST_WORDS), bytes.len());
     String::from_utf8_lossy(&bytes[from..]).into_owned()
 }
 
-fn last_lines(text: &str, count: usize) -> String {
+/// The last `count` lines of a text.
+pub(crate) fn last_lines(text: &str, count: usize) -> String {
     let lines: Vec<&str> = text.lines().collect();
     lines[lines.len().saturating_sub(count)..].join("\n")
 }
