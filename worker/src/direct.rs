@@ -15,8 +15,9 @@ use tokio::sync::mpsc;
 
 use crate::event_count::lock;
 
-/// Pause of signed requests after one failed.
-const PAUSE: Duration = Duration::from_secs(300);
+/// Pause of signed requests after the first failure. It doubles with each further one, up to [`LONGEST`].
+const PAUSE: Duration = Duration::from_secs(5);
+const LONGEST: Duration = Duration::from_secs(300);
 /// Time limit of a connection attempt.
 const CONNECT: Duration = Duration::from_secs(5);
 /// Longest time without progress.
@@ -34,6 +35,8 @@ pub(crate) struct Direct {
 struct State {
     http: Option<Client>,
     paused_until: Option<Instant>,
+    /// Failures since the last success.
+    failures: u32,
 }
 
 impl Direct {
@@ -59,12 +62,20 @@ impl Direct {
 
     /// Pauses signed requests and returns the reason without the signature.
     fn pause(&self, why: String) -> String {
+        let mut state = lock(&self.state);
+        let pause = PAUSE.saturating_mul(1 << state.failures.min(6)).min(LONGEST);
+        state.failures += 1;
+        state.paused_until = Some(Instant::now() + pause);
         let message = format!("the place of the blobs cannot be used directly: {why}");
-        let paused = lock(&self.state).paused_until.replace(Instant::now() + PAUSE);
-        if paused.is_none() {
-            tracing::warn!("{message}; blobs pass through the server");
-        }
+        tracing::warn!("{message}; blobs pass through the server for {} s", pause.as_secs());
         message
+    }
+
+    fn succeeded(&self) {
+        let mut state = lock(&self.state);
+        if std::mem::take(&mut state.failures) > 0 {
+            state.paused_until = None;
+        }
     }
 
     /// The next bytes of an answer; `None` after the last.
@@ -90,6 +101,7 @@ impl Direct {
         if response.status() != expected {
             return Err(self.pause(format!("it answered {} to a read", response.status())));
         }
+        self.succeeded();
         Ok(response)
     }
 
@@ -121,11 +133,13 @@ impl Direct {
         };
         let answered = async {
             let response = request.body(Body::wrap_stream(body)).send().await.map_err(|error| self.failed(error))?;
-            match response.status() {
-                StatusCode::PRECONDITION_FAILED | StatusCode::CONFLICT => Ok(()),
-                status if status.is_success() => Ok(()),
-                status => Err(self.pause(format!("it answered {status} to a write"))),
+            let status = response.status();
+            let is_there = matches!(status, StatusCode::PRECONDITION_FAILED | StatusCode::CONFLICT);
+            if !status.is_success() && !is_there {
+                return Err(self.pause(format!("it answered {status} to a write")));
             }
+            self.succeeded();
+            Ok(())
         };
         tokio::pin!(answered);
         tokio::select! {
