@@ -83,7 +83,7 @@ mutation parts-of-a-given-up-snapshot-count registry/src/sql/apply.rs 's/run\(co
 mutation readers-take-all-connections trainer/coordinator/src/shell/listener.rs 's/own >= limits\.of_token/own > limits.most/' coordinator:server:limits
 mutation no-limit-of-calls trainer/coordinator/src/shell/rate.rs 's/bucket\.left < 1\.0/bucket.left < -1.0e9/' coordinator:lib:rate
 mutation no-limit-of-live-runs trainer/coordinator/src/decide/runs.rs 's/if live < most \{/if live < most || most > 0 {/' coordinator:server:limits
-mutation no-limit-of-a-runs-lines registry/src/sql/usage.rs 's/bind\(int\(log_bytes\)\)/bind(0)/' coordinator:server:limits
+mutation no-limit-of-a-runs-lines registry/src/sql/usage.rs 's/bind\(int\(log_bytes\)\)/bind(int(log_bytes * 0))/' coordinator:server:limits
 mutation a-refused-blob-is-tried-again worker/src/blobs.rs 's/BlobError::Unfit\(message\)/BlobError::Unavailable(message)/' worker:lib:tests
 mutation name-of-another-token trainer/coordinator/src/state/worker.rs 's/if own\.caller != by\.caller/if own.caller.is_empty()/' coordinator:server:workers
 mutation name-of-a-live-process trainer/coordinator/src/state/worker.rs 's/if own\.secret == by\.secret =>/if !own.caller.is_empty() =>/' coordinator:server:workers

@@ -538,6 +538,25 @@ fn p4_rank_0_dies_in_its_last_save_and_no_step_is_computed_again() {
     }
 }
 
+/// Sampled: the lead of a gang of two is asked to end.
+#[test]
+fn a_gang_goes_on_at_once_without_a_member_that_is_asked_to_end() {
+    let mut cluster = Cluster::start(TRAINER);
+    cluster.join("w1");
+    let run = cluster.submit(&config(), &VAE);
+    cluster.wait_step(&run, "vae", 20);
+    cluster.join("w2");
+    wait_for("w2 to join the gang", || (cluster.stage(&run, "vae")["workers"].as_array()?.len() == 2).then_some(()));
+    cluster.wait_step(&run, "vae", 60);
+    cluster.signal("w1", Signal::SIGTERM);
+    assert_eq!(cluster.ended("w1"), Some(0));
+    let view = cluster.wait_end(&run);
+    let stage = stage_of(&view, "vae");
+    assert_eq!((stage["state"].as_str(), stage["attempt"].as_u64()), (Some("ran"), Some(1)), "{stage:#}");
+    assert!(cluster.said("w2").contains("regrouped after step"), "{}", cluster.said("w2"));
+    equals_reference(&cluster, &run, &view);
+}
+
 /// Sampled: a worker that trains alone and cannot save because the coordinator is dead.
 #[test]
 fn a_worker_leaves_in_time_though_the_coordinator_is_gone() {

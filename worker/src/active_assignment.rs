@@ -6,7 +6,7 @@
 //! Correctness depends on that fence alone.
 
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex};
+use std::sync::{Arc, Mutex, OnceLock};
 use std::time::{Duration, Instant};
 
 use protocol::message::{Assignment, Doing, Grant, Progress, Role};
@@ -21,6 +21,8 @@ use crate::gang::mesh::{Halt, Mesh};
 
 /// Time to wait after a refused write for the orders that explain it.
 const STALE_PATIENCE: Duration = Duration::from_secs(30);
+/// Time for the coordinator to let a gang go on without this worker. Then the whole gang saves and stops.
+const POLITE: Duration = Duration::from_secs(1);
 /// Time to train after a failed checkpoint before the next try.
 const SAVE_PAUSE: Duration = Duration::from_secs(5);
 
@@ -65,10 +67,21 @@ struct PutOff {
 /// Flags of the process, shared by all assignments.
 #[derive(Debug, Default)]
 pub(crate) struct Flags {
-    /// True once the worker is leaving.
-    pub(crate) leaving: AtomicBool,
+    /// Time of the request to leave.
+    leaving: OnceLock<Instant>,
     /// True if the last poll was not answered.
     pub(crate) away: AtomicBool,
+}
+
+impl Flags {
+    pub(crate) fn leave(&self) {
+        self.leaving.get_or_init(Instant::now);
+    }
+
+    /// Time since the request to leave; `None` without one.
+    pub(crate) fn leaving_for(&self) -> Option<Duration> {
+        self.leaving.get().map(Instant::elapsed)
+    }
 }
 
 /// Effect of new orders on a held task.
@@ -231,10 +244,11 @@ impl ActiveAssignment {
         lock(&self.state).done
     }
 
-    /// Returns true if the stage should stop between two steps, because the coordinator drains it or the worker is
-    /// leaving.
-    pub(crate) fn drain(&self) -> bool {
-        self.flags.leaving.load(Ordering::SeqCst) || lock(&self.state).assignment.drain
+    /// Returns true if a stage of `members` members should stop between two steps, because the coordinator drains it or
+    /// the worker is leaving. A gang usually goes on without this worker, for which the coordinator has [`POLITE`].
+    pub(crate) fn drain(&self, members: usize) -> bool {
+        let leaves = |waited: Duration| members <= 1 || waited >= POLITE;
+        self.flags.leaving_for().is_some_and(leaves) || lock(&self.state).assignment.drain
     }
 
     /// Returns true if the last poll was not answered.

@@ -68,7 +68,7 @@ impl Shared {
 
     /// Starts leaving: takes no new work, while the running stage saves and yields.
     pub(crate) fn leave(&self) {
-        self.flags.leaving.store(true, Ordering::SeqCst);
+        self.flags.leave();
         self.preparation.end();
         for held in lock(&self.held).iter() {
             held.event_count().notify();
@@ -78,7 +78,7 @@ impl Shared {
     }
 
     pub(crate) fn is_leaving(&self) -> bool {
-        self.flags.leaving.load(Ordering::SeqCst)
+        self.flags.leaving_for().is_some()
     }
 
     pub(crate) fn is_over(&self) -> bool {
@@ -138,7 +138,7 @@ impl Shared {
 
     fn poll(&self, incarnation: Incarnation, version: u64) -> Poll {
         let doing = lock(&self.held).iter().map(|held| held.doing()).collect();
-        Poll { incarnation, doing, ready: self.preparation.ready(), version }
+        Poll { incarnation, doing, ready: self.preparation.ready(), version, leaving: self.is_leaving() }
     }
 }
 

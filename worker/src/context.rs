@@ -26,7 +26,7 @@ use crate::gang::tree;
 use crate::process;
 use crate::receipts::Receipts;
 use crate::retry::{self, GaveUp};
-use crate::stage_log::{self, Pace};
+use crate::stage_log::{self, Pace, Spent};
 use crate::telemetry_buffer::{Sender, TelemetryBuffer};
 
 /// Access of one attempt to the coordinator and, in a gang, to its peers.
@@ -48,6 +48,7 @@ pub(crate) struct HttpContext {
     has_met: bool,
     begun: Instant,
     pace: Pace,
+    spent: Spent,
     _sender: Sender,
 }
 
@@ -104,6 +105,7 @@ impl HttpContext {
             has_met,
             begun,
             pace,
+            spent: Spent::default(),
             _sender,
         }
     }
@@ -131,7 +133,7 @@ impl HttpContext {
 
     /// Logs the end of the attempt.
     pub(crate) fn log_end(&mut self, outcome: &TaskOutcome) {
-        let line = stage_log::end(outcome, self.begun.elapsed(), self.held.peak_memory());
+        let line = stage_log::end(outcome, self.begun.elapsed(), self.spent, self.held.peak_memory());
         self.log(&line);
     }
 
@@ -295,7 +297,7 @@ impl AttemptContext for HttpContext {
     /// In a gang, drain requests are not reported here: all members must learn of them after the same step, from an
     /// exchange.
     fn interrupted(&self) -> bool {
-        self.held.ended().is_some() || (!self.gang && self.held.drain())
+        self.held.ended().is_some() || (!self.gang && self.held.drain(1))
     }
 }
 
@@ -393,12 +395,17 @@ impl GangContext for HttpContext {
             };
             own.push((slice..slice + 1, part));
         }
-        let drain = self.held.drain();
+        let drain = self.held.drain(mesh.size());
         let durable = self.telemetry.durable();
         let contribution = Contribution { step, slices, parts: own, drain, saved, computed, durable };
         let held = self.held.clone();
+        let begun = Instant::now();
         let exchanged = exchange::exchange(&mesh, &contribution, &|| held.halt(generation));
         self.computes_since = Instant::now();
+        if mesh.size() > 1 {
+            self.spent.computing += computed;
+            self.spent.exchanging += self.computes_since - begun;
+        }
         match exchanged {
             Ok(total) => {
                 self.held.set_holds(Some(step + 1));

@@ -59,14 +59,33 @@ pub(crate) fn regrouped(generation: impl std::fmt::Display, members: usize, step
     format!("regrouped{from}: generation {generation} of {}", counted(members as u64, "member"))
 }
 
+/// Time that a member of a gang has spent on its steps.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct Spent {
+    /// From the end of an exchange to the next one.
+    pub(crate) computing: Duration,
+    /// In exchanges with other members, waiting included.
+    pub(crate) exchanging: Duration,
+}
+
+impl Spent {
+    /// The exchanges' share in percent; `None` for a member that was always alone.
+    fn exchange(self) -> Option<f64> {
+        let all = (self.computing + self.exchanging).as_secs_f64();
+        (!self.exchanging.is_zero()).then(|| 100.0 * self.exchanging.as_secs_f64() / all)
+    }
+}
+
 /// The last line of an attempt. `peak` is the highest memory of the process, in bytes.
-pub(crate) fn end(outcome: &TaskOutcome, took: Duration, peak: Option<u64>) -> String {
+pub(crate) fn end(outcome: &TaskOutcome, took: Duration, spent: Spent, peak: Option<u64>) -> String {
     let seconds = took.as_secs_f64();
     match outcome {
         TaskOutcome::Finished { output, metrics } => {
             let values = values(metrics);
             let memory = peak.map(|bytes| format!(" with at most {} of memory", size(bytes))).unwrap_or_default();
-            format!("finished in {seconds:.1} s{memory}: {}{values}", output.short())
+            let exchange = spent.exchange().map(|share| format!(" ({share:.0} % of its steps in exchanges)"));
+            let exchange = exchange.unwrap_or_default();
+            format!("finished in {seconds:.1} s{exchange}{memory}: {}{values}", output.short())
         }
         TaskOutcome::Resolved { digests } => {
             format!("digested {} in {seconds:.1} s", counted(digests.len() as u64, "input"))
@@ -136,6 +155,19 @@ mod tests {
         let progress = Progress { done: 5060, total: 6000, unit: "steps".to_owned(), metrics: BTreeMap::new() };
         let line = pace.line(&progress, begun + Duration::from_secs(260));
         assert_eq!(line.as_deref(), Some("5,060 of 6,000 steps, 1.000 a second"), "work of others is not its pace");
+    }
+
+    #[test]
+    fn the_end_tells_the_share_of_exchanges_in_a_gang() {
+        let output = Digest::of(b"x");
+        let outcome = TaskOutcome::Finished { output, metrics: BTreeMap::new() };
+        let mut spent = Spent { computing: Duration::from_secs(3), exchanging: Duration::ZERO };
+        let alone = end(&outcome, Duration::from_secs(4), spent, None);
+        assert_eq!(alone, format!("finished in 4.0 s: {}", output.short()));
+        spent.exchanging = Duration::from_secs(1);
+        let line = end(&outcome, Duration::from_secs(4), spent, Some(1 << 20));
+        let expected = "finished in 4.0 s (25 % of its steps in exchanges) with at most 1.0 MiB of memory";
+        assert_eq!(line, format!("{expected}: {}", output.short()));
     }
 
     #[test]

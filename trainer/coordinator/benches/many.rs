@@ -199,7 +199,8 @@ fn beat(server: &Restarted, stop: &AtomicBool) -> Result<Vec<Duration>> {
         labels: Default::default(),
     };
     let joined: Joined = caller.post("/v1/workers", &join)?;
-    let poll = Poll { incarnation: joined.incarnation, doing: vec![], ready: vec![], version: u64::MAX };
+    let poll =
+        Poll { incarnation: joined.incarnation, doing: vec![], ready: vec![], version: u64::MAX, leaving: false };
     let mut times = Vec::new();
     while !stop.load(Ordering::Relaxed) {
         let begun = Instant::now();
@@ -347,7 +348,7 @@ fn recorded(server: &Restarted) -> Result<(Assignment, Poll)> {
         labels: Default::default(),
     };
     let joined: Joined = caller.post("/v1/workers", &join)?;
-    let poll = Poll { incarnation: joined.incarnation, doing: vec![], ready: vec![], version: 0 };
+    let poll = Poll { incarnation: joined.incarnation, doing: vec![], ready: vec![], version: 0, leaving: false };
     let task = loop {
         let desired: DesiredAssignments = caller.post("/v1/workers/recorder/poll", &poll)?;
         if let Some(assignment) = desired.assignments.into_iter().next() {

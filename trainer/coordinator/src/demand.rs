@@ -9,7 +9,6 @@ use crate::state::State;
 use crate::state::execution::StageExecution;
 use crate::state::queue::Need;
 use crate::state::task::{Lease, Part, Task};
-use crate::state::worker::Presence;
 use crate::time::Millis;
 
 /// Number of waiting executions of one kind that are counted. No fleet has more slots.
@@ -37,7 +36,7 @@ impl State {
             }
         }
         let mut workers = Vec::new();
-        for (name, worker) in self.workers.iter().filter(|(_, worker)| worker.presence == Presence::Here) {
+        for (name, worker) in self.workers.iter().filter(|(_, worker)| worker.is_available()) {
             workers.push(DemandWorker {
                 worker: name.clone(),
                 backend: worker.backend,

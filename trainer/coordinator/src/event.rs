@@ -54,6 +54,8 @@ pub enum Event {
         /// The complete list of these tasks.
         tasks: Vec<TaskId>,
     },
+    /// A worker reports that its process was asked to end.
+    WorkerLeaves { worker: WorkerId, incarnation: Incarnation },
     /// A worker did not poll for the length of its lease.
     LeaseExpired { worker: WorkerId, incarnation: Incarnation },
     /// A worker process has ended for certain, unlike after an expired lease.
@@ -137,6 +139,7 @@ impl Event {
             | Self::Join { .. }
             | Self::WorkerBack { .. }
             | Self::WorkerReady { .. }
+            | Self::WorkerLeaves { .. }
             | Self::LeaseExpired { .. }
             | Self::WorkerGone { .. }
             | Self::GangDivided { .. }

@@ -29,7 +29,8 @@ pub fn is_quiet(state: &State, worker: &WorkerId, poll: &Poll) -> Result<bool, R
     let complains = poll.doing.iter().any(|doing| !doing.lost.is_empty());
     let divided = || poll.doing.iter().any(|doing| is_of_a_divided_gang(state, doing));
     let may_join = known.presence == Presence::Here && known.shunned.is_none();
-    Ok(may_join && !complains && !is_ready_for_more(state, known, poll) && !divided())
+    let leaves = poll.leaving && !known.leaving;
+    Ok(may_join && !leaves && !complains && !is_ready_for_more(state, known, poll) && !divided())
 }
 
 /// Returns true if the gang of a reporting member is being heard about a complaint.
@@ -63,6 +64,9 @@ fn heard(state: &mut State, now: Millis, worker: WorkerId, poll: Poll) -> Result
                 poll.incarnation
             )));
         }
+    }
+    if poll.leaving && !known.leaving {
+        events.push(Event::WorkerLeaves { worker: worker.clone(), incarnation: poll.incarnation });
     }
     if is_ready_for_more(state, known, &poll) {
         let worker = worker.clone();

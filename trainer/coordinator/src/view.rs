@@ -34,7 +34,7 @@ pub struct WorkerView {
     pub backend: Backend,
     /// The instruction set that its kernels use, such as `avx512`.
     pub instruction_set: String,
-    /// `idle`, `working`, `unreachable`, `silent` or `gone`.
+    /// `idle`, `working`, `leaving`, `unreachable`, `silent` or `gone`.
     pub state: String,
     /// The task that it holds.
     pub task: Option<TaskId>,
@@ -50,6 +50,7 @@ impl State {
         for (name, worker) in &self.workers {
             let task = self.held_by(name).map(|(_, task)| task.id.clone());
             let state = match (worker.presence, &task) {
+                (Presence::Here, None) if worker.leaving => "leaving",
                 (Presence::Here, None) => "idle",
                 (Presence::Here, Some(_)) => "working",
                 (Presence::Suspect { .. }, _) => "unreachable",
@@ -91,7 +92,7 @@ impl State {
     fn to_prepare(&self, worker: &Worker) -> Vec<Prepare> {
         /// Limit, because a worker takes only one of them in the end.
         const AT_ONCE: usize = 8;
-        if worker.presence != Presence::Here {
+        if !worker.is_available() {
             return Vec::new();
         }
         let open = self.open_gangs.iter().filter_map(|(key, i)| {

@@ -139,7 +139,7 @@ impl Worker {
 
     async fn poll(&self) -> TestResult<Option<Assignment>> {
         let ready = self.ready.lock().unwrap_or_else(PoisonError::into_inner).clone();
-        let poll = Poll { incarnation: self.incarnation, doing: vec![], ready, version: 0 };
+        let poll = Poll { incarnation: self.incarnation, doing: vec![], ready, version: 0, leaving: false };
         let path = format!("/v1/workers/{}/poll", self.name);
         let desired: DesiredAssignments = post(&self.server, &path, &poll).await?;
         // This worker does not really fetch inputs, so all of them are ready at once.

@@ -159,7 +159,7 @@ async fn acts_as_a_worker() {
     let mut terminate = signal(SignalKind::terminate()).unwrap();
     let (mut doing, mut version) = (Vec::new(), 0);
     loop {
-        let poll = Poll { incarnation: joined.incarnation, doing, ready: Vec::new(), version };
+        let poll = Poll { incarnation: joined.incarnation, doing, ready: Vec::new(), version, leaving: false };
         let request = post(format!("/v1/workers/{name}/poll")).json(&poll).send();
         let answer = tokio::select! {
             answer = request => answer,

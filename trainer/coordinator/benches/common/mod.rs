@@ -128,7 +128,13 @@ impl Worker {
 
     /// Sends a heartbeat that is answered at once.
     pub(crate) async fn poll(&mut self) -> Result<Option<Assignment>> {
-        let poll = Poll { incarnation: self.incarnation, doing: vec![], ready: self.ready.clone(), version: 0 };
+        let poll = Poll {
+            incarnation: self.incarnation,
+            doing: vec![],
+            ready: self.ready.clone(),
+            version: 0,
+            leaving: false,
+        };
         let desired: DesiredAssignments =
             self.connection.post(&format!("/v1/workers/{}/poll", self.name), SECRET, &poll).await?;
         let joins_gangs = self.joins_gangs;

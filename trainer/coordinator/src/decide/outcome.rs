@@ -99,8 +99,10 @@ impl Deciding<'_> {
             TaskOutcome::Yielded { .. } => {
                 let now = self.now();
                 let soon = now.after(self.state.policy.backoff_ms);
+                // The pause keeps the task from a worker that is about to end and has not said so.
+                let leaves = self.state.workers.get(&worker).is_some_and(|worker| worker.leaving);
                 self.change(key, i, |task| {
-                    let asked = matches!(task.lease, Lease::Held { drain_by: Some(_), .. });
+                    let asked = leaves || matches!(task.lease, Lease::Held { drain_by: Some(_), .. });
                     task.give_back((!asked).then_some(soon));
                 });
             }

@@ -36,7 +36,7 @@ use crate::state::gang::{self, Change};
 use crate::state::queue::{Need, open_member};
 use crate::state::shared::Map;
 use crate::state::task::{Lease, Task};
-use crate::state::worker::{Presence, Worker};
+use crate::state::worker::Worker;
 use crate::state::{Idle, State};
 
 /// Maximum number of gangs that idle workers prepare for. More than that occur in sweeps, where the remaining gangs get
@@ -59,7 +59,7 @@ pub(crate) fn schedule(cx: &mut Deciding<'_>) {
     cx.share();
     // Usually all workers are busy, and nothing else needs checking.
     cx.state.open_gangs = Arc::default();
-    if !cx.state.unused.iter().any(|name| cx.state.workers.get(name).is_some_and(|w| w.presence == Presence::Here)) {
+    if !cx.state.unused.iter().any(|name| cx.state.workers.get(name).is_some_and(Worker::is_available)) {
         return;
     }
     loop {
@@ -181,7 +181,7 @@ fn idle_that<'a>(state: &'a State, takes: impl Fn(&Worker) -> bool + 'a) -> impl
         GrantOrder::ByNameBackwards => names.next_back(),
     });
     let known = in_order.filter_map(|name| Some((name, state.workers.get(name)?)));
-    let fit = known.filter(move |(_, worker)| worker.presence == Presence::Here && takes(worker));
+    let fit = known.filter(move |(_, worker)| worker.is_available() && takes(worker));
     fit.map(|(name, worker)| worker.member(name))
 }
 

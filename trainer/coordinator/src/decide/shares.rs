@@ -19,7 +19,7 @@ use crate::policy::Policy;
 use crate::state::execution::StageExecution;
 use crate::state::queue::{Need, Rank};
 use crate::state::task::{Lease, Part};
-use crate::state::worker::{Presence, Worker};
+use crate::state::worker::Worker;
 use crate::state::{Idle, State};
 use crate::time::Millis;
 
@@ -129,7 +129,7 @@ impl State {
 
     /// The workers that are idle and here. One that fell silent is not at its group's disposal.
     fn kept_idle(&self) -> impl Iterator<Item = &Idle> {
-        let is_here = |name: &&WorkerId| self.workers.get(name).is_some_and(|it| it.presence == Presence::Here);
+        let is_here = |name: &&WorkerId| self.workers.get(name).is_some_and(Worker::is_available);
         self.unused.iter().filter(is_here).filter_map(|name| self.heard.idle.get(name))
     }
 
@@ -144,7 +144,7 @@ impl State {
     /// A member that a gang can spare for `claim`, whose group has `own` workers: of the group with the most workers.
     fn giver(&self, claim: &Claim<'_>, own: usize, held: &BTreeMap<Group, usize>) -> Option<(Digest, usize, WorkerId)> {
         let can_give = |(name, worker): (&WorkerId, &Worker)| {
-            let (key, i) = worker.holds.filter(|_| worker.presence == Presence::Here)?;
+            let (key, i) = worker.holds.filter(|_| worker.is_available())?;
             let execution = &self.executions[&key];
             let task = &execution.tasks[i];
             let group = self.group_of(execution)?;
@@ -204,7 +204,7 @@ fn divided(
 ) -> BTreeMap<WorkerId, Group> {
     let mut given = BTreeMap::new();
     for name in &state.unused {
-        let Some(worker) = state.workers.get(name).filter(|worker| worker.presence == Presence::Here) else { continue };
+        let Some(worker) = state.workers.get(name).filter(|worker| worker.is_available()) else { continue };
         let idle_ms = state.heard.idle.get(name).map_or(0, |idle| now.since(idle.since));
         if idle_ms > state.policy.share_ms {
             continue;

@@ -56,6 +56,7 @@ impl Deciding<'_> {
             Event::Join { join, by } => self.join(join, by)?,
             Event::WorkerBack { worker } => return self.sign(&worker, Sign::Back),
             Event::WorkerReady { worker, incarnation, tasks } => return self.ready(worker, incarnation, tasks),
+            Event::WorkerLeaves { worker, incarnation } => return self.leaves(worker, incarnation),
             Event::LeaseExpired { worker, incarnation } => {
                 if self.state.process(&worker, incarnation).is_err() || !self.sign(&worker, Sign::LeaseExpired)? {
                     return Ok(false);

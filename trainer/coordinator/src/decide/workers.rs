@@ -2,7 +2,7 @@
 
 use std::collections::BTreeSet;
 
-use protocol::message::Join;
+use protocol::message::{Join, Member};
 use protocol::{Incarnation, TaskId, WorkerId};
 
 use super::attempts::Loss;
@@ -10,6 +10,8 @@ use super::deciding::Deciding;
 use crate::event::Effect;
 use crate::fact::Fact;
 use crate::rejected::Rejected;
+use crate::state::evidence;
+use crate::state::task::{Lease, Part};
 use crate::state::worker::{Identity, Sign, Worker};
 
 impl Deciding<'_> {
@@ -45,6 +47,32 @@ impl Deciding<'_> {
         }
         let process = Worker { ready, ..known.clone() };
         self.record(Fact::Worker { worker, process });
+        Ok(true)
+    }
+
+    /// Gives no more work to a worker whose process was asked to end. Its gang goes on without it if another member
+    /// holds the state; otherwise the worker saves first. Returns `false` if it is known to be leaving.
+    pub(crate) fn leaves(&mut self, worker: WorkerId, incarnation: Incarnation) -> Result<bool, Rejected> {
+        let known = self.state.process(&worker, incarnation)?;
+        if known.leaving {
+            return Ok(false);
+        }
+        let process = Worker { leaving: true, ..known.clone() };
+        let held = known.holds;
+        self.record(Fact::Worker { worker: worker.clone(), process });
+        let Some((key, i)) = held else { return Ok(true) };
+        let task = &self.state.executions[&key].tasks[i];
+        let left: Vec<Member> = task.holders().iter().filter(|member| member.worker != worker).cloned().collect();
+        let stays = |member: &Member| self.state.workers.get(&member.worker).is_some_and(Worker::is_available);
+        let holds = |member: &Member| evidence::holds(&self.state.heard.words, task, member).is_some();
+        let goes_on = task.part == Part::Gang
+            && matches!(task.lease, Lease::Held { drain_by: None, .. })
+            && left.len() >= self.state.executions[&key].range().min.max(1)
+            && left.iter().any(|member| stays(member) && holds(member));
+        if goes_on {
+            tracing::info!(%worker, task = %task.id, "leaves its gang, which goes on without it");
+            self.regroup(key, i, left);
+        }
         Ok(true)
     }
 

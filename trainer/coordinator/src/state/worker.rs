@@ -110,6 +110,9 @@ pub struct Worker {
     #[serde(default, skip_serializing_if = "Labels::is_empty")]
     pub labels: Labels,
     pub presence: Presence,
+    /// True once the process was asked to end.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub leaving: bool,
     /// Number of times that this process was removed from a gang, or was the only one to complain of a removed member.
     /// Each time it is shunned for longer. The number decreases with time.
     pub suspicions: u32,
@@ -139,12 +142,18 @@ impl Worker {
             peer_address: join.peer_address.clone(),
             labels: join.labels.clone(),
             presence: Presence::Here,
+            leaving: false,
             suspicions: 0,
             suspected: None,
             shunned: None,
             ready: BTreeSet::new(),
             holds: None,
         }
+    }
+
+    /// Returns true if the worker may be given work.
+    pub fn is_available(&self) -> bool {
+        self.presence == Presence::Here && !self.leaving
     }
 
     /// Returns true if the worker is not known to be alive.

@@ -134,7 +134,7 @@ impl PureCoordinator {
     }
 
     pub(crate) fn poll(&mut self, name: &str, incarnation: Incarnation) {
-        let poll = Poll { incarnation, doing: Vec::new(), ready: Vec::new(), version: 0 };
+        let poll = Poll { incarnation, doing: Vec::new(), ready: Vec::new(), version: 0, leaving: false };
         self.hear(Observation::Poll { worker: name.into(), poll });
     }
 

@@ -42,7 +42,7 @@ fn join(name: &str) -> Ask {
 }
 
 fn poll(incarnation: Incarnation) -> Poll {
-    Poll { incarnation, doing: Vec::new(), ready: Vec::new(), version: 0 }
+    Poll { incarnation, doing: Vec::new(), ready: Vec::new(), version: 0, leaving: false }
 }
 
 fn full() -> Result<(), WriteError> {

@@ -60,7 +60,7 @@ impl Gang {
             Doing { holds, lost, ..Doing::new(assignment.grant, Progress::default()) }
         });
         let doing = doing.into_iter().collect();
-        let poll = Poll { incarnation: self.processes[name], doing, ready: Vec::new(), version: 0 };
+        let poll = Poll { incarnation: self.processes[name], doing, ready: Vec::new(), version: 0, leaving: false };
         self.coordinator.hear(Observation::Poll { worker: name.into(), poll });
     }
 
@@ -264,6 +264,69 @@ fn a_suspicion_fades_and_a_complaint_alone_weighs_on_its_author() {
     assert_eq!((gang.shunned_ms("w3"), suspicions(&gang, "w1")), (6_000, 1));
 }
 
+impl Gang {
+    /// Polls for a member whose process was asked to end.
+    fn say_goodbye(&mut self, name: &str, holds: Option<u64>) {
+        let doing = self.coordinator.assignment(name);
+        let doing = doing.map(|assignment| Doing { holds, ..Doing::new(assignment.grant, Progress::default()) });
+        let (incarnation, doing) = (self.processes[name], doing.into_iter().collect());
+        let poll = Poll { incarnation, doing, ready: Vec::new(), version: 0, leaving: true };
+        self.coordinator.hear(Observation::Poll { worker: name.into(), poll });
+    }
+
+    fn state_of(&self, name: &str) -> String {
+        let views = self.coordinator.state.worker_views();
+        views.into_iter().find(|view| view.worker == WorkerId::from(name)).expect("known").state
+    }
+}
+
+/// The leader is asked to end. The gang goes on in the same attempt, and the worker gets nothing else.
+#[test]
+fn a_gang_goes_on_without_a_member_that_is_asked_to_end() {
+    let mut gang = Gang::new(ANY, &["w1", "w2", "w3"]);
+    ["w1", "w2", "w3"].iter().for_each(|name| gang.say(name, Some(7), &[]));
+    gang.say_goodbye("w1", Some(7));
+    assert_eq!(gang.members(), (vec!["w2".into(), "w3".into()], 1));
+    assert_eq!(gang.state_of("w1"), "leaving");
+    let assignment = gang.coordinator.assignment("w2").expect("it goes on");
+    assert!(!assignment.drain, "nobody has to save");
+    gang.say_goodbye("w1", None);
+    gang.pass(1_000);
+    assert_eq!(gang.names(), ["w2", "w3"]);
+    gang.coordinator.happen(coordinator::Event::WorkerGone { worker: "w1".into(), incarnation: None }).expect("taken");
+    assert_eq!(gang.state_of("w1"), "gone");
+}
+
+/// All members are asked to end: the last one keeps the task and saves.
+#[test]
+fn the_last_member_that_is_asked_to_end_keeps_the_task() {
+    let mut gang = Gang::new(ANY, &["w1", "w2"]);
+    ["w1", "w2"].iter().for_each(|name| gang.say(name, Some(7), &[]));
+    gang.say_goodbye("w1", Some(7));
+    gang.say_goodbye("w2", Some(7));
+    assert_eq!(gang.members(), (vec!["w2".into()], 1));
+    let yielded = TaskOutcome::Yielded { at: 7 };
+    let assignment = gang.coordinator.assignment("w2").expect("it holds the task");
+    gang.coordinator.report(&assignment, yielded);
+    assert!(gang.names().is_empty(), "a worker that leaves gets no work");
+    gang.join("w3");
+    assert_eq!(gang.members(), (vec!["w3".into()], 2));
+}
+
+/// The others have no state, or are too few: the member keeps its task, saves and stops.
+#[test]
+fn a_member_without_which_the_gang_cannot_go_on_stays() {
+    let mut gang = Gang::new(ANY, &["w1", "w2"]);
+    gang.say("w1", Some(7), &[]);
+    gang.say("w2", None, &[]);
+    gang.say_goodbye("w1", Some(7));
+    assert_eq!(gang.names(), ["w1", "w2"]);
+    let mut pair = Gang::new(WorkerRange { min: 2, max: 8 }, &["w1", "w2"]);
+    ["w1", "w2"].iter().for_each(|name| pair.say(name, Some(7), &[]));
+    pair.say_goodbye("w1", Some(7));
+    assert_eq!(pair.names(), ["w1", "w2"]);
+}
+
 /// A shunned worker may work alone, and must report its fetched inputs again.
 #[test]
 fn a_shunned_worker_begins_alone_what_nobody_else_does() {
@@ -351,7 +414,7 @@ fn a_lead_that_polls_and_does_nothing_is_left_after_a_while() {
         let poll = |gang: &mut Gang, name: &str, holds: Option<u64>, waits_for: Option<WorkerId>| {
             let grant = gang.coordinator.assignment(name).expect("a member").grant;
             let doing = vec![Doing { holds, waits_for, ..Doing::new(grant, Progress::default()) }];
-            let poll = Poll { incarnation: gang.processes[name], doing, ready: Vec::new(), version: 0 };
+            let poll = Poll { incarnation: gang.processes[name], doing, ready: Vec::new(), version: 0, leaving: false };
             gang.coordinator.hear(Observation::Poll { worker: name.into(), poll });
         };
         for second in 0..Policy::default().stall_ms / 5_000 {

@@ -114,7 +114,7 @@ fn p2_what_a_member_says_that_was_left_behind_is_not_believed() {
     let progress = Progress { done: 999, total: 1000, ..Progress::default() };
     let doing = Doing { holds: Some(999), lost: ["b", "c"].map(lost).into(), ..Doing::new(old.clone(), progress) };
     let doing = vec![doing];
-    let poll = Poll { incarnation: a, doing, ready: Vec::new(), version: 0 };
+    let poll = Poll { incarnation: a, doing, ready: Vec::new(), version: 0, leaving: false };
     let heard =
         observe(&mut coordinator.state, Millis(coordinator.now), Observation::Poll { worker: "a".into(), poll });
     let heard = heard.expect("it is known");

@@ -59,7 +59,7 @@ fn beat_of(coordinator: &mut PureCoordinator, names: impl IntoIterator<Item = &'
         let doing = coordinator
             .assignment(name)
             .map(|held| Doing { holds: Some(7), ..Doing::new(held.grant, Progress::default()) });
-        let poll = Poll { incarnation, doing: doing.into_iter().collect(), ready, version: 0 };
+        let poll = Poll { incarnation, doing: doing.into_iter().collect(), ready, version: 0, leaving: false };
         coordinator.hear(Observation::Poll { worker: name.into(), poll });
     }
     coordinator.now += 1_000;

@@ -26,7 +26,7 @@ fn reports(coordinator: &mut PureCoordinator, incarnation: Incarnation, done: u6
     let grant = coordinator.assignment("a").expect("it trains").grant;
     let progress = Progress { done, total: 300, unit: "steps".to_owned(), ..Progress::default() };
     let doing = vec![Doing::new(grant, progress)];
-    let poll = Poll { incarnation, doing, ready: Vec::new(), version: 0 };
+    let poll = Poll { incarnation, doing, ready: Vec::new(), version: 0, leaving: false };
     coordinator.hear(Observation::Poll { worker: "a".into(), poll });
 }
 
@@ -63,7 +63,7 @@ fn the_highest_memory_of_a_stage_is_shown_while_it_runs_and_afterwards() {
     {
         let grant = coordinator.assignment(name).expect("it trains").grant;
         let doing = Doing { peak_memory: Some(peak), ..Doing::new(grant, Progress::default()) };
-        let poll = Poll { incarnation, doing: vec![doing], ready: Vec::new(), version: 0 };
+        let poll = Poll { incarnation, doing: vec![doing], ready: Vec::new(), version: 0, leaving: false };
         coordinator.hear(Observation::Poll { worker: name.into(), poll });
     }
     assert_eq!(stage(&coordinator, &run, "vae").peak_memory, Some(500));

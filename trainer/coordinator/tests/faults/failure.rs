@@ -38,7 +38,13 @@ async fn a_panic_of_the_actor_is_told_to_everybody_at_once() -> TestResult {
     let joined: Joined =
         as_worker(server.request(Method::POST, "/v1/workers")).json(&offer()).send().await?.json().await?;
     // The first poll has no version and is answered at once; the next one has the current version and waits.
-    let poll = |version| Poll { incarnation: joined.incarnation, doing: Vec::new(), ready: Vec::new(), version };
+    let poll = |version| Poll {
+        incarnation: joined.incarnation,
+        doing: Vec::new(),
+        ready: Vec::new(),
+        version,
+        leaving: false,
+    };
     let path = "/v1/workers/a/poll";
     let mut version = 0;
     let waiting = loop {

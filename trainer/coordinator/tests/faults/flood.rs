@@ -68,7 +68,8 @@ async fn a_flood_of_submissions_fills_a_short_queue_and_delays_no_heartbeat() ->
 
     fail::cfg("actor::decide", "pause")?;
     let beats = async {
-        let poll = Poll { incarnation: joined.incarnation, doing: Vec::new(), ready: Vec::new(), version: 0 };
+        let poll =
+            Poll { incarnation: joined.incarnation, doing: Vec::new(), ready: Vec::new(), version: 0, leaving: false };
         for _ in 0..20 {
             let begun = Instant::now();
             let status = caller.post("/v1/workers/a/poll", &poll).send().await?.status();
@@ -95,7 +96,8 @@ async fn a_flood_of_values_is_told_to_come_again() -> TestResult {
     let mut caller = Caller::start(dir.path()).await?;
     caller.handle.submit(submission()?).await?;
     let joined: Joined = caller.post("/v1/workers", &offer()).send().await?.json().await?;
-    let poll = Poll { incarnation: joined.incarnation, doing: Vec::new(), ready: Vec::new(), version: 0 };
+    let poll =
+        Poll { incarnation: joined.incarnation, doing: Vec::new(), ready: Vec::new(), version: 0, leaving: false };
     let assignment = loop {
         let desired: DesiredAssignments = caller.post("/v1/workers/a/poll", &poll).send().await?.json().await?;
         if let Some(assignment) = desired.assignments.into_iter().next() {

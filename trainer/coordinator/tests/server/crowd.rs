@@ -101,7 +101,8 @@ fn echo() -> TcpStream {
 /// Sends heartbeats until `until`. Each is answered at once, because its version is never current.
 fn beat(handle: &Handle, until: Instant) -> Times {
     let (mut known, joined) = join(handle);
-    let poll = Poll { incarnation: joined.incarnation, doing: vec![], ready: vec![], version: u64::MAX };
+    let poll =
+        Poll { incarnation: joined.incarnation, doing: vec![], ready: vec![], version: u64::MAX, leaving: false };
     let mut times = Times { kept: vec![], new: vec![], echo: vec![] };
     let mut echo = echo();
     while Instant::now() < until {
@@ -226,7 +227,8 @@ async fn silent_connections_end_and_known_ones_are_not_evicted() {
     let limits = Connections { most: 20, anonymous: 4, idle: Duration::from_secs(4), ..Connections::default() };
     let handle = start(dir.path(), limits).await;
     let (mut known, joined) = join(&handle);
-    let poll = Poll { incarnation: joined.incarnation, doing: vec![], ready: vec![], version: u64::MAX };
+    let poll =
+        Poll { incarnation: joined.incarnation, doing: vec![], ready: vec![], version: u64::MAX, leaving: false };
 
     // The fifth anonymous connection replaces the first.
     let mut anonymous: Vec<TcpStream> = (0..5).map(|_| TcpStream::connect(handle.address()).unwrap()).collect();

@@ -170,7 +170,7 @@ async fn join(client: &Client, name: &str) -> TestResult<Joined> {
 async fn assignment(client: &Client, name: &str, joined: &Joined, stage: &str) -> TestResult<Assignment> {
     let (mut version, mut ready) = (0, Vec::new());
     loop {
-        let poll = Poll { incarnation: joined.incarnation, doing: vec![], ready, version };
+        let poll = Poll { incarnation: joined.incarnation, doing: vec![], ready, version, leaving: false };
         let desired: DesiredAssignments = client.call("POST", &format!("/v1/workers/{name}/poll"), poll).await?;
         version = desired.version;
         ready = desired.prepare.into_iter().map(|prepare| prepare.task).collect();
@@ -423,7 +423,7 @@ async fn p2_a_silent_worker_loses_its_task_and_its_writes_are_refused() -> TestR
 
     // A process that joins with the same name replaces the old one, whose polls are refused.
     join(&client, "b").await?;
-    let poll = Poll { incarnation: second.incarnation, doing: vec![], ready: vec![], version: 0 };
+    let poll = Poll { incarnation: second.incarnation, doing: vec![], ready: vec![], version: 0, leaving: false };
     assert_eq!(client.refused("/v1/workers/b/poll", poll.clone()).await?.0, 409);
     assert_eq!(client.refused("/v1/workers/c/poll", poll).await?.0, 404);
     handle.shutdown().await;
@@ -447,7 +447,8 @@ async fn polls_alone_keep_a_lease_and_show_progress() -> TestResult {
             let progress = Progress { done, total: 100, ..Progress::default() };
             let doing = Doing::new(held.clone(), progress);
             let doing = if name == "a" { vec![doing] } else { vec![] };
-            let poll = Poll { incarnation: joined.incarnation, doing, ready: vec![], version: version[i] };
+            let poll =
+                Poll { incarnation: joined.incarnation, doing, ready: vec![], version: version[i], leaving: false };
             let desired: DesiredAssignments = client.call("POST", &format!("/v1/workers/{name}/poll"), poll).await?;
             version[i] = desired.version;
             let grants: Vec<&Grant> = desired.assignments.iter().map(|assignment| &assignment.grant).collect();

@@ -87,7 +87,7 @@ fn working(handle: &Handle) -> (Caller, Assignment) {
     let mut worker = Caller::connect(handle.address(), WORKER);
     Caller::connect(handle.address(), SUBMITTER).post::<serde_json::Value>("/v1/runs", &submission().unwrap());
     let joined: Joined = worker.post("/v1/workers", &offer());
-    let poll = Poll { incarnation: joined.incarnation, doing: vec![], ready: vec![], version: 0 };
+    let poll = Poll { incarnation: joined.incarnation, doing: vec![], ready: vec![], version: 0, leaving: false };
     let begun = Instant::now();
     loop {
         let desired: DesiredAssignments = worker.post("/v1/workers/a/poll", &poll);

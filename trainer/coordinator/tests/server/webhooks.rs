@@ -159,7 +159,7 @@ async fn a_stage_that_stands_still_is_reported_once() -> TestResult {
     let joined: Joined = joined.send().await?.error_for_status()?.json().await?;
     let mut held: Option<Assignment> = None;
     for _ in 0..20 {
-        let poll = Poll { incarnation: joined.incarnation, doing: vec![], ready: vec![], version: 0 };
+        let poll = Poll { incarnation: joined.incarnation, doing: vec![], ready: vec![], version: 0, leaving: false };
         let polled = server.request(Method::POST, "/v1/workers/a/poll").header(SECRET_HEADER, SECRET).json(&poll);
         let desired: DesiredAssignments = polled.send().await?.error_for_status()?.json().await?;
         held = held.or(desired.assignments.into_iter().next());

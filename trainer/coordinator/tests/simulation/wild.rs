@@ -47,6 +47,7 @@ pub(crate) fn events(state: &State, ended: &[Run]) -> Vec<Event> {
         events.push(Event::WorkerBack { worker: worker.clone() });
         let tasks = state.tasks.keys().take(3).cloned().chain(["none".into()]).collect();
         events.push(Event::WorkerReady { worker: worker.clone(), incarnation, tasks });
+        events.push(Event::WorkerLeaves { worker: worker.clone(), incarnation });
         events.push(Event::LeaseExpired { worker: worker.clone(), incarnation });
         events.push(Event::LeaseExpired { worker: worker.clone(), incarnation: Incarnation(0) });
         for incarnation in [None, Some(incarnation), Some(Incarnation(0))] {

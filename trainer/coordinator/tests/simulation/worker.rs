@@ -67,6 +67,8 @@ pub(crate) struct FakeWorker {
     pub(crate) name: WorkerId,
     /// Set while the process exists.
     pub(crate) alive: bool,
+    /// The time at which the process was asked to end.
+    pub(crate) leaving: Option<Millis>,
     /// The process is stopped by a signal until this time.
     pub(crate) hung_until: Millis,
     /// The stage hangs until this time, while the process still polls.
@@ -102,6 +104,7 @@ impl FakeWorker {
         Self {
             name: name.into(),
             alive: false,
+            leaving: None,
             hung_until: Millis(0),
             stuck_until: Millis(0),
             refuses_until: Millis(0),
@@ -142,6 +145,11 @@ impl FakeWorker {
 
     pub(crate) fn runs(&self, now: Millis) -> bool {
         self.alive && self.hung_until <= now
+    }
+
+    /// Returns true if the process ends: it was asked to, and has no work or no more time.
+    pub(crate) fn has_left(&self, now: Millis) -> bool {
+        self.alive && self.leaving.is_some_and(|since| self.grant().is_none() || now.since(since) > 5_000)
     }
 
     /// Returns true if it is the process of this member.
@@ -276,7 +284,13 @@ impl FakeWorker {
         let ready: Vec<TaskId> = ready.collect();
         self.said_ready.extend(ready.iter().cloned());
         let version = self.desired.as_ref().map_or(0, |desired| desired.version);
-        let mut calls = vec![Call::Poll(Poll { incarnation, doing: doing.into_iter().collect(), ready, version })];
+        let mut calls = vec![Call::Poll(Poll {
+            incarnation,
+            doing: doing.into_iter().collect(),
+            ready,
+            version,
+            leaving: self.leaving.is_some(),
+        })];
         match &self.saving {
             Saving::Commit(commit) => calls.push(Call::Commit(commit.clone())),
             Saving::Report(report) => calls.push(Call::Report(report.clone())),

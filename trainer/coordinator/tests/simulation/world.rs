@@ -20,7 +20,7 @@ use crate::store::FakeStore;
 use crate::worker::{Answer, Call, FakeWorker};
 
 /// All injected faults. A fault that is never counted has silently disappeared from the simulation.
-pub(crate) const INJECTED: [&str; 29] = [
+pub(crate) const INJECTED: [&str; 30] = [
     "a call that was lost",
     "a call that came twice",
     "a worker that died",
@@ -29,6 +29,7 @@ pub(crate) const INJECTED: [&str; 29] = [
     "a cut that only one of two peers notices",
     "a refused peer port",
     "a false complaint",
+    "a worker that was asked to end",
     "a stage that hangs while its worker polls",
     "a member whom its peers could not reach",
     "a slow joiner",

@@ -38,7 +38,7 @@ async fn a_worker_that_is_kept_for_draws_takes_nothing_else() -> TestResult {
     let (status, answer) = draw(&lab, "anna", &asked).await?;
     assert_eq!(status, StatusCode::OK, "{answer}");
     let drawing: Drawing = serde_json::from_value(answer)?;
-    let poll = serde_json::to_value(Poll { incarnation, doing: vec![], ready: vec![], version: 0 })?;
+    let poll = serde_json::to_value(Poll { incarnation, doing: vec![], ready: vec![], version: 0, leaving: false })?;
     let task = loop {
         let (_, answer) = lab.call("node", "POST", "/v1/workers/a/poll", &poll).await?;
         let desired: DesiredAssignments = serde_json::from_value(answer)?;

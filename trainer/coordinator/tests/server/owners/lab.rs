@@ -213,7 +213,7 @@ impl Lab {
     async fn work(&mut self) -> TestResult {
         let joined: Joined =
             serde_json::from_value(self.call("node", "POST", "/v1/workers", &serde_json::to_value(offer())?).await?.1)?;
-        let poll = Poll { incarnation: joined.incarnation, doing: vec![], ready: vec![], version: 0 };
+        let poll = Poll { incarnation: joined.incarnation, doing: vec![], ready: vec![], version: 0, leaving: false };
         let Assignment { grant, secret, .. } = loop {
             let answer = self.call("node", "POST", "/v1/workers/a/poll", &serde_json::to_value(&poll)?).await?;
             let desired: DesiredAssignments = serde_json::from_value(answer.1)?;

@@ -52,7 +52,7 @@ async fn a_call_that_waits_ends_when_its_token_is_revoked() -> TestResult {
     let mut join = serde_json::to_value(offer())?;
     join["worker"] = "idle".into();
     let joined: Joined = serde_json::from_value(lab.call("node", "POST", "/v1/workers", &join).await?.1)?;
-    let mut poll = Poll { incarnation: joined.incarnation, doing: vec![], ready: vec![], version: 0 };
+    let mut poll = Poll { incarnation: joined.incarnation, doing: vec![], ready: vec![], version: 0, leaving: false };
     let first = lab.call("node", "POST", "/v1/workers/idle/poll", &serde_json::to_value(&poll)?).await?.1;
     poll.version = first["version"].as_u64().ok_or("a version")?;
     let (poll, begun) = (serde_json::to_value(&poll)?, std::time::Instant::now());

@@ -62,7 +62,7 @@ pub(super) async fn fill(handle: &Handle, store: &Store) -> TestResult<[RunId; 2
     let join = protocol::message::Join { instruction_set: HOSTILE.into(), ..offer() };
     let joined = call(&server, SECRET, Method::POST, "/v1/workers", &join).await?;
     let joined: Joined = serde_json::from_value(joined)?;
-    let poll = Poll { incarnation: joined.incarnation, doing: vec![], ready: vec![], version: 0 };
+    let poll = Poll { incarnation: joined.incarnation, doing: vec![], ready: vec![], version: 0, leaving: false };
     let Assignment { grant, secret, .. } = loop {
         let answer = call(&server, SECRET, Method::POST, "/v1/workers/a/poll", &poll).await?;
         let desired: DesiredAssignments = serde_json::from_value(answer)?;

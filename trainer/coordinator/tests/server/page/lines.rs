@@ -24,7 +24,7 @@ async fn a_worker_whose_poll_breaks_is_shown_as_unreachable_before_its_lease_end
     let handle = with_tokens(dir.path()).await;
     let server = Server::new(&handle.url(), Some(handle.token().clone()), None)?;
     let joined: Joined = serde_json::from_value(call(&server, SECRET, Method::POST, "/v1/workers", &offer()).await?)?;
-    let mut poll = Poll { incarnation: joined.incarnation, doing: vec![], ready: vec![], version: 0 };
+    let mut poll = Poll { incarnation: joined.incarnation, doing: vec![], ready: vec![], version: 0, leaving: false };
     let answer = call(&server, SECRET, Method::POST, "/v1/workers/a/poll", &poll).await?;
     poll.version = serde_json::from_value::<DesiredAssignments>(answer)?.version;
     assert_eq!(state(&server).await?, "idle");

@@ -166,7 +166,7 @@ impl Worker {
     }
 
     pub(crate) fn poll_of(&self, ready: Vec<protocol::TaskId>, version: u64) -> Poll {
-        Poll { incarnation: self.process.incarnation, doing: vec![], ready, version }
+        Poll { incarnation: self.process.incarnation, doing: vec![], ready, version, leaving: false }
     }
 
     pub(crate) async fn try_poll(&self) -> (u16, Value) {

@@ -93,7 +93,7 @@ impl Known {
                 let worker = random.one_of(&self.names).as_str().into();
                 let lost = vec![LostPeer { worker, cause: LossCause::Unreachable }];
                 let doing = vec![Doing { lost, ..Doing::new(grant, progress) }];
-                let poll = Poll { incarnation, doing, ready: vec![], version: 0 };
+                let poll = Poll { incarnation, doing, ready: vec![], version: 0, leaving: false };
                 post(&format!("/v1/workers/{name}/poll")).json(&poll)
             }
             2 => post(&format!("/v1/workers/{name}/gone")).json(&Gone { incarnation }),

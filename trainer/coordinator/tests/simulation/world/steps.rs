@@ -160,6 +160,10 @@ impl World {
                     self.ask(Ask::Event(Box::new(Event::WorkerGone { worker, incarnation: None })), Ticket::Nobody);
                 }
             }
+            70..78 if self.workers[i].alive => {
+                self.workers[i].leaving.get_or_insert(self.now);
+                self.count("a worker that was asked to end");
+            }
             40..48 => {
                 let other = self.random.below(self.workers.len() as u64) as usize;
                 if other != i {
@@ -355,6 +359,15 @@ impl World {
 
     fn workers_step(&mut self) {
         let now = self.now;
+        for i in 0..self.workers.len() {
+            if self.workers[i].has_left(now) {
+                self.workers[i].alive = false;
+                let worker = self.workers[i].name.clone();
+                if self.up {
+                    self.ask(Ask::Event(Box::new(Event::WorkerGone { worker, incarnation: None })), Ticket::Nobody);
+                }
+            }
+        }
         self.cuts.retain(|cut| cut.until > now);
         let cuts = self.cuts.clone();
         let refusing: Vec<WorkerId> =
