@@ -102,6 +102,8 @@ pub struct Remote {
     pub(super) store: Arc<dyn Bucket>,
     /// Signs requests of workers.
     pub(super) signer: Option<Arc<dyn Signer>>,
+    /// The client of signed requests of this process. `None` inside if it cannot be made.
+    pub(super) http: OnceLock<Option<reqwest::Client>>,
     /// Answer of the server to a first signed put; `None` before it.
     pub(super) takes_puts: OnceLock<bool>,
     health: Health,
@@ -201,6 +203,7 @@ impl Remote {
             prefix: prefix.to_owned(),
             store,
             signer: None,
+            http: OnceLock::new(),
             takes_puts: OnceLock::new(),
             health: Health::default(),
             runtime: Some(runtime),

@@ -92,17 +92,13 @@ impl Remote {
 
     /// Sends a signed request and returns its answer.
     fn send(&self, method: reqwest::Method, signed: &SignedRequest, body: &'static [u8]) -> Option<reqwest::Response> {
-        let local = |e: reqwest::Error| Error::Generic { store: LOCAL, source: e.without_url().into() };
-        let mut headers = reqwest::header::HeaderMap::new();
+        let made = || reqwest::Client::builder().redirect(reqwest::redirect::Policy::none()).timeout(OWN).build().ok();
+        let mut request = self.http.get_or_init(made).as_ref()?.request(method, &signed.url).body(body);
         for (name, value) in &signed.headers {
-            let name: reqwest::header::HeaderName = name.parse().ok()?;
-            headers.insert(name, value.parse().ok()?);
+            request = request.header(name, value);
         }
-        let url = signed.url.clone();
-        let sent = self.run(async move {
-            let http = reqwest::Client::builder().timeout(OWN).build().map_err(local)?;
-            http.request(method, url).headers(headers).body(body).send().await.map_err(local)
-        });
+        let local = |e: reqwest::Error| Error::Generic { store: LOCAL, source: e.without_url().into() };
+        let sent = self.run(async move { request.send().await.map_err(local) });
         sent.inspect_err(|error| tracing::debug!("a signed request failed: {}", innermost(error))).ok()
     }
 }
