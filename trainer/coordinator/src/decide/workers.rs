@@ -50,7 +50,7 @@ impl Deciding<'_> {
         Ok(true)
     }
 
-    /// Gives no more work to a worker whose process was asked to end. Its gang goes on without it if another member
+    /// Gives no more work to a worker whose process was asked to end. Its gang continues without it if another member
     /// holds the state; otherwise the worker saves first. Returns `false` if it is known to be leaving.
     pub(crate) fn leaves(&mut self, worker: WorkerId, incarnation: Incarnation) -> Result<bool, Rejected> {
         let known = self.state.process(&worker, incarnation)?;
