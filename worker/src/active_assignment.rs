@@ -21,7 +21,7 @@ use crate::gang::mesh::{Halt, Mesh};
 
 /// Time to wait after a refused write for the orders that explain it.
 const STALE_PATIENCE: Duration = Duration::from_secs(30);
-/// Time for the coordinator to let a gang go on without this worker. Then the whole gang saves and stops.
+/// Time for the coordinator to let a gang continue without this worker. Then the whole gang saves and stops.
 const POLITE: Duration = Duration::from_secs(1);
 /// Time to train after a failed checkpoint before the next try.
 const SAVE_PAUSE: Duration = Duration::from_secs(5);
@@ -245,7 +245,7 @@ impl ActiveAssignment {
     }
 
     /// Returns true if a stage of `members` members should stop between two steps, because the coordinator drains it or
-    /// the worker is leaving. A gang usually goes on without this worker, for which the coordinator has [`POLITE`].
+    /// the worker is leaving. Within [`POLITE`], the gang usually continues without it.
     pub(crate) fn drain(&self, members: usize) -> bool {
         let leaves = |waited: Duration| members <= 1 || waited >= POLITE;
         self.flags.leaving_for().is_some_and(leaves) || lock(&self.state).assignment.drain

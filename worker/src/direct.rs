@@ -1,7 +1,7 @@
 //! Transfers between a worker and the place of the blobs itself, by requests that the coordinator has signed.
 //!
 //! A worker may have no way to the place: another network, another certificate, a proxy. So a failure is never final. The
-//! transfer goes on through the coordinator, and signed requests pause.
+//! transfer continues through the coordinator, and signed requests pause.
 
 use std::sync::Mutex;
 use std::time::{Duration, Instant};

@@ -88,7 +88,7 @@ pub trait Backend: Send + Sync + fmt::Debug {
         None
     }
     /// Signs a request that stores a blob under a name of 64 hexadecimal digits beside the blobs, unless that is taken. The
-    /// place refuses other bytes than those that hash to `digest`. `None` if the place takes no such requests.
+    /// place refuses bytes that do not hash to `digest`. `None` if the place takes no such requests.
     fn sign_write(&self, name: &str, digest: Digest) -> Option<SignedRequest> {
         let _ = (name, digest);
         None

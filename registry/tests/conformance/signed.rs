@@ -177,7 +177,7 @@ fn azure_is_read_by_signed_requests_alone() {
     let http = runtime();
     let whole = bytes(300_000);
     let [digest, other] = [whole.clone(), bytes(200_000)].map(|bytes| store.put(&bytes).unwrap());
-    // It does not report the SHA-256 of what it stores.
+    // It does not report the SHA-256 of an object.
     assert_eq!(store.sign_write(&common::grant("r/s", 1), digest), None);
 
     let read = store.sign_read(digest).unwrap().expect("reads are signed");

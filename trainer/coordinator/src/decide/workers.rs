@@ -70,7 +70,7 @@ impl Deciding<'_> {
             && left.len() >= self.state.executions[&key].range().min.max(1)
             && left.iter().any(|member| stays(member) && holds(member));
         if goes_on {
-            tracing::info!(%worker, task = %task.id, "leaves its gang, which goes on without it");
+            tracing::info!(%worker, task = %task.id, "leaves its gang, which continues");
             self.regroup(key, i, left);
         }
         Ok(true)

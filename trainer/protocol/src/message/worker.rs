@@ -56,7 +56,7 @@ pub struct Poll {
     /// Version of the assignments that the worker has ([`DesiredAssignments::version`]). The coordinator answers at
     /// once if it has another version, else within `poll_ms`.
     pub version: u64,
-    /// True once the process was asked to end. It takes no more work, and gangs that can go on without it do so.
+    /// True once the process was asked to end. It takes no more work, and gangs continue without it where they can.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub leaving: bool,
 }
