@@ -22,7 +22,7 @@ use crate::gang::mesh::{Halt, Mesh};
 /// Time to wait after a refused write for the orders that explain it.
 const STALE_PATIENCE: Duration = Duration::from_secs(30);
 /// Time for the coordinator to let a gang continue without this worker. Then the whole gang saves and stops.
-const POLITE: Duration = Duration::from_secs(1);
+const POLITE: Duration = Duration::from_secs(3);
 /// Time to train after a failed checkpoint before the next try.
 const SAVE_PAUSE: Duration = Duration::from_secs(5);
 
