@@ -88,6 +88,9 @@ mutation a-refused-blob-is-tried-again worker/src/blobs.rs 's/BlobError::Unfit\(
 mutation name-of-another-token trainer/coordinator/src/state/worker.rs 's/if own\.caller != by\.caller/if own.caller.is_empty()/' coordinator:server:workers
 mutation name-of-a-live-process trainer/coordinator/src/state/worker.rs 's/if own\.secret == by\.secret =>/if !own.caller.is_empty() =>/' coordinator:server:workers
 mutation failed-where-it-failed trainer/coordinator/src/decide/schedule.rs 's{if task.failed_on.is_empty\(\) }{if true }' coordinator:decisions:liveness
+mutation a-leaving-worker-gets-work trainer/coordinator/src/state/worker.rs 's/self\.presence == Presence::Here && !self\.leaving/self.presence == Presence::Here/' coordinator:decisions:gangs
+mutation a-gang-stops-when-a-member-leaves trainer/coordinator/src/decide/workers.rs 's/if goes_on \{/if goes_on \&\& self.state.draining {/' coordinator:decisions:gangs
+mutation a-gang-loses-its-state-when-a-member-leaves trainer/coordinator/src/decide/workers.rs 's/stays\(member\) && holds\(member\)/stays(member) || holds(member)/' coordinator:decisions:gangs
 mutation a-name-is-waited-for-once worker/src/assignments.rs 's/begun = Instant::now\(\);\n                if said/if said/' worker:lib:restart_of_the_coordinator
 mutation name-beyond-its-pattern trainer/coordinator/src/shell/secrets.rs 's/\|names\| !names\.allow\(worker\.as_str\(\)\)/|_| false/' coordinator:server:workers
 mutation poll-without-its-secret trainer/coordinator/src/shell/secrets.rs 's/if identity\.secret == Digest::of\(self\.secret\.0\.as_bytes\(\)\)/if !self.secret.0.contains("?")/' coordinator:server:workers
