@@ -38,6 +38,7 @@ const STATES = {
   ready: ["warn", "◔"],
   idle: ["idle", "○"],
   working: ["run", "●"],
+  leaving: ["idle", "◌"],
   unreachable: ["bad", "✕"],
   silent: ["warn", "◔"],
   gone: ["idle", "⊘"],

@@ -125,7 +125,7 @@ export function workers(context) {
   }
 
   function render() {
-    const order = ["working", "idle", "silent", "unreachable", "gone"];
+    const order = ["working", "leaving", "idle", "silent", "unreachable", "gone"];
     const here = list.filter((worker) => worker.state !== "gone");
     const gone = list.length - here.length;
     const shown = [...(withGone ? list : here)].sort((a, b) => order.indexOf(a.state) - order.indexOf(b.state) || a.worker.localeCompare(b.worker, "en", { numeric: true }));
