@@ -5,7 +5,9 @@
 # Exits with 1 if no test finds a fault, or if the code that a fault changes no longer exists.
 set -euo pipefail
 root=$(cd "$(dirname "$0")/.." && pwd)
-copy=$(mktemp -d)
+# Not below /tmp, which a sandboxed worker may read: its test would fail without a fault.
+mkdir -p "$root/target"
+copy=$(mktemp -d "$root/target/mutation.XXXXXX")
 export CARGO_TARGET_DIR=${MUTATIONS_TARGET:-$root/target/mutations}
 git -C "$root" worktree add --quiet --force --detach "$copy" HEAD
 trap 'git -C "$root" worktree remove --force "$copy"' EXIT
