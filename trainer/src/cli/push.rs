@@ -146,7 +146,10 @@ impl Worker {
         let said = last_lines(&last_words(self.log.path(), 0), LAST_LINES);
         let code = status.code().and_then(|code| u8::try_from(code).ok()).unwrap_or(exit::FAILED);
         let problem = Problem::new(code, anyhow::anyhow!("the worker of this machine ended ({status})\n{said}"));
-        Err(problem.hint("the token needs the scopes `submit` and `worker`"))
+        Err(match code {
+            exit::UNAUTHORISED => problem.hint("the token needs the scopes `submit` and `worker`"),
+            _ => problem.hint("push again; the stages continue where they were"),
+        })
     }
 
     /// Asks the worker to leave, so that the server does not wait for it.
