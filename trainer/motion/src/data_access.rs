@@ -19,7 +19,10 @@ use crate::roots::Root;
 #[derive(Debug, thiserror::Error)]
 pub enum AccessError {
     /// The worker has no data root.
-    #[error("`{path}`: this worker has no data root; start it with `--data-root DIR` and use a path below that folder")]
+    #[error(
+        "`{path}`: this worker has no data root; start it with `--data-root DIR` and use a path below that folder, or \
+         bring the data with `trainer data push PIPELINE`"
+    )]
     NoRoots {
         /// As the pipeline has it.
         path: String,
