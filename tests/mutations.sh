@@ -104,8 +104,9 @@ mutation mention-of-foreign-blobs trainer/coordinator/src/shell/vouching.rs 's/i
 mutation staged-of-everybody trainer/coordinator/src/shell/uploads.rs 's/let has_receipt = receipt\.is_some\(\)/let has_receipt = receipt.is_none()/' coordinator:server:workers
 mutation sent-on-a-workers-word trainer/coordinator/src/shell/uploads.rs 's/blobs\.has_arrived\(&asked, digest\)/asked.fence.0 > 0 || blobs.has_arrived(\&asked, digest)/' coordinator:server:workers
 mutation sent-by-anybody registry/src/blob/direct.rs 's/staged_name\(&\(holder\(grant\), digest\)\)/{ let _ = (grant, staged_name, holder); digest.hex() }/' registry:conformance:signed
-mutation a-signed-put-of-any-bytes registry/src/blob/objects/signed.rs 's/&\[\(CHECKSUM, &checksum\(digest\)\), \(IF_NONE_MATCH, "\*"\)\]/\&[(IF_NONE_MATCH, "*")]/' registry:conformance:signed
-mutation a-signed-put-that-overwrites registry/src/blob/objects/signed.rs 's/, \(IF_NONE_MATCH, "\*"\)\]/]/' registry:conformance:signed
+mutation a-signed-put-of-any-bytes registry/src/blob/objects/signed.rs 's/\[\(CHECKSUM, &\*sum\), \(IF_NONE/[(IF_NONE/' registry:conformance:signed
+mutation a-signed-put-that-overwrites registry/src/blob/objects/signed.rs 's/\(IF_NONE_MATCH, "\*"\), //' registry:conformance:signed
+mutation a-copy-counts-as-sent registry/src/blob/objects/signed.rs 's/ && reported\(OWNER\) == Some\(name\)//' registry:conformance:signed
 mutation worker-reads-everything trainer/coordinator/src/shell/uploads.rs 's/if !proof\.caller\.scopes\.allow\(Scope::Read\)/if proof.caller.scopes.allow(Scope::Promote)/' coordinator:server:workers
 mutation poll-in-anothers-name trainer/coordinator/src/observe.rs 's/if \(&said\.grant\.worker, said\.grant\.incarnation\) != \(&worker, poll\.incarnation\)/if said.grant.worker.as_str().is_empty()/' coordinator:server:workers
 mutation promotion-without-scope trainer/access/src/tokens.rs 's/if !allow\(Scope::Promote\)/if false/' "access:lib coordinator:server:owners::promotion"

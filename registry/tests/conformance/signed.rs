@@ -132,6 +132,27 @@ fn what_is_not_as_it_was_signed_is_refused() {
     assert_eq!(site.store.size(digest).unwrap(), None);
 }
 
+/// A worker knows the digest of another's blob and has not its bytes. It asks the server for a copy of that blob instead.
+#[test]
+fn a_copy_is_no_proof_of_having_the_bytes() {
+    let site = Site::start();
+    let (owner, thief, whole) = (common::grant("r/s", 1), common::grant("r/other", 1), bytes(300_000));
+    let digest = Digest::of(&whole);
+    assert_eq!(site.put(&site.store.sign_write(&owner, digest).unwrap(), &whole), 200);
+    site.store.take_over(&owner, digest).unwrap();
+
+    let source = format!("/{NAME}/p/sha256/{}/{}", &digest.hex()[..2], &digest.hex()[2..]);
+    for directive in ["COPY", "REPLACE"] {
+        let mut signed = site.store.sign_write(&thief, digest).unwrap();
+        signed.headers.insert("x-amz-copy-source".to_owned(), source.clone());
+        signed.headers.insert("x-amz-metadata-directive".to_owned(), directive.to_owned());
+        let status = site.put(&signed, b"");
+        // A server may make the copy; it has the metadata of its source.
+        assert!(status == 403 || directive == "COPY", "{status}");
+        assert!(!site.store.has_arrived(&thief, digest), "{directive}: {status}");
+    }
+}
+
 #[test]
 fn an_expired_signature_is_refused() {
     let site = Site::start();
@@ -148,7 +169,7 @@ fn an_expired_signature_is_refused() {
     assert_eq!(site.send(reqwest::Method::GET, &signed, b"").0, 403);
 }
 
-/// What a worker sent and never reported is listed after a day, and a collection removes it.
+/// A blob that a worker sent and never reported is listed after a day, and a collection removes it.
 #[test]
 fn what_was_sent_and_never_used_is_removed() {
     let site = Site::start();

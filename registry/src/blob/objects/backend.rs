@@ -173,11 +173,11 @@ impl Backend for Objects {
 
     fn sign_write(&self, name: &str, digest: Digest) -> Option<SignedRequest> {
         let remote = &self.0.remote;
-        if remote.takes_signed_puts() { remote.sign_write(&remote.arriving(name), digest) } else { None }
+        if remote.takes_signed_puts() { remote.sign_write(name, digest) } else { None }
     }
 
     fn has_arrived(&self, name: &str, digest: Digest) -> bool {
-        self.0.remote.attests(&self.0.remote.arriving(name), digest)
+        self.0.remote.attests(&self.0.remote.arriving(name), name, digest)
     }
 
     fn settle(&self, name: &str, digest: Digest) -> Result<Stat, BlobError> {

@@ -284,7 +284,7 @@ impl Remote {
         self.kind.scheme == "s3"
     }
 
-    /// Runs a request that says nothing about the health of the store, and blocks until it ends.
+    /// Runs a request without recording its result as the health of the store, and blocks until it ends.
     pub(super) fn run<T: Send + 'static>(
         &self,
         request: impl Future<Output = Result<T, Error>> + Send + 'static,

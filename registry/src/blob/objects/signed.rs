@@ -4,6 +4,9 @@
 //! name that belongs to one process and task, so that a worker which has no bytes learns nothing and names nothing. The
 //! bucket's server computes the SHA-256, and its answer to a request for metadata says so (`attests`). Then it copies the
 //! object to its final name. Other clouds compute no SHA-256, so their blobs are only read by signed requests.
+//!
+//! A copy of another's object would have the same SHA-256, and some servers make one if a put has a further header. So the
+//! put also signs the name as metadata (`x-amz-meta-stride`), and that a copy keeps the metadata of its source.
 
 use std::time::Duration;
 
@@ -24,6 +27,9 @@ const OWN: Duration = Duration::from_secs(10);
 
 const CHECKSUM: HeaderName = HeaderName::from_static("x-amz-checksum-sha256");
 const CHECKSUM_MODE: HeaderName = HeaderName::from_static("x-amz-checksum-mode");
+/// The name that a signed put was made for, as metadata of the object.
+const OWNER: HeaderName = HeaderName::from_static("x-amz-meta-stride");
+const DIRECTIVE: HeaderName = HeaderName::from_static("x-amz-metadata-directive");
 const IF_NONE_MATCH: HeaderName = HeaderName::from_static("if-none-match");
 
 /// Bytes of the object that tests a signed put.
@@ -38,8 +44,10 @@ impl Remote {
         self.sign(Method::GET, path, &[])
     }
 
-    pub(super) fn sign_write(&self, path: &Path, digest: Digest) -> Option<SignedRequest> {
-        self.sign(Method::PUT, path, &[(CHECKSUM, &checksum(digest)), (IF_NONE_MATCH, "*")])
+    pub(super) fn sign_write(&self, name: &str, digest: Digest) -> Option<SignedRequest> {
+        let sum = checksum(digest);
+        let signed = [(CHECKSUM, &*sum), (IF_NONE_MATCH, "*"), (OWNER, name), (DIRECTIVE, "COPY")];
+        self.sign(Method::PUT, &self.arriving(name), &signed)
     }
 
     /// Returns `None` if the credentials in use cannot sign, for instance because they lack the permission.
@@ -61,12 +69,12 @@ impl Remote {
         }
     }
 
-    /// Returns true if the server reports that the object's bytes hash to `digest`.
-    pub(super) fn attests(&self, path: &Path, digest: Digest) -> bool {
+    /// Returns true if the server reports that the object at `path` was put for `name` and that its bytes hash to `digest`.
+    pub(super) fn attests(&self, path: &Path, name: &str, digest: Digest) -> bool {
         let Some(signed) = self.sign(Method::HEAD, path, &[(CHECKSUM_MODE, "ENABLED")]) else { return false };
         let answer = self.send(reqwest::Method::HEAD, &signed, &[]);
-        let reported = answer.as_ref().and_then(|answer| answer.headers().get(CHECKSUM.as_str())?.to_str().ok());
-        reported == Some(checksum(digest).as_str())
+        let reported = |header: HeaderName| answer.as_ref()?.headers().get(header.as_str())?.to_str().ok();
+        reported(CHECKSUM) == Some(&checksum(digest)) && reported(OWNER) == Some(name)
     }
 
     /// Returns true if the server stores what a signed request sends and reports its SHA-256. Asks it once.
@@ -77,12 +85,12 @@ impl Remote {
         if let Some(takes) = self.takes_puts.get() {
             return *takes;
         }
-        let path = self.path("SIGNED");
-        let digest = Digest::of(TEST);
-        let signed = self.sign(Method::PUT, &path, &[(CHECKSUM, &checksum(digest))]);
+        let (path, digest) = (self.path("SIGNED"), Digest::of(TEST));
+        let sum = checksum(digest);
+        let signed = self.sign(Method::PUT, &path, &[(CHECKSUM, &*sum), (OWNER, "test"), (DIRECTIVE, "COPY")]);
         // A server that does not answer is asked again later.
         let Some(put) = signed.and_then(|signed| self.send(reqwest::Method::PUT, &signed, TEST)) else { return false };
-        let takes = put.status().is_success() && self.attests(&path, digest);
+        let takes = put.status().is_success() && self.attests(&path, "test", digest);
         if self.takes_puts.set(takes).is_ok() {
             let way = if takes { "directly" } else { "through this server, because the bucket reports no SHA-256" };
             tracing::info!("workers write the blobs of `{}` {way}", self.url);

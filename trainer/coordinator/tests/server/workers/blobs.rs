@@ -73,7 +73,7 @@ async fn a_manifest_names_no_blob_of_another_run() {
     let staged = staged.header(SECRET_HEADER, &own.secret).header(RECEIPT_HEADER, &stolen[&Digest::of(CLIPS)]);
     let there: BlobStored = serde_json::from_value(answer(staged).await.1).unwrap();
     assert_eq!((there.stored, there.staged, there.receipt), (false, 0, None));
-    // To say that it was sent gives no receipt.
+    // A report that it was sent gives no receipt.
     let sent = thief.server.request(Method::POST, &format!("/v1/blobs/{}/sent", Digest::of(CLIPS)));
     let sent = sent.header(GRANT_HEADER, serde_json::to_string(&own.grant).unwrap()).header(SECRET_HEADER, &own.secret);
     let there: BlobStored = serde_json::from_value(answer(sent).await.1).unwrap();
