@@ -62,7 +62,7 @@ impl Said {
     /// Panics with all output unless the exit code is `code`.
     #[track_caller]
     pub fn expect_code(self, code: i32) -> Self {
-        assert_eq!(self.code, Some(code), "exit code; stdout:\n{}\n--- stderr\n{}", self.stdout, self.stderr);
+        assert_eq!(self.code, Some(code), "exit code; stderr:\n{}\n--- stdout\n{}", self.stderr, self.stdout);
         self
     }
 }

@@ -87,6 +87,11 @@ impl Outgoing {
         self.announcement
     }
 
+    /// Number of floats that fit.
+    fn capacity(&self) -> usize {
+        (self.map.len() - NUMBERS) / 4
+    }
+
     /// The numbers at these places.
     ///
     /// # Panics
@@ -149,30 +154,32 @@ pub(super) struct Between {
 }
 
 impl Between {
-    /// Makes memory for `numbers` floats at the first call; later calls return `None`.
+    /// Makes memory for `numbers` floats, unless they fit in the announced memory. A stage whose next phase trains a
+    /// larger network thus gets larger memory. After a failure no memory is made again.
     pub(super) fn announce(&mut self, step: u64, numbers: usize) -> Option<Announcement> {
-        if self.announced.is_some() {
+        let fits = self.outgoing.as_ref().map(|outgoing| outgoing.capacity() >= numbers);
+        if fits.unwrap_or(self.announced.is_some()) {
             return None;
         }
         self.announced = Some(step);
-        match Outgoing::new(numbers) {
-            Ok(outgoing) => self.outgoing = Some(outgoing),
-            Err(error) => tracing::debug!("no memory for a peer; its connection is used: {error}"),
-        }
+        self.is_mapped = false;
+        self.outgoing = Outgoing::new(numbers)
+            .inspect_err(|error| tracing::debug!("no memory for a peer; its connection is used: {error}"))
+            .ok();
         self.outgoing.as_ref().map(Outgoing::announcement)
     }
 
     /// Handles a peer's greeting of `step`: the memory that it announces, and if it has mapped this member's.
     pub(super) fn greeted(&mut self, step: u64, announced: Option<&Announcement>, is_mapped: bool) {
-        self.is_mapped = is_mapped && self.outgoing.is_some();
-        // The greeting of the announcing step crosses the announcement.
-        if !is_mapped && self.announced.is_some_and(|announced| announced < step) {
-            self.outgoing = None;
+        // The greeting of the announcing step crosses the announcement, and tells of earlier memory.
+        if self.announced.is_some_and(|announced| announced < step) {
+            self.is_mapped = is_mapped;
+            self.outgoing = self.outgoing.take().filter(|_| is_mapped);
         }
-        match announced.map(Incoming::open) {
-            None => {}
-            Some(Ok(incoming)) => self.incoming = Some(incoming),
-            Some(Err(error)) => tracing::debug!("a peer's memory is not seen; its connection is used: {error}"),
+        if let Some(announced) = announced {
+            self.incoming = Incoming::open(announced)
+                .inspect_err(|error| tracing::debug!("a peer's memory is not seen; its connection is used: {error}"))
+                .ok();
         }
     }
 

@@ -180,12 +180,12 @@ fn signs_of_life_go_out_between_the_frames_of_a_long_payload() {
     assert!(signs == 3, "{signs} signs of life among {large} frames");
 }
 
-fn step(mesh: &Mesh, step: u64, numbers: &[f32], interrupt: Interrupt<'_>) -> Result<(), Halt> {
+fn step(mesh: &Mesh, step: u64, numbers: &[f32], interrupt: Interrupt<'_>) -> Result<Vec<f32>, Halt> {
     let own = mesh.config.rank;
     let parts = vec![(own..own + 1, numbers)];
     let computed = Duration::from_millis(20);
     let contribution = Contribution { step, slices: 2, parts, drain: false, saved: false, computed, durable: 0 };
-    exchange::exchange(mesh, &contribution, interrupt).map(drop)
+    exchange::exchange(mesh, &contribution, interrupt).map(|total| total.sum)
 }
 
 /// Two reachable links on which a member alone would be faster: one has too little bandwidth, the other too much
@@ -248,5 +248,32 @@ fn a_good_link_is_not_named_slow() {
         }
     });
     assert_eq!([meshes[0].lost(), meshes[1].lost()], [[], []]);
+    meshes.into_iter().for_each(|mesh| mesh.close(None));
+}
+
+/// A stage may train networks of different sizes in one generation, as an evaluator does.
+#[test]
+fn buffers_that_grow_and_shrink_pass_by_memory_too() {
+    let gang = Gang::new(2, QUICK);
+    let meshes = [0, 1].map(|own| mesh(&gang, &[0, 1], own, "s").0);
+    let lengths = [10, 10, 10, 5, 5, 70_000, 70_000, 70_000, 10, 200, 100_001, 100_001, 100_001];
+    thread::scope(|scope| {
+        for mesh in &meshes {
+            scope.spawn(move || {
+                let mut shared = Vec::new();
+                for (at, length) in (5..).zip(lengths) {
+                    let own = mesh.config.rank as f32;
+                    let numbers: Vec<f32> = (0..length).map(|i| i as f32 + own).collect();
+                    let sum = step(mesh, at, &numbers, &|| None).expect("a sum");
+                    assert!(sum.iter().enumerate().all(|(i, sum)| *sum == 2.0 * i as f32 + 1.0), "step {at}");
+                    shared.push(mesh.memory(1 - mesh.config.rank).outgoing().is_some());
+                }
+                // The step that announces memory uses the connection.
+                let expected = [5, 10, 15].map(|step| shared[step - 5]);
+                assert_eq!(expected, [false; 3], "{shared:?}");
+                assert_eq!(shared.iter().filter(|is_shared| **is_shared).count(), lengths.len() - 3, "{shared:?}");
+            });
+        }
+    });
     meshes.into_iter().for_each(|mesh| mesh.close(None));
 }
