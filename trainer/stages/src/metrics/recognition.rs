@@ -1,11 +1,12 @@
 //! A classifier of motions by action.
 //!
-//! Statistics of a motion's normalised feature rows over time describe it, for any length. Ridge regression on one-hot
+//! Statistics over time of the root's path and the joints' positions describe a motion, for any length. Ridge regression on one-hot
 //! labels with a Gaussian kernel classifies it: a closed form without draws, so that the same clips give the same
 //! answers. Ours; the classifier for the recognition accuracy of Action2Motion (Guo et al., 2020) is a recurrent
 //! network.
 
 use motion::Skeleton;
+use motion::features::root_path;
 use nalgebra::{DMatrix, DVector};
 
 /// Added to the kernel's diagonal, which is 1.
@@ -13,26 +14,48 @@ const RIDGE: f64 = 0.05;
 /// Standard deviations from the mean that count at most. Statistics that hardly vary in real clips would otherwise
 /// outweigh all others in generated motion.
 const FARTHEST: f64 = 10.0;
-/// Number of statistics per channel.
-const STATISTICS: usize = 5;
+/// Seconds over which channels are averaged, so that shaking is not taken for an activity.
+const SMOOTH_SECONDS: f64 = 0.25;
 
-/// Describes a motion of normalised rows `[frames, features]`. Each channel has its mean, standard deviation, extremes
-/// and mean change from frame to frame. Joint rotations are left out, since they repeat the positions.
+/// Describes a motion of feature rows `[frames, features]` in the data's own scale.
+///
+/// Channels are the root's heading and place since the first frame, its height, and the joints' positions relative to
+/// it. After a running mean over a quarter of a second each has its mean, standard deviation, extremes and mean change
+/// from frame to frame. Rotations, velocities and contacts are left out, since they repeat the positions.
 pub fn describe(rows: &[f32], skeleton: &Skeleton) -> Vec<f64> {
     let layout = skeleton.layout();
     let width = skeleton.features;
-    let frames = (rows.len() / width).max(1) as f64;
-    let channels = (0..width).filter(|c| !layout.rotations.contains(c));
-    let mut all = Vec::with_capacity(STATISTICS * width);
-    for channel in channels {
-        let values = || rows.chunks_exact(width).map(|row| f64::from(row[channel]));
-        let mean = values().sum::<f64>() / frames;
-        let variance = values().map(|v| (v - mean).powi(2)).sum::<f64>() / frames;
-        let change: f64 = values().zip(values().skip(1)).map(|(a, b)| (b - a).abs()).sum();
-        let (low, high) = values().fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| (low.min(v), high.max(v)));
-        all.extend([mean, variance.sqrt(), low, high, change / (frames - 1.0).max(1.0)]);
-    }
-    all
+    let around = (SMOOTH_SECONDS * skeleton.fps / 2.0) as usize;
+    let turns = rows.chunks_exact(width).scan(0.0, |heading, row| {
+        let now = *heading;
+        *heading += f64::from(row[layout.yaw.start]);
+        Some(now)
+    });
+    let path = root_path(rows, skeleton);
+    let along = |axis: usize| path.iter().map(|(_, at)| at[axis]).collect();
+    let body = layout.root_height.start..layout.positions.end;
+    let channel = |c: usize| rows.chunks_exact(width).map(|row| f64::from(row[c])).collect();
+    let channels = [turns.collect(), along(0), along(2)].into_iter().chain(body.map(channel));
+    channels.flat_map(|values: Vec<f64>| statistics(&running_mean(&values, around))).collect()
+}
+
+/// Means over `around` values on each side. At both ends the first or last value is repeated.
+fn running_mean(values: &[f64], around: usize) -> Vec<f64> {
+    let last = values.len().saturating_sub(1);
+    let at = |i: usize| values[i.saturating_sub(around).min(last)];
+    let mean = |i: usize| (i..=i + 2 * around).map(at).sum::<f64>() / (2 * around + 1) as f64;
+    (0..values.len()).map(mean).collect()
+}
+
+/// Mean, standard deviation, extremes and mean change of a channel.
+fn statistics(values: &[f64]) -> [f64; 5] {
+    let frames = values.len().max(1) as f64;
+    let mean = values.iter().sum::<f64>() / frames;
+    let variance = values.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / frames;
+    let change: f64 = values.windows(2).map(|pair| (pair[1] - pair[0]).abs()).sum();
+    let low = values.iter().copied().fold(f64::INFINITY, f64::min);
+    let high = values.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+    [mean, variance.sqrt(), low, high, change / (frames - 1.0).max(1.0)]
 }
 
 /// A trained classifier of described motions.

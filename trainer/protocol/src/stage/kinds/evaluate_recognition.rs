@@ -22,9 +22,10 @@ pub struct Activity {
 }
 
 /// `evaluate.recognition`: trains a classifier of activities on real clips of the train split. It measures the share of
-/// generated motions that are classified as their caption's activity (`accuracy`, and `accuracy/NAME`), and of real
-/// clips of `split` (`real_accuracy`). It also measures the share of skating steps of both (`skating`, `real_skating`).
-/// The report has a contact sheet.
+/// generated motions that are classified as their caption's activity (`accuracy`, and `accuracy/NAME`). It also measures
+/// that of real clips of `split` (`real_accuracy`), and of these clips as the model's VAE or tokenizer reconstructs them
+/// (`reconstructed_accuracy`). `skating` and `real_skating` are the shares of skating steps. The report has a contact
+/// sheet.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct EvaluateRecognition {
@@ -78,8 +79,8 @@ impl Default for EvaluateRecognition {
 
 impl StageSpec for EvaluateRecognition {
     const KIND: &'static str = "evaluate.recognition";
-    // Version 3 classifies motions that are far from all real ones.
-    const VERSION: u32 = 3;
+    // Version 4 classifies smoothed paths and positions, and reconstructions too.
+    const VERSION: u32 = 4;
     const SHAPE: Shape = Shape::Plain;
     const OUTPUT: Output = Output { name: "report", kind: ArtifactKind::Report };
 
@@ -130,7 +131,9 @@ impl StageSpec for EvaluateRecognition {
     }
 
     fn metrics(&self) -> Option<BTreeSet<String>> {
-        let all = ["accuracy", "real_accuracy", "skating", "real_skating"].map(str::to_owned).into_iter();
+        let all = ["accuracy", "real_accuracy", "reconstructed_accuracy", "skating", "real_skating"]
+            .map(str::to_owned)
+            .into_iter();
         Some(all.chain(self.activities.iter().map(|activity| format!("accuracy/{}", activity.name))).collect())
     }
 }

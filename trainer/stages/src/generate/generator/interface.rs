@@ -90,6 +90,12 @@ pub trait MotionGenerator: std::fmt::Debug {
         None
     }
 
+    /// Encodes feature rows `[frames, features]` in the data's own scale and decodes them, as far as the model decodes
+    /// motion at all. Frames beyond the longest motion or the last whole unit are left out.
+    fn reconstruct(&self, rows: &[f32], _noise: &mut Stream) -> Vec<f32> {
+        rows.to_vec()
+    }
+
     /// Access to the latents, if the model generates motion from latents.
     fn latents(&self) -> Option<&dyn LatentGenerator> {
         None

@@ -9,6 +9,7 @@ use std::rc::Rc;
 use burn::tensor::Device;
 use checkpoint::Blobs;
 use checkpoint::model::Model;
+use motion::Stream;
 use protocol::artifact::Role;
 use protocol::stage::{DataFormat, Family, LatentShape, Sampler};
 use protocol::{ArtifactKind, Digest};
@@ -157,6 +158,24 @@ impl MotionGenerator for LatentDiffusion {
 
     fn control(&self) -> Option<&ControlMeta> {
         self.control.as_ref().map(TrainedControl::meta)
+    }
+
+    fn reconstruct(&self, rows: &[f32], noise: &mut Stream) -> Vec<f32> {
+        let width = self.vae.meta().features;
+        let whole = if self.decoder.is_some() { UNIT } else { 1 };
+        let frames = (rows.len() / width / whole * whole).min(self.longest());
+        if frames == 0 {
+            return rows.to_vec();
+        }
+        let mut rows = rows[..frames * width].to_vec();
+        self.vae.normalise(&mut rows);
+        let z = self.vae.encode(rows, frames).mu;
+        let mut rows = match &self.decoder {
+            None => self.vae.decode(z, frames),
+            Some(decoder) => decoder.decode_latent(&self.vae, z, frames, noise),
+        };
+        self.vae.denormalise(&mut rows);
+        rows
     }
 
     fn latents(&self) -> Option<&dyn LatentGenerator> {

@@ -23,6 +23,7 @@ use models::networks::{Gpt, GptConfig, Init, MaskedTransformer, Mmm, MmmConfig, 
 use models::tokens::autoregressive::{self, Draw};
 use models::tokens::masked::{self, Canvas, Sampling};
 use models::tokens::{mmm, residual};
+use motion::Stream;
 use protocol::artifact::Role;
 use protocol::stage::{DataFormat, Family, Sampler, TokenNetwork};
 use protocol::units::counted;
@@ -282,9 +283,14 @@ impl TokenModel {
     fn decoded(&self, ids: &[i64], sampler: &Sampler, seeds: &Seeds<'_>, b: usize) -> Vec<f32> {
         // A stream after all those that ids are drawn from.
         let noise = (sampler.steps + self.meta.quantizers) * self.meta.longest.max(2);
+        self.decode(ids, &mut seeds(noise, b))
+    }
+
+    /// Decodes ids to rows in the data's own scale. A flow decoder draws from `noise`.
+    fn decode(&self, ids: &[i64], noise: &mut Stream) -> Vec<f32> {
         let mut rows = match &self.decoder {
             None => self.tokenizer.decode(ids),
-            Some(decoder) => decoder.decode(&self.tokenizer, ids, &mut seeds(noise, b)),
+            Some(decoder) => decoder.decode(&self.tokenizer, ids, noise),
         };
         self.tokenizer.denormalise(&mut rows);
         rows
@@ -378,6 +384,18 @@ impl MotionGenerator for TokenModel {
         let motions = ids.into_iter().zip(batch.lengths).enumerate().map(motion).collect();
         lap(Lap::Decoded);
         Ok(motions)
+    }
+
+    fn reconstruct(&self, rows: &[f32], noise: &mut Stream) -> Vec<f32> {
+        let width = self.tokenizer.meta().features;
+        let unit = self.tokenizer.unit();
+        let frames = (rows.len() / width / unit * unit).min(self.longest());
+        if frames == 0 {
+            return rows.to_vec();
+        }
+        let mut rows = rows[..frames * width].to_vec();
+        self.tokenizer.normalise(&mut rows);
+        self.decode(&self.tokenizer.encode(rows), noise)
     }
 
     fn infilling(&self) -> Option<&dyn Infilling> {
