@@ -32,7 +32,7 @@ use crate::blob::place::Place;
 use crate::identity::Marker;
 use crate::lease::{self, LeaseTerms};
 use crate::lock::CollectionLock;
-use crate::retention::{self, BlobCalls, Rows};
+use crate::retention::{self, Rows};
 use crate::sql::sqlite;
 use crate::{BlobStore, QueryError, ReadStore, StoreId, clock, folder};
 
@@ -191,7 +191,7 @@ impl ReadStore {
         let from = self.dir().to_owned();
         let store = self.id().clone();
         let ended = |e: tokio::task::JoinError| BackupError::Damaged(format!("copying stopped early: {e}"));
-        let needed = retention::needed(&BlobCalls::of(self), &rows).await?;
+        let needed = retention::needed(self, &rows).await?;
         let work = move || {
             let blobs = copy_blobs(&blobs, &from, &to, needed)?;
             let (database_digest, database_bytes) = hashed(&copy).map_err(disk("cannot read", &copy))?;
@@ -239,7 +239,7 @@ fn copy_blobs(
     blobs: &BlobStore,
     from: &Path,
     to: &Path,
-    needed: BTreeSet<Digest>,
+    needed: Vec<Digest>,
 ) -> Result<BTreeMap<Digest, u64>, BackupError> {
     let mut copied = BTreeMap::new();
     let mut shards = BTreeSet::new();

@@ -1,13 +1,10 @@
 //! Check of a whole store: the database's own check, every blob hashed again, every reference resolved.
 
-use std::collections::BTreeSet;
-
-use protocol::TaskId;
+use protocol::Digest;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::blob::BlobStore;
-use crate::catalog::Root;
+use crate::blob::{BlobStore, ManifestError};
 use crate::{QueryError, ReadStore};
 
 /// Result of a check.
@@ -17,7 +14,7 @@ pub struct Report {
     pub blobs: u64,
     /// Total bytes of these blobs.
     pub bytes: u64,
-    /// Number of references checked.
+    /// Number of artifacts that rows name; each was checked.
     pub references: u64,
     /// Descriptions of the problems.
     pub problems: Vec<String>,
@@ -36,23 +33,24 @@ impl ReadStore {
         }
         problems.extend(self.problems().await?);
         let needs = self.needs().await?;
-        // The result of a finished stage replaces its shards, so a backup leaves out their blobs.
-        let replaced: BTreeSet<TaskId> = needs.done_shards.into_iter().collect();
-        let mut roots = needs.roots;
-        roots.retain(|root| root.shard.as_ref().is_none_or(|task| !replaced.contains(task)));
         let blobs = self.blobs().clone();
         let ended = |e: tokio::task::JoinError| QueryError::Blob(format!("the check stopped early: {e}"));
-        let mut report = tokio::task::spawn_blocking(move || check(&blobs, &roots)).await.map_err(ended)?;
+        let checked = tokio::task::spawn_blocking(move || check(&blobs, &needs.roots)).await;
+        let (mut report, broken) = checked.map_err(ended)?;
         problems.append(&mut report.problems);
+        for (root, e) in broken {
+            problems.push(format!("{}: {e}", self.named_by(root).await?));
+        }
         Ok(Report { problems, ..report })
     }
 }
 
-fn check(blobs: &BlobStore, roots: &[Root]) -> Report {
+/// Checks all blobs and `roots`. Returns the roots that are not whole beside the report.
+fn check(blobs: &BlobStore, roots: &[Digest]) -> (Report, Vec<(Digest, ManifestError)>) {
     let mut report = Report::default();
     match blobs.list() {
         Ok(all) => {
-            for entry in all.values() {
+            for entry in all {
                 report.blobs += 1;
                 report.bytes += entry.bytes;
                 match blobs.check(entry.digest) {
@@ -74,11 +72,8 @@ fn check(blobs: &BlobStore, roots: &[Root]) -> Report {
         }
         (Err(e), _, _) | (_, Err(e), _) | (_, _, Err(e)) => report.problems.push(e.to_string()),
     }
-    for root in roots {
-        report.references += 1;
-        if let Err(e) = blobs.complete_manifest(root.digest) {
-            report.problems.push(format!("{}: {e}", root.what));
-        }
-    }
-    report
+    report.references = roots.len() as u64;
+    let broken = roots.iter().filter_map(|root| blobs.complete_manifest(*root).err().map(|e| (*root, e)));
+    let broken = broken.collect();
+    (report, broken)
 }

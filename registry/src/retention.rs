@@ -15,7 +15,7 @@
 //!
 //! In a bucket, a collection also ends the uploads in parts that killed processes left.
 
-use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
 
 use checkpoint::BlobError;
@@ -27,7 +27,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::blob::{BlobStore, Entry, ManifestError};
 use crate::calls::Calls;
-use crate::catalog::{Needs, Root};
+use crate::catalog::Needs;
 use crate::lock::CollectionLock;
 use crate::proofs::Proofs;
 use crate::{QueryError, ReadStore, Store, WriteError, clock};
@@ -58,7 +58,8 @@ impl ReadStore {
     pub async fn gc_plan(&self, grace_ms: i64) -> Result<Plan, QueryError> {
         let rows = Rows::of(self).await?;
         let ages = Ages { now_ms: clock::now_ms(), grace_ms, opened_ms: self.opened_ms(), live: rows.live };
-        let (plan, candidates) = plan(&BlobCalls::of(self), &rows, &ages).await?;
+        let planned = plan(&BlobCalls::of(self), &rows, &ages).await;
+        let (plan, candidates) = self.explained(planned).await?;
         let bytes = candidates.iter().map(|entry| entry.bytes).sum();
         let unfinished = BlobCalls::of(self).ask(BlobStore::unfinished).await;
         let uploads = unfinished.map_err(|e| QueryError::Blob(e.to_string()))?.len() as u64;
@@ -80,8 +81,9 @@ impl Store {
         let rows = Rows::of(self).await?;
         let ages = Ages { now_ms: clock::now_ms(), grace_ms, opened_ms: self.opened_ms(), live: rows.live };
         let place = BlobCalls::of(self);
-        let plan = match plan(&place, &rows, &ages).await {
-            Ok((plan, candidates)) => self.sweep(&place, &rows, &ages, plan, candidates).await,
+        let planned = plan(&place, &rows, &ages).await;
+        let plan = match self.explained(planned).await {
+            Ok((plan, candidates)) => self.sweep(&place, &rows, plan, candidates, ages).await,
             Err(e) => Err(e.into()),
         };
         crate::reserve::keep(self.dir());
@@ -96,18 +98,18 @@ impl Store {
         &self,
         place: &BlobCalls,
         rows: &Rows,
-        ages: &Ages,
         mut plan: Plan,
         candidates: Vec<Entry>,
+        ages: Ages,
     ) -> Result<Plan, WriteError> {
-        let mut kept = BTreeSet::new();
+        let mut kept = Marks::default();
         for batch in candidates.chunks(BATCH) {
             // Follows the references of names in new rows.
-            mark(place, rows, |_| true, self.proofs().to_follow(), &mut kept).await?;
-            let batch = batch.iter().map(|entry| entry.digest).filter(|digest| !kept.contains(digest));
+            let marked = mark(place, rows, self.proofs().to_follow(), &mut kept).await;
+            self.explained(marked).await?;
+            let batch = batch.iter().map(|entry| entry.digest).filter(|digest| !kept.has(*digest));
             let condemned = Condemned(Arc::clone(self.proofs()), self.condemn(batch.collect()).await?);
             let removing = stream::iter(condemned.1.clone()).map(|digest| {
-                let ages = *ages;
                 let is_young = move |put_ms| put_ms >= ages.before_ms(put_ms);
                 place.ask(move |blobs| blobs.remove_unless(digest, is_young))
             });
@@ -157,15 +159,16 @@ impl BlobCalls {
         self.calls.run(move || call(&blobs)).await
     }
 
-    async fn list(&self) -> Result<BTreeMap<Digest, Entry>, QueryError> {
+    async fn list(&self) -> Result<Vec<Entry>, QueryError> {
         self.ask(BlobStore::list).await.map_err(|e| QueryError::Blob(e.to_string()))
     }
 }
 
 /// Roots and lineage for a collection, as of one moment.
 pub(crate) struct Rows {
-    roots: BTreeMap<Digest, String>,
-    /// Artifacts that each artifact was made from.
+    /// Artifacts that rows name, sorted.
+    roots: Vec<Digest>,
+    /// Artifacts that each artifact was made from, without roots.
     parents: HashMap<Digest, Vec<Digest>>,
     /// Tasks whose shards are deleted.
     forget_shards: Vec<TaskId>,
@@ -185,12 +188,7 @@ impl Rows {
 
 impl From<Needs> for Rows {
     fn from(needs: Needs) -> Self {
-        let forgotten: BTreeSet<&TaskId> = needs.done_shards.iter().collect();
-        let stays = |root: &&Root| root.shard.as_ref().is_none_or(|task| !forgotten.contains(task));
-        let roots = needs.roots.iter().filter(stays).map(|root| (root.digest, root.what.clone())).collect();
-        let parents = needs.parents;
-        let forget_shards = needs.done_shards;
-        let live = needs.live;
+        let Needs { roots, parents, done_shards: forget_shards, live } = needs;
         Self { roots, parents, forget_shards, held: BTreeSet::new(), live }
     }
 }
@@ -217,36 +215,105 @@ impl Ages {
 
 /// Number of concurrent reads of manifests and removals of blobs.
 const AT_ONCE: usize = 16;
+/// Largest number of manifests that one call reads.
+const MANIFESTS: usize = 64;
 /// Number of blobs removed before new rows are checked again.
 const BATCH: usize = 64;
 
-/// Adds everything reachable from `queue` to `marked`. `is_there` returns true for digests of stored blobs.
-async fn mark(
-    place: &BlobCalls,
-    rows: &Rows,
-    is_there: impl Fn(Digest) -> bool,
-    mut queue: Vec<Digest>,
-    marked: &mut BTreeSet<Digest>,
-) -> Result<(), QueryError> {
+/// Marked blobs. Those of a listing take one bit each.
+#[derive(Default)]
+struct Marks<'a> {
+    /// Stored blobs, sorted by digest; `None` if they were not listed.
+    listed: Option<&'a [Entry]>,
+    /// For each listed blob, true if it is marked.
+    marked: Vec<bool>,
+    /// Marked digests that are not listed.
+    others: BTreeSet<Digest>,
+}
+
+impl<'a> Marks<'a> {
+    fn among(listed: &'a [Entry]) -> Self {
+        Self { listed: Some(listed), marked: vec![false; listed.len()], others: BTreeSet::new() }
+    }
+
+    fn place(&self, digest: Digest) -> Option<usize> {
+        self.listed?.binary_search_by_key(&digest, |entry| entry.digest).ok()
+    }
+
+    fn has(&self, digest: Digest) -> bool {
+        self.place(digest).map_or_else(|| self.others.contains(&digest), |place| self.marked[place])
+    }
+
+    /// Marks a digest. Returns false if it was marked before.
+    fn add(&mut self, digest: Digest) -> bool {
+        match self.place(digest) {
+            Some(place) => !std::mem::replace(&mut self.marked[place], true),
+            None => self.others.insert(digest),
+        }
+    }
+
+    /// Returns true if the digest may be a stored blob.
+    fn may_be_there(&self, digest: Digest) -> bool {
+        self.listed.is_none() || self.place(digest).is_some()
+    }
+}
+
+/// A reason to collect nothing.
+enum MarkError {
+    Query(QueryError),
+    /// The references of the artifact cannot be read.
+    Unreadable {
+        artifact: Digest,
+        why: String,
+    },
+}
+
+impl From<QueryError> for MarkError {
+    fn from(error: QueryError) -> Self {
+        Self::Query(error)
+    }
+}
+
+impl ReadStore {
+    /// Names the row of an artifact whose references cannot be read.
+    async fn explained<T>(&self, marked: Result<T, MarkError>) -> Result<T, QueryError> {
+        match marked {
+            Ok(done) => Ok(done),
+            Err(MarkError::Query(e)) => Err(e),
+            Err(MarkError::Unreadable { artifact, why }) => {
+                let row = self.named_by(artifact).await?;
+                Err(QueryError::Blob(format!("nothing was collected: cannot read the references of {row}: {why}")))
+            }
+        }
+    }
+}
+
+/// Adds everything reachable from `queue` to `marks`.
+async fn mark(place: &BlobCalls, rows: &Rows, mut queue: Vec<Digest>, marks: &mut Marks<'_>) -> Result<(), MarkError> {
+    let is_root = |digest: Digest| rows.roots.binary_search(&digest).is_ok();
     while !queue.is_empty() {
-        queue.retain(|digest| marked.insert(*digest) && (rows.roots.contains_key(digest) || is_there(*digest)));
+        queue.retain(|digest| marks.add(*digest) && (is_root(*digest) || marks.may_be_there(*digest)));
         let parents = queue.iter().filter_map(|digest| rows.parents.get(digest)).flatten().copied();
         let mut next: Vec<Digest> = parents.collect();
-        let read = |digest: Digest| place.ask(move |blobs| (digest, blobs.manifest(digest)));
-        let mut reading = stream::iter(queue).map(read).buffer_unordered(AT_ONCE);
-        while let Some((digest, read)) = reading.next().await {
-            match (read, rows.roots.get(&digest)) {
-                (Ok(manifest), _) => {
-                    marked.extend(manifest.blobs().map(|blob| blob.digest));
-                    mentioned(&manifest.meta, &mut next);
-                }
-                // A digest in `meta` that is not a manifest, or a blob removed since the listing.
-                (Err(ManifestError::NotAManifest { .. } | ManifestError::Blob(BlobError::NotFound(_))), None) => {}
-                (Err(e), why) => {
-                    let why = why.map_or_else(|| format!("artifact {digest}"), Clone::clone);
-                    return Err(QueryError::Blob(format!(
-                        "nothing was collected: cannot read the references of {why}: {e}"
-                    )));
+        let each = (queue.len() / AT_ONCE).clamp(1, MANIFESTS);
+        let batches: Vec<Vec<Digest>> = queue.chunks(each).map(<[Digest]>::to_vec).collect();
+        let read = |batch: Vec<Digest>| {
+            place.ask(move |blobs| batch.into_iter().map(|digest| (digest, blobs.manifest(digest))).collect::<Vec<_>>())
+        };
+        let mut reading = stream::iter(batches).map(read).buffer_unordered(AT_ONCE);
+        while let Some(batch) = reading.next().await {
+            for (digest, read) in batch {
+                match read {
+                    Ok(manifest) => {
+                        for blob in manifest.blobs() {
+                            marks.add(blob.digest);
+                        }
+                        mentioned(&manifest.meta, &mut next);
+                    }
+                    // A digest in `meta` that is not a manifest, or a blob removed since the listing.
+                    Err(ManifestError::NotAManifest { .. } | ManifestError::Blob(BlobError::NotFound(_)))
+                        if !is_root(digest) => {}
+                    Err(e) => return Err(MarkError::Unreadable { artifact: digest, why: e.to_string() }),
                 }
             }
         }
@@ -256,21 +323,32 @@ async fn mark(
     Ok(())
 }
 
+/// Adds everything reachable from the roots to `marks`.
+async fn mark_roots(place: &BlobCalls, rows: &Rows, marks: &mut Marks<'_>) -> Result<(), MarkError> {
+    for roots in rows.roots.chunks(AT_ONCE * MANIFESTS * 16) {
+        mark(place, rows, roots.to_vec(), marks).await?;
+    }
+    Ok(())
+}
+
 /// Returns the blobs that the rows need, after checking that they exist.
-pub(crate) async fn needed(place: &BlobCalls, rows: &Rows) -> Result<BTreeSet<Digest>, QueryError> {
-    let check = |(root, why): (&Digest, &String)| {
+pub(crate) async fn needed(store: &ReadStore, rows: &Rows) -> Result<Vec<Digest>, QueryError> {
+    let place = &BlobCalls::of(store);
+    let check = |root: &Digest| {
         let root = *root;
-        let why = why.clone();
         let checked = place.ask(move |blobs| blobs.complete_manifest(root));
-        async move { checked.await.map(|_| ()).map_err(|e| QueryError::Blob(format!("{why}: {e}"))) }
+        async move { checked.await.map(|_| ()).map_err(|e| (root, e)) }
     };
-    stream::iter(&rows.roots).map(check).buffered(AT_ONCE).try_collect::<()>().await?;
+    let checked = stream::iter(&rows.roots).map(check).buffered(AT_ONCE).try_collect::<()>().await;
+    if let Err((root, e)) = checked {
+        return Err(QueryError::Blob(format!("{}: {e}", store.named_by(root).await?)));
+    }
     let all = place.list().await?;
-    let mut marked = BTreeSet::new();
-    mark(place, rows, |digest| all.contains_key(&digest), rows.roots.keys().copied().collect(), &mut marked).await?;
+    let mut marks = Marks::among(&all);
+    let marked = mark_roots(place, rows, &mut marks).await;
+    store.explained(marked).await?;
     // A digest in `meta` need not be a stored blob; blobs that roots list were checked above.
-    marked.retain(|digest| all.contains_key(digest));
-    Ok(marked)
+    Ok(all.iter().zip(&marks.marked).filter(|(_, is_marked)| **is_marked).map(|(entry, _)| entry.digest).collect())
 }
 
 fn is_damaged_manifest(blobs: &BlobStore, digest: Digest) -> bool {
@@ -278,11 +356,10 @@ fn is_damaged_manifest(blobs: &BlobStore, digest: Digest) -> bool {
 }
 
 /// Returns the plan and the blobs that may be removed.
-async fn plan(place: &BlobCalls, rows: &Rows, ages: &Ages) -> Result<(Plan, Vec<Entry>), QueryError> {
+async fn plan(place: &BlobCalls, rows: &Rows, ages: &Ages) -> Result<(Plan, Vec<Entry>), MarkError> {
     let all = place.list().await?;
-    let mut marked = BTreeSet::new();
-    let is_there = |digest| all.contains_key(&digest);
-    mark(place, rows, is_there, rows.roots.keys().copied().collect(), &mut marked).await?;
+    let mut marks = Marks::among(&all);
+    mark_roots(place, rows, &mut marks).await?;
     // No row relies on these blobs yet, so a damaged one does not stop the collection.
     let of_rows = rows.held.clone();
     let held = move |blobs: &BlobStore| {
@@ -290,17 +367,19 @@ async fn plan(place: &BlobCalls, rows: &Rows, ages: &Ages) -> Result<(Plan, Vec<
         held.into_iter().partition(|digest| is_damaged_manifest(blobs, *digest))
     };
     let (damaged, held): (Vec<Digest>, Vec<Digest>) = place.ask(held).await;
-    mark(place, rows, is_there, held, &mut marked).await?;
-    marked.extend(damaged);
+    mark(place, rows, held, &mut marks).await?;
+    for digest in damaged {
+        marks.add(digest);
+    }
     let mut plan = Plan { forget_shards: rows.forget_shards.clone(), ..Plan::default() };
     let mut candidates = Vec::new();
-    for entry in all.into_values() {
-        if marked.contains(&entry.digest) {
+    for (entry, is_marked) in all.iter().zip(&marks.marked) {
+        if *is_marked {
             plan.kept += 1;
         } else if entry.put_ms >= ages.before_ms(entry.put_ms) {
             plan.fresh += 1;
         } else {
-            candidates.push(entry);
+            candidates.push(*entry);
         }
     }
     Ok((plan, candidates))

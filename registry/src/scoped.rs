@@ -235,6 +235,10 @@ impl Records for ScopedRecords {
         self.all.held().await
     }
 
+    async fn named_by(&self, artifact: Digest) -> Result<String> {
+        self.all.named_by(artifact).await
+    }
+
     async fn needs(&self) -> Result<Needs> {
         self.all.needs().await
     }

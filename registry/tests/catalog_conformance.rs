@@ -688,9 +688,21 @@ async fn needs_name_every_row_that_names_a_blob(place: &impl Place) {
         .unwrap();
     opened.store.pin(pinned, "kept").await.unwrap();
     let needs = opened.records().needs().await.unwrap();
-    let found: BTreeSet<_> = needs.roots.iter().map(|root| root.digest).collect();
+    let found: BTreeSet<_> = needs.roots.iter().copied().collect();
     assert_eq!(found, [checkpoint, shard, value, model, pinned].into());
+    assert!(needs.roots.is_sorted() && needs.roots.len() == 5, "{:?}", needs.roots);
     assert_eq!(needs.parents[&value], [Digest::of(b"data")]);
+    assert!(!needs.parents.contains_key(&model), "a root is marked anyway");
+    for (artifact, name) in [
+        (checkpoint, "checkpoint of"),
+        (shard, "shard `"),
+        (value, "output `"),
+        (model, "version m:1"),
+        (pinned, "pin (kept)"),
+    ] {
+        let described = opened.records().named_by(artifact).await.unwrap();
+        assert!(described.contains(name), "{described}");
+    }
     assert!(needs.live && needs.done_shards.is_empty());
     opened.catalog().commit(Order::Pin { digest: pinned, reason: None }).await.unwrap();
     assert_eq!(opened.records().needs().await.unwrap().roots.len(), 4);

@@ -1,6 +1,5 @@
 //! The blob store: verifies what is read and reused, stores equal bytes once, and repairs damaged blobs.
 
-use std::collections::BTreeMap;
 use std::fmt;
 use std::path::Path;
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError, RwLock};
@@ -285,9 +284,11 @@ impl BlobStore {
         self.seen().bytes(digest)
     }
 
-    /// Lists all blobs by digest.
-    pub fn list(&self) -> Result<BTreeMap<Digest, Entry>, BlobError> {
-        Ok(self.backend().list()?.into_iter().map(|entry| (entry.digest, entry)).collect())
+    /// Lists all blobs, sorted by digest.
+    pub fn list(&self) -> Result<Vec<Entry>, BlobError> {
+        let mut entries = self.backend().list()?;
+        entries.sort_unstable_by_key(|entry| entry.digest);
+        Ok(entries)
     }
 
     /// Lists the files among the blobs that are not the store's. They are never touched.

@@ -168,6 +168,9 @@ pub trait Records: Debug + Send + Sync {
     /// Returns the blobs that rows need.
     async fn needs(&self) -> Result<Needs>;
 
+    /// Describes a row that names an artifact, such as "version walker:3". Reads all rows.
+    async fn named_by(&self, artifact: Digest) -> Result<String>;
+
     /// Describes the inconsistencies that the database finds in itself. Reads all of it.
     async fn problems(&self) -> Result<Vec<String>>;
 

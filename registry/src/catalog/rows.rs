@@ -204,23 +204,13 @@ pub struct LineageNode {
     pub depth: u32,
 }
 
-/// A digest that a row names and whose blobs must be whole.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Root {
-    /// Digest of the manifest.
-    pub digest: Digest,
-    /// Description of the row.
-    pub what: String,
-    /// The task, if the row is a shard.
-    pub shard: Option<TaskId>,
-}
-
 /// Blobs that the rows need, as of one moment.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Needs {
-    /// Artifacts that rows name.
-    pub roots: Vec<Root>,
-    /// Artifacts that each artifact was made from.
+    /// Artifacts that rows name and whose blobs must be whole, sorted and without repetition. Those of `done_shards` are
+    /// left out.
+    pub roots: Vec<Digest>,
+    /// Artifacts that each artifact was made from, without roots.
     pub parents: HashMap<Digest, Vec<Digest>>,
     /// Tasks whose shards a collection deletes, because the artifact of their finished stage replaces them.
     pub done_shards: Vec<TaskId>,

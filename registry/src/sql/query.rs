@@ -309,6 +309,10 @@ impl Records for SqlRecords {
         Ok(needs)
     }
 
+    async fn named_by(&self, artifact: Digest) -> Result<String> {
+        retention::named_by(&mut self.0.reader().await?.conn(), artifact).await
+    }
+
     async fn problems(&self) -> Result<Vec<String>> {
         let mut reader = self.0.reader().await?;
         match &mut reader.conn() {

@@ -2,14 +2,15 @@
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 
+use futures::TryStreamExt as _;
 use protocol::stage::Keep;
 use protocol::{Digest, TaskId};
 
 use super::apply::proven;
 use super::error::write_error;
 use super::rows::{checkpoints, digest, digests};
-use super::statement::{Conn, int, json, query, run};
-use crate::catalog::{Needs, Root};
+use super::statement::{Conn, Row, int, json, query, run};
+use crate::catalog::Needs;
 use crate::proofs::Proofs;
 use crate::{QueryError, WriteError, clock};
 
@@ -97,40 +98,63 @@ pub(super) async fn needs(conn: &mut Conn<'_>) -> Result<Needs, QueryError> {
     let done = "SELECT task FROM shards WHERE run IN (SELECT run FROM runs WHERE state = 'finished') ORDER BY task";
     let done = query(done).fetch_all(&mut *conn).await?;
     let done_shards = done.iter().map(|row| row.try_get::<String, _>(0).map(TaskId::new)).collect::<Result<_, _>>()?;
+    let roots = roots(conn).await?;
     let mut parents: HashMap<Digest, Vec<Digest>> = HashMap::new();
-    for row in query("SELECT parent, child FROM edges").fetch_all(&mut *conn).await? {
-        parents.entry(digest(&row, "child")?).or_default().push(digest(&row, "parent")?);
-    }
-    let live = "SELECT EXISTS (SELECT 1 FROM runs WHERE state IN ('running', 'paused'))";
-    let live = query(live).fetch_one(&mut *conn).await?.try_get(0)?;
-    Ok(Needs { roots: roots(conn).await?, parents, done_shards, live })
-}
-
-/// Lists every digest that a row names and that must be whole, with a description of the row.
-async fn roots(conn: &mut Conn<'_>) -> Result<Vec<Root>, QueryError> {
-    let mut roots = Vec::new();
-    let mut add = |digest: Digest, what: String, shard: Option<TaskId>| roots.push(Root { digest, what, shard });
-    for row in query("SELECT model, version, artifact FROM versions").fetch_all(&mut *conn).await? {
-        let (model, version): (String, i64) = (row.try_get(0)?, row.try_get(1)?);
-        add(digest(&row, "artifact")?, format!("version {model}:{version}"), None);
-    }
-    for row in query("SELECT key, run, stage, outputs FROM stage_results").fetch_all(&mut *conn).await? {
-        let (run, stage): (String, String) = (row.try_get("run")?, row.try_get("stage")?);
-        for (name, digest) in digests(row.try_get("outputs")?)? {
-            add(digest, format!("output `{name}` of `{run}/{stage}`"), None);
+    let mut edges = query("SELECT parent, child FROM edges").fetch(conn);
+    while let Some(row) = edges.try_next().await? {
+        let parent = digest(&row, "parent")?;
+        if roots.binary_search(&parent).is_err() {
+            parents.entry(digest(&row, "child")?).or_default().push(parent);
         }
     }
-    for row in query("SELECT task, step, manifest FROM checkpoints").fetch_all(&mut *conn).await? {
-        let (task, step): (String, i64) = (row.try_get(0)?, row.try_get(1)?);
-        add(digest(&row, "manifest")?, format!("checkpoint of `{task}` at step {step}"), None);
+    drop(edges);
+    let live = "SELECT EXISTS (SELECT 1 FROM runs WHERE state IN ('running', 'paused'))";
+    let live = query(live).fetch_one(&mut *conn).await?.try_get(0)?;
+    Ok(Needs { roots, parents, done_shards, live })
+}
+
+/// Rows that name an artifact: a description of the row, and the digest in the column `named`, or a list of them.
+const NAMING: [&str; 5] = [
+    "SELECT 'version ' || model || ':' || version AS what, artifact AS named FROM versions",
+    "SELECT '`' || run || '/' || stage || '`' AS what, outputs AS named FROM stage_results",
+    "SELECT 'checkpoint of `' || task || '` at step ' || step AS what, manifest AS named FROM checkpoints",
+    "SELECT 'shard `' || task || '`' AS what, output AS named FROM shards \
+     WHERE run NOT IN (SELECT run FROM runs WHERE state = 'finished')",
+    "SELECT 'pin (' || reason || ')' AS what, digest AS named FROM pins",
+];
+
+/// The artifacts that a row of [`NAMING`] names, by the name of an output; without one, by an empty name.
+fn named(row: &Row) -> Result<BTreeMap<String, Digest>, QueryError> {
+    let text: &str = row.try_get("named")?;
+    if text.starts_with('{') { digests(text) } else { Ok([(String::new(), digest(row, "named")?)].into()) }
+}
+
+/// Lists every artifact that a row names and that must be whole, sorted and without repetition.
+async fn roots(conn: &mut Conn<'_>) -> Result<Vec<Digest>, QueryError> {
+    let mut roots = Vec::new();
+    for naming in NAMING {
+        let mut rows = query(naming).fetch(conn);
+        while let Some(row) = rows.try_next().await? {
+            roots.extend(named(&row)?.into_values());
+        }
     }
-    for row in query("SELECT task, output FROM shards").fetch_all(&mut *conn).await? {
-        let task: String = row.try_get(0)?;
-        add(digest(&row, "output")?, format!("shard `{task}`"), Some(TaskId::new(task)));
-    }
-    for row in query("SELECT digest, reason FROM pins").fetch_all(&mut *conn).await? {
-        let reason: String = row.try_get(1)?;
-        add(digest(&row, "digest")?, format!("pin ({reason})"), None);
-    }
+    roots.sort_unstable();
+    roots.dedup();
     Ok(roots)
+}
+
+/// Describes a row that names an artifact.
+pub(super) async fn named_by(conn: &mut Conn<'_>, artifact: Digest) -> Result<String, QueryError> {
+    for naming in NAMING {
+        let mut rows = query(naming).fetch(conn);
+        while let Some(row) = rows.try_next().await? {
+            let what: String = row.try_get("what")?;
+            match named(&row)?.iter().find(|(_, named)| **named == artifact) {
+                Some((output, _)) if output.is_empty() => return Ok(what),
+                Some((output, _)) => return Ok(format!("output `{output}` of {what}")),
+                None => {}
+            }
+        }
+    }
+    Ok(format!("artifact {artifact}"))
 }
