@@ -213,6 +213,8 @@ fn summary(row: &Row) -> Result<RunSummary> {
         project,
         state,
         interrupted: false,
+        priority: 0,
+        queued: false,
         created_ms: row.try_get("created_ms")?,
         changed_ms: row.try_get("changed_ms")?,
         done: count("done")?,

@@ -44,6 +44,7 @@ fn pipeline(seed: u64) -> Pipeline {
         name: "bench".into(),
         seed: Seed(seed),
         backend: Backend::Flex,
+        priority: 0,
         stages: vec![
             stage("dataset", StageSettings::DataSynthetic(DataSynthetic::default())),
             stage("vae", StageSettings::TrainVae(TrainVae::default())),

@@ -61,6 +61,7 @@ fn pipeline(seed: u64) -> Pipeline {
         name: "queued".into(),
         seed: Seed(seed),
         backend: Backend::Flex,
+        priority: 0,
         stages: all,
         code_versions: BTreeMap::new(),
     }

@@ -2,12 +2,12 @@
 
 use std::collections::BTreeMap;
 
+use protocol::canonical;
 use protocol::demand::{Demand, DemandGroup, DemandWorker};
-use protocol::{Group, canonical};
 
 use crate::state::State;
 use crate::state::execution::StageExecution;
-use crate::state::queue::Need;
+use crate::state::queue::{Claimant, Need};
 use crate::state::task::{Lease, Part, Task};
 use crate::time::Millis;
 
@@ -19,7 +19,7 @@ impl State {
     pub fn demand(&self, now: Millis) -> Demand {
         let mut groups: BTreeMap<Need, DemandGroup> = BTreeMap::new();
         for need in self.queue.needs() {
-            let need_of_all = Need { gang: false, group: Group::default(), ..need.clone() };
+            let need_of_all = Need { gang: false, claimant: Claimant::default(), ..need.clone() };
             let group = groups.entry(need_of_all).or_insert_with_key(group_of);
             for (_, key) in self.queue.with(need).take(COUNTED) {
                 let execution = &self.executions[&key];
@@ -65,7 +65,7 @@ fn need_of(execution: &StageExecution) -> Need {
         backend: execution.backend,
         instruction_set: execution.bound_to().map(str::to_owned),
         requires: execution.placement.requires.clone(),
-        group: Group::default(),
+        claimant: Claimant::default(),
     }
 }
 

@@ -73,7 +73,7 @@ pub enum Event {
         /// The time without progress. Milliseconds.
         for_ms: u64,
     },
-    /// A group has too few workers, and a gang of another one can spare a member.
+    /// Waiting work should get a worker that is busy, or an idle worker is no longer kept for a group.
     Unshared,
     /// No member of a gang has advanced by a step for too long.
     GangStalled { task: TaskId, fence: Fence },

@@ -142,6 +142,7 @@ fn of_task(execution: &StageExecution, task: &Task, change: &TaskChange, why: Op
             if matches!(execution.state, ExecutionState::Failed { .. }) => {}
         (Lease::Held { holders, .. }, Some(Lease::Waiting { .. })) => {
             let kind = if why.is_some() { HistoryKind::Retried } else { HistoryKind::Released };
+            let why = why.or(task.is_preempted().then_some("made way for a run of a higher priority"));
             let worker = holders.first().filter(|_| holders.len() == 1).map(|member| member.worker.clone());
             entries.push(HistoryEntry { worker, why: why.map(str::to_owned), ..entry(kind) });
         }

@@ -22,7 +22,7 @@ use crate::time::Millis;
 
 /// The version of stored data. Other major versions are refused. A later minor version may have unknown kinds or
 /// fields; it is readable as long as none of them occurs.
-pub const FORMAT: (u32, u32) = (2, 2);
+pub const FORMAT: (u32, u32) = (2, 3);
 
 /// An error in recovered data.
 #[derive(Debug, thiserror::Error)]

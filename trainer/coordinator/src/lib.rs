@@ -27,6 +27,7 @@ pub mod state;
 mod time;
 pub mod value;
 mod view;
+mod waiting;
 
 pub use batch::Refused;
 pub use decide::decide;

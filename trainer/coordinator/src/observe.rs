@@ -150,7 +150,7 @@ fn tick(state: &mut State, at: Millis, overslept: u64) -> Vec<Event> {
             Lease::Waiting { .. } | Lease::Held { .. } | Lease::Done { .. } => {}
         }
     }
-    if state.member_to_give(now).is_some() || state.share_is_over(now) {
+    if state.next_move(now).is_some() || state.share_is_over(now) {
         events.push(Event::Unshared);
     }
     // Gangs come from the reports of their members, so that waiting runs cost nothing here.

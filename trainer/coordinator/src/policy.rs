@@ -47,6 +47,10 @@ pub struct Policy {
     pub share_ms: u64,
     /// Time for which a group gets no member of another group's gang after it has let one idle. Milliseconds.
     pub share_again_ms: u64,
+    /// Time for a preempted training to save and yield before its task is released. Milliseconds.
+    pub yield_ms: u64,
+    /// Time for which a training that was resumed is not preempted. Milliseconds.
+    pub stay_ms: u64,
     /// Number of decisions between snapshots of the state. A snapshot deletes the facts before it.
     pub snapshot_every: u64,
     /// Maximum number of active runs; further submissions are refused.
@@ -77,6 +81,8 @@ impl Default for Policy {
             forget_ms: 3_600_000,
             share_ms: 120_000,
             share_again_ms: 1_800_000,
+            yield_ms: 300_000,
+            stay_ms: 60_000,
             snapshot_every: 4_000,
             live_runs: 20_000,
             grants: GrantOrder::ByName,

@@ -129,7 +129,14 @@ impl State {
 
     /// A run as clients see it at `now`.
     pub fn view(&self, run: &Run, now: Millis) -> RunView {
-        let stages: Vec<StageView> = (0..run.stages.len()).map(|i| self.stage_view(run, i, now)).collect();
+        let mut stages: Vec<StageView> = (0..run.stages.len()).map(|i| self.stage_view(run, i, now)).collect();
+        // A sweep may have made thousands of stages, and all of them wait for the same workers.
+        for stage in stages.iter_mut().filter(|stage| stage.wants_workers.is_some() && stage.of.is_none()) {
+            let place = self.execution_of(run, &stage.name).and_then(|execution| self.where_workers_are(execution));
+            if let (Some(message), Some(place)) = (&mut stage.message, place) {
+                *message = format!("{message}; {place}");
+            }
+        }
         let sweeps = run.sweeps.iter().map(|sweep| self.sweep_view(run, sweep)).collect();
         RunView { sweeps, ..without_sweeps(run, stages) }
     }
@@ -305,6 +312,8 @@ fn without_sweeps(run: &Run, stages: Vec<StageView>) -> RunView {
         owner: run.owner.clone(),
         state: run.state,
         interrupted: run.is_interrupted(),
+        priority: run.submitted.priority,
+        queued: false,
         note: note(run.state, &stages),
         stages,
         sweeps: Vec::new(),
@@ -369,7 +378,7 @@ fn assignment(
     worker: &WorkerId,
     incarnation: Incarnation,
 ) -> Option<Assignment> {
-    let Lease::Held { holders, secret, drain_by } = &task.lease else { return None };
+    let Lease::Held { holders, secret, drain_by, .. } = &task.lease else { return None };
     if !holders.iter().any(|member| member.worker == *worker && member.incarnation == incarnation) {
         return None;
     }

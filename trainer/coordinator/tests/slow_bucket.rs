@@ -46,6 +46,7 @@ fn pipeline(shards: usize) -> Pipeline {
         name: "slow".into(),
         seed: Seed(1),
         backend: Backend::Flex,
+        priority: 0,
         stages: vec![
             stage("dataset", StageSettings::DataSynthetic(DataSynthetic::default())),
             stage("vae", StageSettings::TrainVae(TrainVae::default())),

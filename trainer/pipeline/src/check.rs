@@ -64,6 +64,9 @@ impl Pipeline {
         if !(1..=limits::STAGES).contains(&self.stages.len()) {
             return Err(format!("the pipeline has {} stages; expected 1 to {}", self.stages.len(), limits::STAGES));
         }
+        if let Some(message) = broken_priority(self.priority) {
+            return Err(message);
+        }
         for stage in &self.stages {
             if !protocol::id::is_stage_name(stage.name.as_str()) {
                 return Err(format!(
@@ -83,6 +86,13 @@ impl Pipeline {
             None => Ok(()),
         }
     }
+}
+
+/// Says why a priority is refused; `None` if it is not.
+pub(crate) fn broken_priority(priority: i32) -> Option<String> {
+    let most = limits::PRIORITY;
+    let is_fine = (-most..=most).contains(&priority);
+    (!is_fine).then(|| format!("`priority` is {priority}; expected -{most} to {most}"))
 }
 
 impl PipelineStage {

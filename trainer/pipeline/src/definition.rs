@@ -16,6 +16,9 @@ pub struct Pipeline {
     pub seed: Seed,
     /// Backend that computes.
     pub backend: Backend,
+    /// Order among the runs of a group: work of a higher priority comes first. Part of no key.
+    #[serde(default, skip_serializing_if = "is_default")]
+    pub priority: i32,
     /// Stages in topological order.
     pub stages: Vec<PipelineStage>,
     /// Code versions of its kinds when it was read, those above 1. They are stored so that a run that continues under a
@@ -64,10 +67,10 @@ impl Pipeline {
         self.stages.iter().find(|stage| &stage.name == name)
     }
 
-    /// Digest that names the pipeline. It covers everything except paths of folders outside the store, whose contents
-    /// count.
+    /// Digest that names the pipeline. It covers everything except the priority, and paths of folders outside the
+    /// store, whose contents count.
     pub fn digest(&self) -> Digest {
-        let mut pipeline = self.clone();
+        let mut pipeline = Self { priority: 0, ..self.clone() };
         for stage in &mut pipeline.stages {
             let folders = stage.settings.refs().into_iter().filter(|found| !matches!(found.target, Target::Stage(_)));
             folders.for_each(|folder| folder.name.clear());
@@ -138,6 +141,10 @@ impl PipelineStage {
         };
         self.external.iter().filter_map(own).collect()
     }
+}
+
+fn is_default(priority: &i32) -> bool {
+    *priority == 0
 }
 
 /// Code version of every kind that has not changed yet.

@@ -9,7 +9,7 @@ use crate::schema::list_keys;
 use crate::yaml::{self, Budget, Content, Entry, Node};
 
 /// Top-level keys of a pipeline.
-pub(crate) const TOP_KEYS: [&str; 6] = ["name", "seed", "backend", "dataset", "text", "stages"];
+pub(crate) const TOP_KEYS: [&str; 7] = ["name", "seed", "backend", "priority", "dataset", "text", "stages"];
 
 /// Applies one override; positions of added values have `source`.
 ///

@@ -12,6 +12,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
+use crate::check;
 use crate::definition::{Pipeline, PipelineStage};
 use crate::described::described;
 use crate::diagnostic::{Diagnostic, Diagnostics, Position, window};
@@ -57,13 +58,16 @@ struct Head {
     name: String,
     /// Seed that keys all randomness.
     seed: Seed,
-    /// Backend that computes.
     backend: Backend,
+    /// Order among the runs of one project or token: work of a higher priority is served first, and takes workers from
+    /// trainings of a lower one. Results do not depend on it. `--priority` of `trainer submit` overrides it.
+    #[schemars(range(min = -100, max = 100))]
+    priority: i32,
 }
 
 impl Default for Head {
     fn default() -> Self {
-        Self { name: String::new(), seed: Seed(0), backend: Backend::default() }
+        Self { name: String::new(), seed: Seed(0), backend: Backend::default(), priority: 0 }
     }
 }
 
@@ -148,8 +152,8 @@ impl Reader {
         let stages = self.connect(&root, &written, stages);
         let head = head?;
         let stages = stages?;
-        let Head { name, seed, backend } = head;
-        let mut pipeline = Pipeline { name, seed, backend, stages, code_versions: BTreeMap::new() };
+        let Head { name, seed, backend, priority } = head;
+        let mut pipeline = Pipeline { name, seed, backend, priority, stages, code_versions: BTreeMap::new() };
         pipeline.note_code_versions();
         Some(pipeline)
     }
@@ -174,7 +178,11 @@ impl Reader {
                 }
             }
         }
-        serde_json::from_value(base).ok()
+        let head: Head = serde_json::from_value(base).ok()?;
+        if let (Some(message), Some(entry)) = (check::broken_priority(head.priority), root.entry("priority")) {
+            self.mistake(entry.value.at, "priority", message, None);
+        }
+        Some(head)
     }
 
     /// All stages of the file, and the readable ones with their settings. A stage with mistakes is only in the first

@@ -115,7 +115,7 @@ fn references(settings: &StageSettings) -> BTreeMap<String, Target> {
 pub fn markdown() -> String {
     let mut text = String::from(
         "# Stage kinds and their keys\n\nGenerated from the code: `trainer schema --markdown`. `trainer schema` prints \
-         the same as JSON Schema, for editors that check YAML.\n\nA pipeline has the keys `name`, `seed`, `backend`, \
+         the same as JSON Schema, for editors that check YAML.\n\nA pipeline has the keys `name`, `seed`, `backend`, `priority`, \
          `dataset` (a `data.synthetic` or `data.open` stage with this name), `text` (a\n`text.embed` stage) and \
          `stages`, a mapping from names to stages. A stage has a `kind`, the keys of its kind, and, where they \
          apply,\nthe keys of every stage. An unknown key is an error.\n\n",

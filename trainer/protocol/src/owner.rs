@@ -51,6 +51,35 @@ impl fmt::Display for Owner {
     }
 }
 
+/// Limits of a group, as the token file has them. `None` is no limit.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct GroupLimits {
+    /// Largest number of workers at a time.
+    pub workers: Option<usize>,
+    /// Largest number of runs at work; further ones are queued.
+    pub runs: Option<usize>,
+    /// Number of stored bytes from which submissions are refused.
+    pub bytes: Option<u64>,
+}
+
+impl GroupLimits {
+    /// The lower one of each limit.
+    #[must_use]
+    pub fn lower(self, other: Self) -> Self {
+        fn lower<T: Ord>(one: Option<T>, other: Option<T>) -> Option<T> {
+            match (one, other) {
+                (Some(one), Some(other)) => Some(one.min(other)),
+                (one, other) => one.or(other),
+            }
+        }
+        Self {
+            workers: lower(self.workers, other.workers),
+            runs: lower(self.runs, other.runs),
+            bytes: lower(self.bytes, other.bytes),
+        }
+    }
+}
+
 /// The group of an owner: `@PROJECT`, or a token's name. A name never begins with `@`.
 #[derive(Debug, Clone, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, JsonSchema)]
 #[serde(transparent)]

@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use clap::Args;
+use protocol::limits;
 use registry::Place;
 
 /// Parses a whole number of at least `LEAST`.
@@ -16,6 +17,13 @@ pub(super) fn whole<const LEAST: u64>(text: &str) -> Result<u64, String> {
 /// As [`whole`], for counts.
 pub(super) fn count(text: &str) -> Result<usize, String> {
     whole::<1>(text).and_then(|number| usize::try_from(number).map_err(|error| error.to_string()))
+}
+
+/// Parses the priority of a run.
+pub(super) fn priority(text: &str) -> Result<i32, String> {
+    let most = limits::PRIORITY;
+    let priority = text.parse::<i32>().ok().filter(|priority| (-most..=most).contains(priority));
+    priority.ok_or_else(|| format!("expected a whole number from -{most} to {most}"))
 }
 
 /// A pipeline file with overrides.

@@ -7,7 +7,7 @@ use clap::Args;
 use protocol::message::{RunState, RunSummary, RunView, Submit};
 use protocol::{Owner, StageName};
 
-use super::args::PipelineArgs;
+use super::args::{self, PipelineArgs};
 use super::spectrum;
 use crate::client::{Client, Target};
 use crate::local::advice::advice;
@@ -27,6 +27,10 @@ pub(crate) struct SubmitArgs {
     /// Stop after this stage
     #[arg(long, value_name = "STAGE")]
     until: Option<String>,
+    /// Order among the runs of your project or token, from -100 to 100: a higher one comes first, and takes workers from
+    /// trainings of a lower one [default: the pipeline's, or 0]
+    #[arg(long, value_name = "N", value_parser = args::priority, allow_negative_numbers = true)]
+    priority: Option<i32>,
     /// Submitting twice with the same key starts one run
     #[arg(long, value_name = "KEY")]
     idempotency_key: Option<String>,
@@ -104,14 +108,21 @@ pub(crate) fn show(view: &RunView, whys: &Whys, output: Output) {
     match output {
         Output::Json => print::json(&Summary::of(view, whys, false)),
         Output::Table => {
-            print::out(&format!("run {}: {}\n", view.run, summary::run_state(view)));
+            let priority = summary::with_priority(view.priority);
+            print::out(&format!("run {}: {}{priority}\n", view.run, summary::run_state(view)));
+            if view.queued {
+                print::out(&format!("{}\n", view.note));
+            }
             print::out(&format!("{}{}", summary::table(view, whys), summary::evaluations(view)));
         }
     }
 }
 
 pub(crate) async fn submit(args: SubmitArgs) -> Result<u8> {
-    let file = pipeline_file::read_with_data(&args.pipeline.pipeline, &args.pipeline.set)?;
+    let mut file = pipeline_file::read_with_data(&args.pipeline.pipeline, &args.pipeline.set)?;
+    if let Some(priority) = args.priority {
+        file.pipeline.priority = priority;
+    }
     let until = args.until.map(StageName::new);
     pipeline_file::check_stage(&file.pipeline, until.as_ref())?;
     let Some(client) = Client::running(&args.target).await? else {
@@ -165,9 +176,14 @@ pub(crate) async fn status(args: StatusArgs) -> Result<u8> {
             Output::Table => {
                 let row = |run: &RunSummary| {
                     let owner = Owner { name: run.owner.clone(), project: run.project.clone(), ..Owner::default() };
-                    let state = if run.interrupted { "interrupted" } else { run.state.name() };
+                    let state = match run {
+                        RunSummary { interrupted: true, .. } => "interrupted",
+                        RunSummary { queued: true, .. } => "queued",
+                        _ => run.state.name(),
+                    };
+                    let state = format!("{state}{}", summary::with_priority(run.priority));
                     let stages = format!("{}/{}", run.done, run.stages);
-                    vec![run.run.to_string(), run.pipeline.clone(), owner.to_string(), state.to_owned(), stages]
+                    vec![run.run.to_string(), run.pipeline.clone(), owner.to_string(), state, stages]
                 };
                 print::out(&print::table(
                     &["RUN", "PIPELINE", "OWNER", "STATE", "STAGES"],

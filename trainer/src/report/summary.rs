@@ -22,6 +22,9 @@ pub(crate) struct Summary {
     /// Owner of the run.
     owner: String,
     state: String,
+    /// Order among the runs of its group.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    priority: Option<i32>,
     stages: Vec<StageSummary>,
     #[serde(skip_serializing_if = "Vec::is_empty")]
     sweeps: Vec<SweepView>,
@@ -89,6 +92,7 @@ impl Summary {
             pipeline: run.pipeline.clone(),
             owner: run.owner.to_string(),
             state: if interrupted { "interrupted".to_owned() } else { run_state(run).to_owned() },
+            priority: Some(run.priority).filter(|priority| *priority != 0),
             stages: run.stages.iter().map(stage).collect(),
             sweeps: run.sweeps.clone(),
             storage: run.storage.clone(),
@@ -114,12 +118,18 @@ pub(crate) fn state(state: StageState) -> &'static str {
 pub(crate) fn run_state(run: &RunView) -> &'static str {
     match run.state {
         RunState::Paused if run.interrupted => "interrupted",
+        RunState::Running if run.queued => "queued",
         RunState::Running => "running",
         RunState::Paused => "paused",
         RunState::Finished => "finished",
         RunState::Failed => "failed",
         RunState::Cancelled => "cancelled",
     }
+}
+
+/// The priority of a run as it follows the run's state; empty for the usual one.
+pub(crate) fn with_priority(priority: i32) -> String {
+    if priority == 0 { String::new() } else { format!(", priority {priority}") }
 }
 
 /// The requested stages, one per line, and one line per sweep. `trainer sweep status` shows the trials.
@@ -254,6 +264,8 @@ mod tests {
             owner: protocol::Owner::default(),
             state: RunState::Finished,
             interrupted: false,
+            priority: 0,
+            queued: false,
             stages: states.iter().map(stage).collect(),
             sweeps: vec![],
             storage: None,

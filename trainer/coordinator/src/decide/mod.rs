@@ -20,6 +20,7 @@ pub(crate) mod executions;
 mod forget;
 mod gangs;
 mod mending;
+mod moves;
 pub(crate) mod outcome;
 mod reconcile;
 mod runs;

@@ -1,8 +1,8 @@
 //! Assignment of work to workers. Deterministic in state and moment. A later build with other rules does not change
 //! existing assignments.
 //!
-//! Executions are served in the order of [`State::wanted`](crate::state::State::wanted), as
-//! [`Queue`](crate::state::queue::Queue) stores them. Work that no idle worker can take is skipped. The order within
+//! Executions of a group are served in the order of [`State::wanted`](crate::state::State::wanted), as
+//! [`Queue`](crate::state::queue::Queue) stores them. [`in_turn`] merges the groups. Work that no idle worker can take is skipped. The order within
 //! one decision:
 //! 1. Gangs that have become too large release members.
 //! 2. Plain tasks, shards and merges that are ready get one worker each: they are short, and much waits for them. After
@@ -10,7 +10,8 @@
 //! 3. Running gangs admit idle workers, up to their `max`.
 //! 4. Waiting gangs start with all remaining workers.
 //!
-//! With work of several groups, each group may take only its [share](crate::decide::shares) of the idle workers.
+//! With work of several groups or priorities, each of them may take only its [share](crate::decide::shares) of the idle
+//! workers.
 //!
 //! A gang admits only workers that have reported its inputs as fetched and its members as reachable.
 //! [`State::open_gangs`] tells idle workers which inputs to fetch; the gang does not wait for slow ones. All workers of
@@ -20,11 +21,10 @@
 //! Otherwise the merge would wait for the whole training. A gang of at most one worker may start, because it leaves the
 //! other workers to the merge.
 
-use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use protocol::message::Member;
-use protocol::{Digest, WorkerId};
+use protocol::{Digest, Group, WorkerId};
 
 use crate::decide::deciding::Deciding;
 use crate::decide::shares::Shares;
@@ -33,7 +33,7 @@ use crate::policy::GrantOrder;
 use crate::state::evidence;
 use crate::state::execution::{ExecutionState, StageExecution};
 use crate::state::gang::{self, Change};
-use crate::state::queue::{Need, open_member};
+use crate::state::queue::{Need, Rank, in_turn, open_member};
 use crate::state::shared::Map;
 use crate::state::task::{Lease, Task};
 use crate::state::worker::Worker;
@@ -118,10 +118,10 @@ fn note_idle(cx: &mut Deciding<'_>, shares: &Shares) {
     }
     for name in unused.iter() {
         let known = heard.idle.get(name).cloned().unwrap_or(Idle { since: now, kept_for: None });
-        if let Some(group) = &known.kept_for
+        if let Some(claimant) = &known.kept_for
             && now.since(known.since) > policy.share_ms
         {
-            heard.declined.insert_mut(group.clone(), now);
+            heard.declined.insert_mut(claimant.clone(), now);
         }
         let kept_for = shares.owner(name).cloned().or(known.kept_for);
         heard.idle.insert_mut(name.clone(), Idle { since: known.since, kept_for });
@@ -131,11 +131,15 @@ fn note_idle(cx: &mut Deciding<'_>, shares: &Shares) {
 /// The first execution with a ready task that an idle worker can take.
 fn next_small(state: &State, shares: &Shares) -> Option<Digest> {
     let is_met = |need: &Need| {
-        idle_that(state, |worker| need.takes(worker)).any(|member| shares.allow(&member.worker, &need.group))
+        idle_that(state, |worker| need.takes(worker)).any(|member| shares.allow(&member.worker, &need.claimant))
     };
     let needs = state.queue.needs().filter(|need| !need.gang && is_met(need));
-    let first = needs.filter_map(|need| state.queue.with(need).next()).min();
-    first.map(|(_, key)| key)
+    in_turn(needs.flat_map(|need| waiting(state, need, 1))).first().copied()
+}
+
+/// The first executions with a need.
+fn waiting<'a>(state: &'a State, need: &'a Need, count: usize) -> impl Iterator<Item = (&'a Group, Rank, Digest)> {
+    state.queue.with(need).take(count).map(|(rank, key)| (&need.claimant.group, rank, key))
 }
 
 fn is_met(state: &State, need: &Need) -> bool {
@@ -146,16 +150,14 @@ fn is_met(state: &State, need: &Need) -> bool {
 fn prepared_gangs(state: &State) -> Vec<Digest> {
     let tasks = idle_that(state, |_| true).flat_map(|member| &state.workers[&member.worker].ready);
     let keys = tasks.filter_map(|task| state.place(task).ok()).map(|(key, _)| key);
-    let in_order: BTreeSet<_> = keys.filter_map(|key| Some((state.queue.rank_of_gang(&key)?, key))).collect();
-    in_order.into_iter().map(|(_, key)| key).collect()
+    in_turn(keys.filter_map(|key| state.queue.gang(&key).map(|(group, rank)| (group, rank, key))))
 }
 
 /// The first gang tasks that an idle worker could join.
 fn open_gangs(state: &State) -> Vec<(Digest, usize)> {
     let needs = state.queue.needs().filter(|need| need.gang && is_met(state, need));
-    let mut first: Vec<_> = needs.flat_map(|need| state.queue.with(need).take(OPEN_GANGS)).collect();
-    first.sort_unstable();
-    let keys = first.into_iter().take(OPEN_GANGS).map(|(_, key)| key);
+    let first = in_turn(needs.flat_map(|need| waiting(state, need, OPEN_GANGS)));
+    let keys = first.into_iter().take(OPEN_GANGS);
     keys.filter_map(|key| Some((key, open_member(&state.executions[&key])?))).collect()
 }
 
@@ -170,8 +172,8 @@ pub(crate) fn allowed<'a>(
     shares: &'a Shares,
     execution: &'a StageExecution,
 ) -> impl Iterator<Item = Member> + 'a {
-    let group = state.queue.group(&execution.key);
-    idle(state, execution).filter(move |member| group.is_none_or(|group| shares.allow(&member.worker, group)))
+    let claimant = state.queue.claimant(&execution.key);
+    idle(state, execution).filter(move |member| claimant.is_none_or(|own| shares.allow(&member.worker, own)))
 }
 
 fn idle_that<'a>(state: &'a State, takes: impl Fn(&Worker) -> bool + 'a) -> impl Iterator<Item = Member> + 'a {

@@ -1,24 +1,21 @@
-//! Fair shares: workers are divided evenly among the groups whose work waits for them.
+//! Fair shares: workers are divided evenly among the groups whose work waits for them, and by priority within a group.
 //!
 //! A group is a project, or a token without one. Each idle worker belongs to the group with the fewest workers that
-//! could use it. A group that has at least two workers more than another one gives up a member of a gang, above the
-//! gang's minimum. Gangs change their members without loss, so this costs a regroup. The work of one group alone is
-//! served in its order, without shares.
+//! could use it, and there to the waiting work of the highest priority. [`moves`](super::moves) frees workers that are
+//! busy. The work of one group with one priority is served in its order, without shares.
 //!
-//! A group whose worker stays idle for longer than [`Policy::share_ms`](crate::policy::Policy::share_ms), for instance
-//! because it cannot fetch the inputs, loses its claim to it. For [`Policy::share_again_ms`](crate::policy::Policy::share_again_ms),
-//! no gang gives up a member for that group.
+//! Runs whose worker stays idle for longer than [`Policy::share_ms`](crate::policy::Policy::share_ms), for instance
+//! because it cannot fetch the inputs, lose their claim to it. For [`Policy::share_again_ms`](crate::policy::Policy::share_again_ms),
+//! no other work gives up a worker for them.
 
 use std::collections::{BTreeMap, BTreeSet};
 
 use protocol::{Digest, Group, WorkerId};
 
-use super::deciding::Deciding;
 use crate::demand::slots;
 use crate::policy::Policy;
 use crate::state::execution::StageExecution;
-use crate::state::queue::{Need, Rank};
-use crate::state::task::{Lease, Part};
+use crate::state::queue::{Claimant, Need, Rank, Turn};
 use crate::state::worker::Worker;
 use crate::state::{Idle, State};
 use crate::time::Millis;
@@ -26,32 +23,34 @@ use crate::time::Millis;
 /// Executions of one need whose room for workers is added up.
 const COUNTED: usize = 64;
 
-/// The idle workers of each group.
+/// The idle workers of each group and priority.
 #[derive(Debug, Default)]
 pub(crate) struct Shares {
-    /// The work of several groups waits.
+    /// Work of several groups or priorities waits.
     are_divided: bool,
-    kept_for: BTreeMap<WorkerId, Group>,
+    kept_for: BTreeMap<WorkerId, Claimant>,
 }
 
-/// Work of a group that waits for workers.
-struct Claim<'a> {
-    need: &'a Need,
-    rank: Rank,
-    execution: &'a StageExecution,
+/// Work that waits for workers, all of one group and priority.
+pub(super) struct Claim<'a> {
+    pub(super) need: &'a Need,
+    pub(super) rank: Rank,
+    pub(super) execution: &'a StageExecution,
     /// Number of workers that it could use now.
-    room: u64,
+    pub(super) room: u64,
 }
 
 impl Shares {
     /// Divides the workers that are idle at `now`.
     pub(crate) fn of(state: &State, now: Millis) -> Self {
         let mut claims = claims(state);
-        let groups: BTreeSet<&Group> = claims.iter().map(|claim| &claim.need.group).collect();
-        if groups.len() < 2 {
+        let coming = looked_up(state, &claims);
+        claims.extend(coming);
+        let claimants: BTreeSet<&Claimant> = claims.iter().map(|claim| &claim.need.claimant).collect();
+        if claimants.len() < 2 {
             return Self::default();
         }
-        Self { are_divided: true, kept_for: divided(state, now, &mut claims, &mut held(state)) }
+        Self { are_divided: true, kept_for: Division::of(state, claims).divide(now) }
     }
 
     /// Returns true if workers are divided.
@@ -59,71 +58,103 @@ impl Shares {
         self.are_divided
     }
 
-    /// The group that a worker is kept for.
-    pub(crate) fn owner(&self, worker: &WorkerId) -> Option<&Group> {
+    /// The runs that a worker is kept for.
+    pub(crate) fn owner(&self, worker: &WorkerId) -> Option<&Claimant> {
         self.kept_for.get(worker)
     }
 
-    /// Returns true if work of `group` may take an idle worker.
-    pub(crate) fn allow(&self, worker: &WorkerId, group: &Group) -> bool {
-        self.kept_for.get(worker).is_none_or(|owner| owner == group)
+    /// Returns true if work of `claimant` may take an idle worker.
+    pub(crate) fn allow(&self, worker: &WorkerId, claimant: &Claimant) -> bool {
+        self.kept_for.get(worker).is_none_or(|owner| owner == claimant || claimant.precedes(owner))
     }
 }
 
-impl Deciding<'_> {
-    /// Takes members from gangs of groups with many workers, for groups with few. Returns true if it took one, or if an
-    /// idle worker is no longer kept.
-    pub(crate) fn share(&mut self) -> bool {
-        let mut taken = self.state.share_is_over(self.now());
-        while let Some((key, i, worker)) = self.state.member_to_give(self.now()) {
-            taken = true;
-            self.state.visits += 1;
-            let members = self.state.executions[&key].tasks[i].holders().iter();
-            let left = members.filter(|member| member.worker != worker).cloned().collect();
-            tracing::info!(%worker, task = %self.state.executions[&key].tasks[i].id, "leaves its gang for another group's work");
-            self.regroup(key, i, left);
+/// The waiting work, and the workers that each group has.
+pub(super) struct Division<'a> {
+    state: &'a State,
+    pub(super) claims: Vec<Claim<'a>>,
+    /// The first turn of each group's waiting work. A tie of groups goes to the earliest one.
+    turns: BTreeMap<&'a Group, Turn>,
+    /// Number of workers of each group.
+    pub(super) held: BTreeMap<Group, usize>,
+    /// The lowest priority of each group's work under way.
+    lowest: BTreeMap<Group, i32>,
+}
+
+impl<'a> Division<'a> {
+    pub(super) fn of(state: &'a State, claims: Vec<Claim<'a>>) -> Self {
+        let mut turns: BTreeMap<&Group, Turn> = BTreeMap::new();
+        for claim in &claims {
+            let turn = claim.rank.turn();
+            turns.entry(&claim.need.claimant.group).and_modify(|first| *first = turn.min(*first)).or_insert(turn);
         }
-        taken
+        let mut by_execution: BTreeMap<Digest, usize> = BTreeMap::new();
+        for (key, _) in state.workers.values().filter_map(|worker| worker.holds) {
+            *by_execution.entry(key).or_default() += 1;
+        }
+        let mut held = BTreeMap::new();
+        let mut lowest = BTreeMap::new();
+        for (key, count) in by_execution {
+            let Some(Claimant { group, priority }) = state.claimant_of(&state.executions[&key]) else { continue };
+            lowest.entry(group.clone()).and_modify(|least: &mut i32| *least = priority.min(*least)).or_insert(priority);
+            *held.entry(group).or_default() += count;
+        }
+        Self { state, claims, turns, held, lowest }
+    }
+
+    /// Number of workers of a claim's group.
+    pub(super) fn count(&self, claim: &Claim<'_>) -> usize {
+        self.held.get(&claim.need.claimant.group).copied().unwrap_or_default()
+    }
+
+    /// The order in which claims get workers: the groups with few workers first, and within a group by priority.
+    fn place(&self, claim: &Claim<'_>) -> (usize, Option<Turn>, Rank) {
+        (self.count(claim), self.turns.get(&claim.need.claimant.group).copied(), claim.rank)
+    }
+
+    /// Returns true if busy workers could be freed for a claim: those of a group with more workers, or of the same group
+    /// with a lower priority.
+    pub(super) fn is_short(&self, claim: &Claim<'_>) -> bool {
+        let Claimant { group, priority } = &claim.need.claimant;
+        let most = self.held.values().copied().max().unwrap_or_default();
+        self.count(claim) + 2 <= most || self.lowest.get(group).is_some_and(|lowest| lowest < priority)
+    }
+
+    /// Gives each idle worker to the first claim that it fits, and counts it as that group's.
+    pub(super) fn divide(&mut self, now: Millis) -> BTreeMap<WorkerId, Claimant> {
+        let mut given = BTreeMap::new();
+        for name in &self.state.unused {
+            let Some(worker) = self.state.workers.get(name).filter(|worker| worker.is_available()) else { continue };
+            let idle_ms = self.state.heard.idle.get(name).map_or(0, |idle| now.since(idle.since));
+            if idle_ms > self.state.policy.share_ms {
+                continue;
+            }
+            let fits = |claim: &&Claim<'_>| claim.room > 0 && claim.execution.takes(worker);
+            let fitting = (0..self.claims.len()).filter(|i| fits(&&self.claims[*i]));
+            let Some(first) = fitting.min_by_key(|i| self.place(&self.claims[*i])) else { continue };
+            let claim = &mut self.claims[first];
+            claim.room -= 1;
+            *self.held.entry(claim.need.claimant.group.clone()).or_default() += 1;
+            given.insert(name.clone(), claim.need.claimant.clone());
+        }
+        given
+    }
+
+    /// Sorts the claims in the order in which they get workers.
+    pub(super) fn sort(&mut self) {
+        let mut claims = std::mem::take(&mut self.claims);
+        claims.sort_by_key(|claim| self.place(claim));
+        self.claims = claims;
     }
 }
 
 impl State {
-    /// The member of a gang that waiting work of another group should get.
-    pub(crate) fn member_to_give(&self, now: Millis) -> Option<(Digest, usize, WorkerId)> {
-        let mut claims = claims(self);
-        claims.retain(|claim| !self.declines(&claim.need.group, now));
-        if claims.is_empty() {
-            return None;
-        }
-        let mut held = held(self);
-        let most = held.values().copied().max().unwrap_or_default();
-        let is_short = |claim: &Claim<'_>| held.get(&claim.need.group).copied().unwrap_or_default() + 2 <= most;
-        if !claims.iter().any(is_short) {
-            return None;
-        }
-        // Idle workers count as those of the group that is going to use them.
-        let idle = divided(self, now, &mut claims, &mut held);
-        claims.sort_by_key(|claim| (held.get(&claim.need.group).copied().unwrap_or_default(), claim.rank));
-        claims.iter().filter(|claim| claim.room > 0).find_map(|claim| {
-            let coming = idle.iter().filter(|(name, group)| {
-                **group == claim.need.group
-                    && self.workers.get(name).is_some_and(|worker| claim.execution.takes(worker))
-            });
-            // Gives one worker at a time, or as many as the work needs to begin.
-            if coming.count() >= claim.execution.range().min.max(1) {
-                return None;
-            }
-            let own = held.get(&claim.need.group).copied().unwrap_or_default();
-            self.giver(claim, own, &held)
-        })
-    }
-
-    /// Returns true if a group has let a worker idle for too long and this is not noted yet.
+    /// Returns true if runs have let a worker idle for too long and this is not noted yet.
     pub(crate) fn share_is_over(&self, now: Millis) -> bool {
         self.kept_idle().any(|idle| {
             let end = idle.since.after(self.policy.share_ms);
-            let is_noted = |group| self.heard.declined.get(group).is_some_and(|at| *at > end);
-            now > end && idle.kept_for.as_ref().is_some_and(|group| !is_noted(group))
+            let is_noted = |claimant| self.heard.declined.get(claimant).is_some_and(|at| *at > end);
+            now > end && idle.kept_for.as_ref().is_some_and(|claimant| !is_noted(claimant))
         })
     }
 
@@ -133,42 +164,23 @@ impl State {
         self.unused.iter().filter(is_here).filter_map(|name| self.heard.idle.get(name))
     }
 
-    /// Returns true if the group has lately let a worker idle that was kept for it.
-    fn declines(&self, group: &Group, now: Millis) -> bool {
+    /// Returns true if these runs have lately let a worker idle that was kept for them.
+    pub(super) fn declines(&self, claimant: &Claimant, now: Millis) -> bool {
         let Policy { share_ms, share_again_ms, .. } = self.policy;
-        let lately = self.heard.declined.get(group).is_some_and(|at| now.since(*at) < share_again_ms);
-        let is_unused = |idle: &Idle| idle.kept_for.as_ref() == Some(group) && now.since(idle.since) > share_ms;
+        let lately = self.heard.declined.get(claimant).is_some_and(|at| now.since(*at) < share_again_ms);
+        let is_unused = |idle: &Idle| idle.kept_for.as_ref() == Some(claimant) && now.since(idle.since) > share_ms;
         lately || self.kept_idle().any(is_unused)
     }
 
-    /// A member that a gang can spare for `claim`, whose group has `own` workers: of the group with the most workers.
-    fn giver(&self, claim: &Claim<'_>, own: usize, held: &BTreeMap<Group, usize>) -> Option<(Digest, usize, WorkerId)> {
-        let can_give = |(name, worker): (&WorkerId, &Worker)| {
-            let (key, i) = worker.holds.filter(|_| worker.is_available())?;
-            let execution = &self.executions[&key];
-            let task = &execution.tasks[i];
-            let group = self.group_of(execution)?;
-            let count = held.get(&group).copied().unwrap_or_default();
-            let spare = task.part == Part::Gang
-                && matches!(task.lease, Lease::Held { drain_by: None, .. })
-                && task.holders().len() > execution.range().min.max(1)
-                && self.goes_on_without(task, name);
-            let fits = group != claim.need.group && count >= own + 2 && claim.execution.takes(worker);
-            (spare && fits).then(|| (count, task.holders().len(), key, i, name.clone()))
-        };
-        let given = self.workers.iter().filter_map(can_give).max();
-        given.map(|(_, _, key, i, name)| (key, i, name))
-    }
-
-    /// The group for which an execution is computed: that of the first run that waits for it.
-    fn group_of(&self, execution: &StageExecution) -> Option<Group> {
-        let first = self.queue.rank(&execution.key).and_then(|rank| self.runs.get(&rank.run));
-        first.or_else(|| self.registrant(execution)).map(|run| run.owner.group())
+    /// The runs for which an execution is computed: those whose group waits for it first.
+    pub(crate) fn claimant_of(&self, execution: &StageExecution) -> Option<Claimant> {
+        let waiting = self.queue.rank(&execution.key).and_then(|rank| self.claimant(rank));
+        waiting.or_else(|| self.registrant(execution).and_then(|run| self.claimant(self.rank(run.number, 0))))
     }
 }
 
 /// The first waiting work of each need.
-fn claims(state: &State) -> Vec<Claim<'_>> {
+pub(super) fn claims(state: &State) -> Vec<Claim<'_>> {
     let first = |need| {
         let mut waiting = state.queue.with(need).take(COUNTED);
         let (rank, key) = waiting.next()?;
@@ -180,43 +192,15 @@ fn claims(state: &State) -> Vec<Claim<'_>> {
     state.queue.needs().filter_map(first).collect()
 }
 
-/// Number of workers of each group.
-fn held(state: &State) -> BTreeMap<Group, usize> {
-    let mut by_execution: BTreeMap<Digest, usize> = BTreeMap::new();
-    for (key, _) in state.workers.values().filter_map(|worker| worker.holds) {
-        *by_execution.entry(key).or_default() += 1;
-    }
-    let mut held = BTreeMap::new();
-    for (key, count) in by_execution {
-        if let Some(group) = state.group_of(&state.executions[&key]) {
-            *held.entry(group).or_default() += count;
+/// Work that may wait in a moment, once the store has been asked for its value. It keeps a worker from work of a lower
+/// priority, which would otherwise begin between two stages of the higher one.
+fn looked_up<'a>(state: &'a State, claims: &[Claim<'_>]) -> Vec<Claim<'a>> {
+    let mut coming = Vec::new();
+    for (need, rank, key) in state.queue.looked_up() {
+        if claims.iter().any(|claim| need.claimant.precedes(&claim.need.claimant)) {
+            let execution = &*state.executions[&key];
+            coming.push(Claim { need, rank, execution, room: execution.range().min.max(1) as u64 });
         }
     }
-    held
-}
-
-/// Gives each idle worker to the claim of the group with the fewest workers, and counts it as that group's.
-fn divided(
-    state: &State,
-    now: Millis,
-    claims: &mut [Claim<'_>],
-    held: &mut BTreeMap<Group, usize>,
-) -> BTreeMap<WorkerId, Group> {
-    let mut given = BTreeMap::new();
-    for name in &state.unused {
-        let Some(worker) = state.workers.get(name).filter(|worker| worker.is_available()) else { continue };
-        let idle_ms = state.heard.idle.get(name).map_or(0, |idle| now.since(idle.since));
-        if idle_ms > state.policy.share_ms {
-            continue;
-        }
-        let fits = |claim: &&mut Claim<'_>| claim.room > 0 && claim.execution.takes(worker);
-        let count = |claim: &Claim<'_>| held.get(&claim.need.group).copied().unwrap_or_default();
-        let Some(claim) = claims.iter_mut().filter(fits).min_by_key(|claim| (count(claim), claim.rank)) else {
-            continue;
-        };
-        claim.room -= 1;
-        *held.entry(claim.need.group.clone()).or_default() += 1;
-        given.insert(name.clone(), claim.need.group.clone());
-    }
-    given
+    coming
 }

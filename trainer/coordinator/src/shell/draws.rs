@@ -211,7 +211,8 @@ fn drawing(draw: &Draw) -> Result<Pipeline, Failure> {
         });
     }
     let backend = Backend::default();
-    let pipeline = Pipeline { name: PIPELINE.into(), seed: Seed(0), backend, stages, code_versions: BTreeMap::new() };
+    let pipeline =
+        Pipeline { name: PIPELINE.into(), seed: Seed(0), backend, priority: 0, stages, code_versions: BTreeMap::new() };
     pipeline.check().map_err(Failure::invalid)?;
     Ok(pipeline)
 }

@@ -1,6 +1,6 @@
 //! Questions to the state: its runs, tasks and workers by name, and what they wait for.
 
-use std::collections::HashSet;
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use protocol::message::Grant;
@@ -8,6 +8,7 @@ use protocol::{Digest, Incarnation, RunId, StageName, TaskId, WorkerId};
 
 use super::State;
 use super::execution::{ExecutionState, StageExecution};
+use super::queue::Rank;
 use super::run::{self, Run};
 use super::task::Task;
 use super::worker::Worker;
@@ -83,20 +84,23 @@ impl State {
         Some((execution, &execution.tasks[i]))
     }
 
-    /// The keys of executions that a running run waits for, in the order of service: by submission of the run, then by
-    /// stage. Recomputed inputs precede their readers.
+    /// The keys of executions that a running run waits for, in the order of service within each group: by priority, by
+    /// submission of the run, then by stage. Recomputed inputs precede their readers.
     pub fn wanted(&self) -> Vec<Digest> {
-        let mut seen = HashSet::new();
-        let active = self.runs.values().flat_map(|run| run.active());
-        let mut wanted = Vec::new();
-        for (_, key) in active {
-            if !seen.contains(&key) {
-                wanted.extend(self.mended_for(key).into_iter().filter(|input| seen.insert(*input)));
-                wanted.push(key);
-                seen.insert(key);
+        let mut ranks: BTreeMap<Digest, Vec<Rank>> = BTreeMap::new();
+        for (number, run) in &self.runs {
+            for (stage, key) in run.active() {
+                let rank = self.rank(*number, stage);
+                ranks.entry(key).or_default().push(rank);
+                for (mended, input) in self.mended_for(key).into_iter().enumerate() {
+                    ranks.entry(input).or_default().push(Rank { mended, ..rank });
+                }
             }
         }
-        wanted
+        let mut wanted: Vec<(Rank, Digest)> =
+            ranks.into_iter().filter_map(|(key, ranks)| Some((self.first_of(&ranks)?, key))).collect();
+        wanted.sort_unstable();
+        wanted.into_iter().map(|(_, key)| key).collect()
     }
 
     /// Returns true if a running run waits for an execution.

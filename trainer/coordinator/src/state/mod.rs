@@ -33,11 +33,11 @@ pub mod worker;
 use std::sync::Arc;
 
 use protocol::message::Progress;
-use protocol::{Digest, Fence, Group, Incarnation, TaskId, WorkerId};
+use protocol::{Digest, Fence, Incarnation, TaskId, WorkerId};
 
 use self::evidence::Words;
 use self::execution::StageExecution;
-use self::queue::Queue;
+use self::queue::{Claimant, Queue};
 use self::run::Run;
 use self::shared::{Map, Set};
 use self::worker::Worker;
@@ -46,13 +46,13 @@ use crate::time::Millis;
 
 pub use self::apply::UnknownObject;
 
-/// A worker without a task, while workers are divided among groups.
+/// A worker without a task, while workers are divided.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Idle {
     /// Time of its last task.
     pub since: Millis,
-    /// The group whose share it is, or was last.
-    pub kept_for: Option<Group>,
+    /// The runs whose share it is, or was last.
+    pub kept_for: Option<Claimant>,
 }
 
 /// Data from polls. It is lost with the process, which does no harm.
@@ -64,10 +64,10 @@ pub struct Heard {
     pub progress: Map<TaskId, Arc<Progress>>,
     /// The highest reported memory of a worker's process by task, in bytes.
     pub memory: Map<TaskId, u64>,
-    /// Times since when workers hold no task, while they are divided among groups.
+    /// Times since when workers hold no task, while they are divided.
     pub idle: Map<WorkerId, Idle>,
-    /// Times at which groups last let a worker idle that was kept for them.
-    pub declined: Map<Group, Millis>,
+    /// Times at which runs last let a worker idle that was kept for them.
+    pub declined: Map<Claimant, Millis>,
     /// Reports of gang members about their state and about each other. A worker that loses its task also loses its
     /// report.
     pub words: Arc<Words>,

@@ -5,6 +5,9 @@
 //! execution. A decision finds grantable work here without inspecting the executions that wait. Invariant C14 checks
 //! the index.
 
+use std::cmp::Reverse;
+use std::collections::{BTreeMap, BTreeSet};
+
 use protocol::stage::Backend;
 use protocol::{Digest, Group, Labels};
 
@@ -15,9 +18,11 @@ use super::task::{Lease, Part, Task};
 use super::worker::Worker;
 use crate::time::Millis;
 
-/// A position in the order of service.
+/// A position in the order of service of a group.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Rank {
+    /// The priority of the run; the highest comes first.
+    pub priority: Reverse<i32>,
     /// The run's number, in order of submission.
     pub run: u64,
     /// The stage's index in the pipeline.
@@ -25,6 +30,49 @@ pub struct Rank {
     /// The index in [`State::mended_for`] of a recomputed input, which precedes its reader; `usize::MAX` for the stage
     /// itself.
     pub mended: usize,
+}
+
+/// A position in the order of submission: run, stage and recomputed input, as in [`Rank`]. It orders the work of different
+/// groups, because a priority counts only within a group.
+pub type Turn = (u64, usize, usize);
+
+impl Rank {
+    /// The position without the priority.
+    pub fn turn(&self) -> Turn {
+        (self.run, self.stage, self.mended)
+    }
+}
+
+/// The runs of a group that have the same priority.
+#[derive(Debug, Clone, Default, PartialEq, Eq, PartialOrd, Ord)]
+pub struct Claimant {
+    /// Empty where groups are not told apart.
+    pub group: Group,
+    pub priority: i32,
+}
+
+impl Claimant {
+    /// Returns true if `other` is of the same group and has a lower priority.
+    pub fn precedes(&self, other: &Self) -> bool {
+        self.group == other.group && self.priority > other.priority
+    }
+}
+
+/// Merges the work of several groups into one order. Each group keeps the turns of its work; a higher priority gets an
+/// earlier turn of the same group.
+pub fn in_turn<'a>(work: impl IntoIterator<Item = (&'a Group, Rank, Digest)>) -> Vec<Digest> {
+    let mut groups: BTreeMap<&Group, (BTreeSet<Turn>, BTreeSet<(Rank, Digest)>)> = BTreeMap::new();
+    for (group, rank, key) in work {
+        let (turns, ranks) = groups.entry(group).or_default();
+        turns.insert(rank.turn());
+        ranks.insert((rank, key));
+    }
+    let in_order: BTreeMap<Turn, Digest> = groups
+        .into_values()
+        .flat_map(|(turns, ranks)| turns.into_iter().zip(ranks))
+        .map(|(turn, (_, key))| (turn, key))
+        .collect();
+    in_order.into_values().collect()
 }
 
 /// The kind of workers that an execution needs.
@@ -38,8 +86,8 @@ pub struct Need {
     pub instruction_set: Option<String>,
     /// The labels that each worker must have.
     pub requires: Labels,
-    /// The group that waits. Empty where groups are not told apart.
-    pub group: Group,
+    /// The runs that wait.
+    pub claimant: Claimant,
 }
 
 impl Need {
@@ -58,6 +106,8 @@ pub(super) struct Entry {
     /// `None` if no running run waits for it.
     pub(super) rank: Option<Rank>,
     pub(super) need: Option<Need>,
+    /// Set if the execution may need these workers, which a lookup in the store decides.
+    pub(super) is_looking: bool,
     /// The backend, if shards are held.
     pub(super) sharding: Option<Backend>,
     /// The earliest deadline of a task.
@@ -69,6 +119,8 @@ pub(super) struct Entry {
 pub struct Queue {
     entries: Map<Digest, Entry>,
     by_need: Map<Need, Set<(Rank, Digest)>>,
+    /// The same for executions that are being looked up.
+    looking: Map<Need, Set<(Rank, Digest)>>,
     /// The number of wanted executions with held shards.
     sharding: Map<Backend, usize>,
     due: Set<(Millis, Digest)>,
@@ -85,20 +137,26 @@ impl Queue {
         self.by_need.get(need).into_iter().flat_map(|set| set.iter().copied())
     }
 
+    /// The first execution of each need that is being looked up.
+    pub fn looked_up(&self) -> impl Iterator<Item = (&Need, Rank, Digest)> {
+        self.looking.iter().filter_map(|(need, set)| set.first().map(|(rank, key)| (need, *rank, *key)))
+    }
+
     /// The position of an execution that a running run waits for.
     pub fn rank(&self, key: &Digest) -> Option<Rank> {
         self.entries.get(key)?.rank
     }
 
-    /// The group that waits for an execution's workers.
-    pub fn group(&self, key: &Digest) -> Option<&Group> {
-        self.entries.get(key)?.need.as_ref().map(|need| &need.group)
+    /// The runs that wait for an execution's workers.
+    pub fn claimant(&self, key: &Digest) -> Option<&Claimant> {
+        self.entries.get(key)?.need.as_ref().map(|need| &need.claimant)
     }
 
-    /// The position of an execution that needs gang members.
-    pub fn rank_of_gang(&self, key: &Digest) -> Option<Rank> {
-        let entry = self.entries.get(key)?;
-        entry.need.as_ref().filter(|need| need.gang).and(entry.rank)
+    /// An execution that needs gang members: its group and position.
+    pub fn gang(&self, key: &Digest) -> Option<(&Group, Rank)> {
+        let entry = self.entries.get(key).filter(|entry| !entry.is_looking)?;
+        let need = entry.need.as_ref().filter(|need| need.gang)?;
+        Some((&need.claimant.group, entry.rank?))
     }
 
     /// Returns true if a worker holds a shard of an execution on `backend`.
@@ -129,9 +187,10 @@ impl Queue {
 
     fn put_in(&mut self, key: Digest, entry: &Entry) {
         if let (Some(rank), Some(need)) = (entry.rank, &entry.need) {
-            let mut set = self.by_need.get(need).cloned().unwrap_or_default();
+            let sets = if entry.is_looking { &mut self.looking } else { &mut self.by_need };
+            let mut set = sets.get(need).cloned().unwrap_or_default();
             set.insert_mut((rank, key));
-            self.by_need.insert_mut(need.clone(), set);
+            sets.insert_mut(need.clone(), set);
         }
         if let Some(backend) = entry.sharding {
             let count = self.sharding.get(&backend).copied().unwrap_or_default();
@@ -143,12 +202,13 @@ impl Queue {
     }
 
     fn take_out(&mut self, key: Digest, entry: &Entry) {
+        let sets = if entry.is_looking { &mut self.looking } else { &mut self.by_need };
         if let (Some(rank), Some(need)) = (entry.rank, &entry.need)
-            && let Some(set) = self.by_need.get_mut(need)
+            && let Some(set) = sets.get_mut(need)
         {
             set.remove_mut(&(rank, key));
             if set.is_empty() {
-                self.by_need.remove_mut(need);
+                sets.remove_mut(need);
             }
         }
         if let Some(backend) = entry.sharding

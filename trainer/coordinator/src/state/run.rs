@@ -465,6 +465,7 @@ mod tests {
             name: "p".into(),
             seed: Seed(1),
             backend: Backend::Flex,
+            priority: 0,
             stages: vec![stage],
             code_versions: BTreeMap::new(),
         };

@@ -59,6 +59,9 @@ pub enum Lease {
         secret: String,
         /// The time at which the task is released by force, if it is asked to drain.
         drain_by: Option<Millis>,
+        /// Set if it is asked to drain because work of a higher priority gets its workers.
+        #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+        preempted: bool,
     },
     /// The task is done.
     Done {
@@ -195,12 +198,12 @@ impl Task {
     }
 
     fn lease_to(&mut self, holders: Vec<Member>, secret: impl FnOnce(Fence) -> String) -> Write {
-        let drain_by = match self.lease {
-            Lease::Held { drain_by, .. } => drain_by,
-            Lease::Waiting { .. } | Lease::Done { .. } => None,
+        let (drain_by, preempted) = match self.lease {
+            Lease::Held { drain_by, preempted, .. } => (drain_by, preempted),
+            Lease::Waiting { .. } | Lease::Done { .. } => (None, false),
         };
         let fence = self.raise();
-        self.lease = Lease::Held { holders, secret: secret(self.fence), drain_by };
+        self.lease = Lease::Held { holders, secret: secret(self.fence), drain_by, preempted };
         fence
     }
 
@@ -253,14 +256,28 @@ impl Task {
         }
     }
 
-    /// Asks the holders to drain until `deadline`, or to continue if it is `None`.
+    /// Asks the holders to drain until `deadline`, or to continue if it is `None`. A preempted task keeps draining.
     pub fn drain(&mut self, deadline: Option<Millis>) {
-        if let Lease::Held { drain_by, .. } = &mut self.lease {
+        if let Lease::Held { drain_by, preempted, .. } = &mut self.lease {
             *drain_by = match (*drain_by, deadline) {
                 (Some(already), Some(_)) => Some(already),
+                (Some(already), None) if *preempted => Some(already),
                 (_, deadline) => deadline,
             };
         }
+    }
+
+    /// Asks the holders to drain until `deadline`, because work of a higher priority gets them.
+    pub fn preempt(&mut self, deadline: Millis) {
+        self.drain(Some(deadline));
+        if let Lease::Held { preempted, .. } = &mut self.lease {
+            *preempted = true;
+        }
+    }
+
+    /// Returns true if it is asked to drain for work of a higher priority.
+    pub fn is_preempted(&self) -> bool {
+        matches!(self.lease, Lease::Held { preempted: true, .. })
     }
 
     fn raise(&mut self) -> Write {

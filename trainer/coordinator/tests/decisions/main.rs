@@ -9,6 +9,7 @@ mod demand;
 mod gangs;
 mod history;
 mod liveness;
+mod priorities;
 mod promises;
 mod queued;
 mod resolve;

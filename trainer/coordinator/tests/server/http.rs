@@ -127,6 +127,7 @@ fn pipeline() -> Pipeline {
         name: "small".into(),
         seed: Seed(1),
         backend: Backend::Flex,
+        priority: 0,
         stages: vec![
             stage("dataset", StageSettings::DataSynthetic(DataSynthetic::default())),
             stage("vae", StageSettings::TrainVae(TrainVae::default())),

@@ -60,7 +60,7 @@ pub(crate) fn quickstart(seed: u64, workers: WorkerRange, require: &[&str]) -> P
         }
     });
     let (name, stages) = ("quickstart".into(), stages.to_vec());
-    Pipeline { name, seed: Seed(seed), backend: Backend::Flex, stages, code_versions: BTreeMap::new() }
+    Pipeline { name, seed: Seed(seed), backend: Backend::Flex, priority: 0, stages, code_versions: BTreeMap::new() }
 }
 
 /// The same pipeline with a text encoder in a folder without a known digest.

@@ -3,12 +3,13 @@
 mod disk;
 mod steps;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use coordinator::batch::{Ask, Batches};
 use coordinator::state::run::Run;
 use coordinator::{Control, Effect, Event, Millis, Policy, Refused, State, journal};
+use pipeline::Pipeline;
 use protocol::message::{Member, RunState};
 use protocol::stage::WorkerRange;
 use protocol::{Attempt, Digest, Incarnation, RunId, TaskId, WorkerId};
@@ -20,7 +21,7 @@ use crate::store::FakeStore;
 use crate::worker::{Answer, Call, FakeWorker};
 
 /// All injected faults. A fault that is never counted has silently disappeared from the simulation.
-pub(crate) const INJECTED: [&str; 30] = [
+pub(crate) const INJECTED: [&str; 31] = [
     "a call that was lost",
     "a call that came twice",
     "a worker that died",
@@ -42,6 +43,7 @@ pub(crate) const INJECTED: [&str; 30] = [
     "an ask that came while a commit was in flight",
     "a quiet poll answered while a commit was in flight",
     "a collection of what was not named yet",
+    "a training that made way for a higher priority",
     "an input that was found damaged",
     "a checkpoint refused for a missing blob",
     "an outcome refused for a missing blob",
@@ -89,6 +91,8 @@ pub(crate) struct World {
     present: BTreeMap<WorkerId, Incarnation>,
     /// Gangs after the newest batch, with attempts and members.
     gangs: BTreeMap<TaskId, (Attempt, Vec<Member>)>,
+    /// Trainings that are asked to make way.
+    preempted: BTreeSet<TaskId>,
     /// Number of injected faults by kind.
     pub(crate) injected: BTreeMap<&'static str, u64>,
     /// Set while the coordinator runs.
@@ -127,6 +131,8 @@ fn policy() -> Policy {
 impl World {
     pub(crate) fn new(seed: u64) -> Self {
         let mut random = Random::new(seed);
+        // Apart from the others, so that a seed keeps its faults.
+        let mut priorities = Random::new(!seed);
         let workers = (0..1 + random.below(6)).map(|i| FakeWorker::new(&format!("w{i}"))).collect();
         let submissions = (0..1 + random.below(3))
             .map(|i| {
@@ -140,13 +146,15 @@ impl World {
                         seed => pipelines::reading_files(pipelines::quickstart(seed, range, gates)),
                     },
                 };
+                let pipeline = Pipeline { priority: priorities.below(3) as i32 - 1, ..pipeline };
+                let is_mine = i % 2 == 0 || priorities.chance(50);
                 let event = Event::Submit {
                     submission: None,
                     pipeline: Box::new(pipeline),
                     source: String::new(),
                     idempotency_key: random.chance(30).then(|| format!("key-{i}")),
                     until: random.chance(20).then(|| "mld".into()),
-                    owner: protocol::Owner::local(if i % 2 == 0 { "me" } else { "you" }),
+                    owner: protocol::Owner::local(if is_mine { "me" } else { "you" }),
                 };
                 (Millis(random.below(CHAOS_MS / 2)), event)
             })
@@ -166,6 +174,7 @@ impl World {
             heard_then: BTreeMap::new(),
             present: BTreeMap::new(),
             gangs: BTreeMap::new(),
+            preempted: BTreeSet::new(),
             injected: BTreeMap::new(),
             up: true,
             back_at: Millis(0),

@@ -36,6 +36,12 @@ pub struct RunView {
     /// It is paused because the process that worked on it ended, not because a user paused it.
     #[serde(default)]
     pub interrupted: bool,
+    /// Order among the runs of its group: the highest is served first.
+    #[serde(default, skip_serializing_if = "is_usual")]
+    pub priority: i32,
+    /// It waits until fewer runs of its group are at work.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub queued: bool,
     /// Stages in topological order, then the stages made by sweeps.
     pub stages: Vec<StageView>,
     /// Sweeps that have started.
@@ -76,6 +82,12 @@ pub struct RunSummary {
     /// It is paused because the process that worked on it ended, not because a user paused it.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub interrupted: bool,
+    /// Order among the runs of its group: the highest is served first.
+    #[serde(default, skip_serializing_if = "is_usual")]
+    pub priority: i32,
+    /// It waits until fewer runs of its group are at work.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub queued: bool,
     /// Time of the submission, in milliseconds since 1970.
     pub created_ms: i64,
     /// Time of the newest change of its state, in milliseconds since 1970.
@@ -94,6 +106,10 @@ pub struct RunSummary {
     pub note: String,
 }
 
+fn is_usual(priority: &i32) -> bool {
+    *priority == 0
+}
+
 impl RunSummary {
     /// Largest size of a summary as JSON in bytes, unless its names alone are longer.
     pub const BYTES: usize = 300;
@@ -110,6 +126,8 @@ impl RunSummary {
             project: view.owner.project.clone(),
             state: view.state,
             interrupted: view.interrupted,
+            priority: view.priority,
+            queued: view.queued,
             created_ms,
             changed_ms: view.times.ended_ms.unwrap_or(created_ms),
             done: count(main().filter(|stage| stage.state.is_done()).count()),
@@ -381,6 +399,8 @@ mod tests {
                 project: Some("motion".into()),
                 state: RunState::Cancelled,
                 interrupted: true,
+                priority: -100,
+                queued: true,
                 created_ms: 1_764_054_273_000,
                 changed_ms: 1_764_054_273_000,
                 done: 12,

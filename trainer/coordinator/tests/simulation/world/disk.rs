@@ -1,15 +1,15 @@
 //! The coordinator's batches on a slow disk. Requests wait in the queue while a transaction is in flight, and an answer
 //! reveals only stored data.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use coordinator::batch::{Ask, Done, Turn};
 use coordinator::state::task::Part;
 use coordinator::state::worker::Presence;
-use coordinator::{Effect, Event, Millis, Moment, Refused};
+use coordinator::{Effect, Event, Millis, Moment, Refused, State};
 use protocol::message::{Member, TaskOutcome};
-use protocol::{Digest, Incarnation, WorkerId};
+use protocol::{Digest, Incarnation, TaskId, WorkerId};
 use registry::{Write, WriteError};
 
 use super::World;
@@ -264,6 +264,13 @@ impl World {
             if task.part == Part::Gang && task.is_held() {
                 gangs.insert(task.id.clone(), (task.attempt, task.holders().to_vec()));
             }
+        }
+        let preempted = |state: &State| -> BTreeSet<TaskId> {
+            let tasks = state.executions.values().flat_map(|execution| &execution.tasks);
+            tasks.filter(|task| task.is_preempted()).map(|task| task.id.clone()).collect()
+        };
+        for _ in preempted(&state).difference(&std::mem::replace(&mut self.preempted, preempted(&state))) {
+            self.count("a training that made way for a higher priority");
         }
         for (task, (attempt, before)) in std::mem::replace(&mut self.gangs, gangs) {
             let Some((now, after)) = self.gangs.get(&task).filter(|(now, _)| *now == attempt) else { continue };
