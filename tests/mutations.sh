@@ -140,10 +140,17 @@ mutation old-report-is-believed trainer/coordinator/src/state/evidence.rs 's/ &&
 mutation suspicion-never-fades trainer/coordinator/src/decide/gangs.rs 's/saturating_sub\(u32::try_from\(faded\)[^)]*\)\)/saturating_sub(u32::try_from(faded * 0).unwrap_or(0))/' coordinator:decisions:gangs
 mutation too-few-lose-their-state trainer/coordinator/src/decide/attempts.rs 's/!left\.is_empty\(\) && self\.may_hold/left.is_empty() \&\& self.may_hold/' coordinator:decisions:gangs
 mutation failing-lead-ends-the-try trainer/coordinator/src/decide/outcome.rs 's/&& self\.state\.goes_on_without/\&\& !self.state.goes_on_without/' coordinator:decisions:gangs
-mutation no-shares trainer/coordinator/src/decide/shares.rs 's/if groups\.len\(\) < 2/if groups.len() < 200/' coordinator:decisions:shares
-mutation gangs-give-nothing trainer/coordinator/src/decide/shares.rs 's/own \+ 2/own + 200/' coordinator:decisions:shares
+mutation no-shares trainer/coordinator/src/decide/shares.rs 's/claimants\.len\(\) > 1/claimants.len() > 100/' coordinator:decisions:shares
+mutation gangs-give-nothing trainer/coordinator/src/decide/moves.rs 's/own \+ 2/own + 200/' coordinator:decisions:shares
 mutation unused-shares-come-again trainer/coordinator/src/decide/shares.rs 's/now\.since\(\*at\) < share_again_ms/now.since(*at) < share_again_ms \/ 1000/' coordinator:decisions:shares
-mutation shares-for-ever trainer/coordinator/src/decide/shares.rs 's/idle_ms > state\.policy\.share_ms/idle_ms > state.policy.share_ms * 100/' coordinator:decisions:shares
+mutation shares-for-ever trainer/coordinator/src/decide/shares.rs 's/idle_ms > self\.state\.policy\.share_ms/idle_ms > self.state.policy.share_ms * 100/' coordinator:decisions:shares
+mutation priorities-across-groups trainer/coordinator/src/decide/shares.rs 's/\(self\.count\(claim\), self\.turns\.get\(&claim\.need\.claimant\.group\)\.copied\(\), claim\.rank\)/(self.count(claim), None, claim.rank)/' coordinator:decisions:priorities
+mutation a-training-that-makes-way-is-recalled trainer/coordinator/src/state/task.rs 's/\(Some\(already\), None\) if \*preempted =>/(Some(already), None) if *preempted \&\& already.0 == 0 =>/' coordinator:decisions:priorities
+mutation the-lower-priority-works-between-two-stages trainer/coordinator/src/decide/shares.rs 's/claims\.extend\(coming\);/drop(coming);/' coordinator:decisions:priorities
+mutation resumed-and-stopped-again trainer/coordinator/src/decide/moves.rs 's/>= self\.policy\.stay_ms/>= 0 * self.policy.stay_ms/' coordinator:decisions:priorities
+mutation no-limit-of-a-groups-workers trainer/coordinator/src/decide/schedule.rs 's/welcome\.truncate\(/let _ = (/' coordinator:decisions:limits
+mutation queued-runs-begin trainer/coordinator/src/state/run.rs 's/self\.state == RunState::Running && !self\.queued/self.state == RunState::Running/' coordinator:decisions:limits
+mutation no-limit-of-a-groups-bytes trainer/coordinator/src/shell/actor_handle.rs 's/self\.check_bytes\(&owner\.group\(\)\)\.await\?;//' coordinator:server:limits
 mutation joins-without-reaching worker/src/prepare.rs 's/for Member \{ worker, peer_address, \.\. \} in &task\.peers \{/for Member { worker, peer_address, .. } in task.peers.iter().take(0) {/' worker:lib:prepare
 mutation only-whole-frames-count worker/src/gang/link.rs 's/if count > 0 \{/if count > 1 << 20 {/' worker:lib:relay
 mutation signs-behind-frames worker/src/gang/link.rs 's/writer\.sign\(sign, patience, abort\)\?;/let _ = sign;/' worker:lib:relay

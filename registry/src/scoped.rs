@@ -137,6 +137,10 @@ impl Records for ScopedRecords {
         if self.sees_run(run).await? { self.all.usage(run).await } else { Ok(Usage::default()) }
     }
 
+    async fn group_bytes(&self, group: &Group) -> Result<u64> {
+        if *group == self.group { self.all.group_bytes(group).await } else { Ok(0) }
+    }
+
     async fn kind_sizes(&self) -> Result<Vec<KindSize>> {
         // Sizes of the whole store are not for one group.
         Ok(Vec::new())

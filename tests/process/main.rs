@@ -27,6 +27,7 @@ mod mistakes;
 mod mocap;
 mod motions;
 mod page;
+mod priorities;
 mod push;
 mod reading;
 mod registry;

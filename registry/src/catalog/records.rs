@@ -90,6 +90,9 @@ pub trait Records: Debug + Send + Sync {
     /// Returns the amounts that count against a run's limits.
     async fn usage(&self, run: &RunId) -> Result<Usage>;
 
+    /// Returns the number of bytes of all artifacts and log lines of a group's runs.
+    async fn group_bytes(&self, group: &Group) -> Result<u64>;
+
     /// Returns the sizes of all artifacts by kind, largest first.
     async fn kind_sizes(&self) -> Result<Vec<KindSize>>;
 

@@ -186,6 +186,10 @@ impl Records for SqlRecords {
         usage::read(&mut self.0.reader().await?.conn(), run).await
     }
 
+    async fn group_bytes(&self, group: &Group) -> Result<u64> {
+        usage::group_bytes(&mut self.0.reader().await?.conn(), group).await
+    }
+
     async fn kind_sizes(&self) -> Result<Vec<KindSize>> {
         usage::kind_sizes(&mut self.0.reader().await?.conn()).await
     }

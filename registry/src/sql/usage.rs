@@ -1,6 +1,6 @@
 //! Counters of the limited amounts that each run has stored.
 
-use protocol::RunId;
+use protocol::{Group, RunId};
 
 use super::statement::{Conn, int, query, run};
 use crate::catalog::{KindSize, Usage};
@@ -19,6 +19,16 @@ pub(super) async fn read(conn: &mut Conn<'_>, of_run: &RunId) -> Result<Usage, Q
     let Some(row) = find.fetch_optional(&mut *conn).await? else { return Ok(Usage::default()) };
     let (log_bytes, values): (i64, i64) = (row.try_get(0)?, row.try_get(1)?);
     Ok(Usage { log_bytes: log_bytes.unsigned_abs(), values: values.unsigned_abs() })
+}
+
+/// Bytes of all artifacts and log lines of a group's runs.
+pub(super) async fn group_bytes(conn: &mut Conn<'_>, group: &Group) -> Result<u64, QueryError> {
+    let find = query(
+        "SELECT CAST(coalesce((SELECT sum(a.bytes) FROM run_owners o JOIN artifacts a ON a.run = o.run WHERE o.owner = ?1), 0) \
+         + coalesce((SELECT sum(u.log_bytes) FROM run_owners o JOIN usage u ON u.run = o.run WHERE o.owner = ?1), 0) AS BIGINT)",
+    );
+    let row = find.bind(group.as_str()).fetch_one(conn).await?;
+    Ok(row.try_get::<i64, _>(0)?.unsigned_abs())
 }
 
 /// Sizes of all artifacts by kind.

@@ -2,7 +2,7 @@
 //!
 //! `KEY=VALUE` words may follow the token, each key at most once. [`Caller::set`] is the only list of keys.
 
-use protocol::{Group, Owner};
+use protocol::{Group, GroupLimits, Owner};
 
 use crate::expiry::Expiry;
 use crate::names::Names;
@@ -21,12 +21,14 @@ pub struct Caller {
     pub project: Option<String>,
     /// `expires=`: the moment from which the token is refused.
     pub expires: Option<Expiry>,
+    /// `max_workers=`, `max_runs=` and `max_gib=`: limits of its group. The lowest of all lines of the group counts.
+    pub limits: GroupLimits,
 }
 
 impl Caller {
     /// A caller without limits beyond its scopes.
     pub fn new(name: impl Into<String>, scopes: Scopes) -> Self {
-        Self { name: name.into(), scopes, workers: None, project: None, expires: None }
+        Self { name: name.into(), scopes, workers: None, project: None, expires: None, limits: GroupLimits::default() }
     }
 
     /// Applies the `KEY=VALUE` words that follow the token.
@@ -57,7 +59,13 @@ impl Caller {
                 return Err(format!("`{value}` is not a project name: {expected}"));
             }
             "expires" => self.expires = Some(value.parse()?),
-            _ => return Err(format!("unknown key `{key}=`; expected `workers=`, `project=` or `expires=`")),
+            "max_workers" => self.limits.workers = Some(whole(value)?),
+            "max_runs" => self.limits.runs = Some(whole(value)?),
+            "max_gib" => self.limits.bytes = Some(gib(value)?),
+            _ => {
+                let known = "`workers=`, `project=`, `expires=`, `max_workers=`, `max_runs=` or `max_gib=`";
+                return Err(format!("unknown key `{key}=`; expected {known}"));
+            }
         }
         Ok(())
     }
@@ -92,4 +100,16 @@ impl Caller {
     pub fn worker_names(&self) -> Option<&Names> {
         self.workers.as_ref()
     }
+}
+
+fn whole(value: &str) -> Result<usize, String> {
+    value.parse().map_err(|_| format!("`{value}` is not a whole number"))
+}
+
+/// Parses a number of GiB, such as `500` or `0.5`.
+fn gib(value: &str) -> Result<u64, String> {
+    let most = f64::from(u32::MAX);
+    let number = value.parse::<f64>().ok().filter(|number| (0.0..=most).contains(number));
+    let number = number.ok_or_else(|| format!("`{value}` is not a number of GiB"))?;
+    Ok((number * f64::from(1 << 30)) as u64)
 }

@@ -5,7 +5,7 @@
 //! alice    submit,promote  5f0c...
 //! nodes    worker          91ab...  workers=nodes-*
 //! grafana  read            c2d4...
-//! bob      submit          77e0...  project=motion expires=2026-12-31
+//! bob      submit          77e0...  project=motion expires=2026-12-31 max_runs=4
 //! protect  prod=alice,bob
 //! ```
 //!
@@ -18,7 +18,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 use std::sync::Arc;
 
-use protocol::{Alias, Digest, Group, Owner};
+use protocol::{Alias, Digest, Group, GroupLimits, Owner};
 
 use crate::caller::Caller;
 use crate::scope::{Scope, Scopes};
@@ -108,6 +108,16 @@ impl Tokens {
     /// The caller whose token has this digest.
     pub fn find_digest(&self, digest: Digest) -> Option<&Arc<Caller>> {
         self.callers.get(&digest)
+    }
+
+    /// The limits of each group that has some.
+    pub fn limits(&self) -> BTreeMap<Group, GroupLimits> {
+        let mut limits: BTreeMap<Group, GroupLimits> = BTreeMap::new();
+        for caller in self.callers.values().filter(|caller| caller.limits != GroupLimits::default()) {
+            let of_group = limits.entry(caller.owner().group()).or_default();
+            *of_group = of_group.lower(caller.limits);
+        }
+        limits
     }
 
     /// Digests of all tokens.
@@ -300,6 +310,16 @@ mod tests {
     }
 
     #[test]
+    fn the_lowest_limit_of_a_group_counts() {
+        let text = format!(
+            "alice submit {A} project=motion max_workers=8 max_runs=4\nanna submit {B} project=motion max_workers=2 max_gib=1.5\n\
+             bob submit 0123456789abcde0\n"
+        );
+        let limits = GroupLimits { workers: Some(2), runs: Some(4), bytes: Some(3 << 29) };
+        assert_eq!(read(&text).unwrap().limits(), BTreeMap::from([(Group::of("anna", Some("motion")), limits)]));
+    }
+
+    #[test]
     fn mistakes_are_named_with_their_line_and_without_the_token() {
         for (text, expected) in [
             (format!("alice submit {A}\n{B}\n"), "line 2: expected `NAME SCOPES TOKEN`"),
@@ -310,11 +330,14 @@ mod tests {
             (format!("a worker {A} nodes-*\n"), "line 1: expected `KEY=VALUE` after the token"),
             (
                 format!("a worker {A} colour=red\n"),
-                "line 1: unknown key `colour=`; expected `workers=`, `project=` or `expires=`",
+                "line 1: unknown key `colour=`; expected `workers=`, `project=`, `expires=`, `max_workers=`,",
             ),
             (format!("a worker {A} workers=a workers=b\n"), "line 1: `workers=` is given twice"),
             (format!("a worker {A} workers=\n"), "line 1: `` is not a name pattern"),
             (format!("a submit {A} project=@b\n"), "line 1: `@b` is not a project name"),
+            (format!("a submit {A} max_runs=-1\n"), "line 1: `-1` is not a whole number"),
+            (format!("a submit {A} max_gib=nan\n"), "line 1: `nan` is not a number of GiB"),
+            (format!("a submit {A} max_gib=-1\n"), "line 1: `-1` is not a number of GiB"),
             (format!("a submit {A} expires=soon\n"), "line 1: `soon` is not a time"),
             (format!("a promote {A}\nprotect prod\n"), "line 2: expected `protect ALIAS=NAME,NAME`"),
             (format!("a promote {A}\nprotect prod=\n"), "line 2: `` is not a valid name"),

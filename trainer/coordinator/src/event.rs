@@ -4,10 +4,13 @@
 //! [`Observation`] is a poll or a tick of the clock. [`observe`](crate::observe) turns it into events only where
 //! something follows from it, so that heartbeats cost no disk write.
 
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
 use pipeline::Pipeline;
 use protocol::message::{CommitCheckpoint, Join, Poll, ReportOutcome, TaskOutcome};
 use protocol::stage::Keep;
-use protocol::{Alias, Digest, Fence, Incarnation, Owner, RunId, StageName, TaskId, WorkerId};
+use protocol::{Alias, Digest, Fence, Group, GroupLimits, Incarnation, Owner, RunId, StageName, TaskId, WorkerId};
 use registry::Write;
 
 use crate::state::execution::StageExecution;
@@ -75,6 +78,8 @@ pub enum Event {
     },
     /// Waiting work should get a worker that is busy, or an idle worker is no longer kept for a group.
     Unshared,
+    /// The limits of groups changed.
+    Limits { limits: Arc<BTreeMap<Group, GroupLimits>> },
     /// No member of a gang has advanced by a step for too long.
     GangStalled { task: TaskId, fence: Fence },
     /// A checkpoint was uploaded and is to be committed.
@@ -145,6 +150,7 @@ impl Event {
             | Self::GangDivided { .. }
             | Self::Quiet { .. }
             | Self::Unshared
+            | Self::Limits { .. }
             | Self::GangStalled { .. }
             | Self::Control { .. }
             | Self::WorkerForgotten { .. }

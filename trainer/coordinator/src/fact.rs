@@ -36,6 +36,8 @@ pub enum Fact {
         /// Set if a restart paused the run.
         parked: bool,
     },
+    /// A run waits until fewer runs of its group are at work, or no longer does.
+    RunQueued { run: u64, queued: bool },
     /// The status of some stages of a run changed.
     Stages {
         run: u64,

@@ -57,6 +57,7 @@ pub(crate) fn of(state: &State, fact: &Fact, why: Option<&str>) -> Vec<HistoryEn
             vec![HistoryEntry { why, ..about(execution, kind) }]
         }
         Fact::Stages { .. }
+        | Fact::RunQueued { .. }
         | Fact::Resolved { .. }
         | Fact::StagesAdded { .. }
         | Fact::SweepBegun { .. }

@@ -163,8 +163,9 @@ fn check_queue(state: &State) -> Vec<String> {
     let mut broken = Vec::new();
     let mut rebuilt = state.clone();
     rebuilt.index();
-    let indices =
-        |state: &State| (state.queue.clone(), state.mends.clone(), state.idempotent.clone(), state.parked.clone());
+    let indices = |state: &State| {
+        (state.queue.clone(), state.mends.clone(), state.idempotent.clone(), state.parked.clone(), state.groups.clone())
+    };
     if indices(state) != indices(&rebuilt) {
         broken.push(format!("C14: the queue is {:?}, and should be {:?}", indices(state), indices(&rebuilt)));
     }

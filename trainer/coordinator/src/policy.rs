@@ -1,7 +1,11 @@
 //! Parameters of coordination. They are configurable so that tests can vary them; the documented promises assume the
 //! defaults.
 
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
 use protocol::message::LossCause;
+use protocol::{Group, GroupLimits};
 
 /// Order in which idle workers receive work. Results do not depend on it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -55,6 +59,8 @@ pub struct Policy {
     pub snapshot_every: u64,
     /// Maximum number of active runs; further submissions are refused.
     pub live_runs: usize,
+    /// Limits of groups, as the token file has them now.
+    pub limits: Arc<BTreeMap<Group, GroupLimits>>,
     pub grants: GrantOrder,
     /// Number of our own faults that a task survives.
     pub fault_budget: u32,
@@ -85,6 +91,7 @@ impl Default for Policy {
             stay_ms: 60_000,
             snapshot_every: 4_000,
             live_runs: 20_000,
+            limits: Arc::default(),
             grants: GrantOrder::ByName,
             fault_budget: 5,
             infrastructure_budget: 100,
@@ -93,6 +100,11 @@ impl Default for Policy {
 }
 
 impl Policy {
+    /// The limits of a group.
+    pub fn limits_of(&self, group: &Group) -> GroupLimits {
+        self.limits.get(group).copied().unwrap_or_default()
+    }
+
     /// Time in which a worker joins no others after `suspicions` suspicions.
     pub fn shunned_ms(&self, cause: LossCause, suspicions: u32) -> u64 {
         let first = match cause {

@@ -27,6 +27,9 @@ pub enum Rejected {
     /// A limit is reached; the same request may be accepted later.
     #[error("{0}")]
     Full(String),
+    /// The group has stored as much as it may.
+    #[error("{0}")]
+    UsedUp(String),
     /// The request is invalid.
     #[error("{0}")]
     Invalid(String),

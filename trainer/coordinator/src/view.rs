@@ -138,7 +138,7 @@ impl State {
             }
         }
         let sweeps = run.sweeps.iter().map(|sweep| self.sweep_view(run, sweep)).collect();
-        RunView { sweeps, ..without_sweeps(run, stages) }
+        RunView { sweeps, ..self.without_sweeps(run, stages) }
     }
 
     /// A run as lists show it at `now`, without times.
@@ -146,7 +146,26 @@ impl State {
         // Sweeps may have made thousands of stages, which a summary leaves out.
         let main = run.pipeline.stages.iter().enumerate().filter(|(_, stage)| stage.derived.is_none());
         let stages: Vec<StageView> = main.map(|(i, _)| self.stage_view(run, i, now)).collect();
-        RunSummary::of(&without_sweeps(run, stages))
+        RunSummary::of(&self.without_sweeps(run, stages))
+    }
+
+    fn without_sweeps(&self, run: &Run, stages: Vec<StageView>) -> RunView {
+        let queued = run.queued && run.state == RunState::Running;
+        let note = if queued { self.why_queued(run) } else { note(run.state, &stages) };
+        RunView {
+            run: run.id.clone(),
+            pipeline: run.pipeline.name.clone(),
+            owner: run.owner.clone(),
+            state: run.state,
+            interrupted: run.is_interrupted(),
+            priority: run.submitted.priority,
+            queued,
+            note,
+            stages,
+            sweeps: Vec::new(),
+            storage: None,
+            times: Default::default(),
+        }
     }
 
     fn stage_view(&self, run: &Run, i: usize, now: Millis) -> StageView {
@@ -239,6 +258,7 @@ impl State {
                 (StageState::Ready, interrupted_at(execution))
             }
             ExecutionState::Open if run.state == RunState::Paused => (StageState::Ready, Some("paused".to_owned())),
+            ExecutionState::Open if run.queued => (StageState::Ready, Some("queued".to_owned())),
             ExecutionState::Open if backs_off(execution) => {
                 (StageState::Ready, Some(format!("retries soon (attempt {} failed)", execution.attempt())))
             }
@@ -260,10 +280,7 @@ impl State {
 
     /// Returns true if a stage could begin and lacks only workers.
     fn wants_workers(&self, run: &Run, execution: &StageExecution) -> bool {
-        execution.state == ExecutionState::Open
-            && run.state == RunState::Running
-            && !execution.is_busy()
-            && !self.draining
+        execution.state == ExecutionState::Open && run.is_at_work() && !execution.is_busy() && !self.draining
     }
 
     /// The highest memory that a worker's process reported for an execution, in bytes.
@@ -302,23 +319,6 @@ impl State {
                 metrics: Default::default(),
             },
         }
-    }
-}
-
-fn without_sweeps(run: &Run, stages: Vec<StageView>) -> RunView {
-    RunView {
-        run: run.id.clone(),
-        pipeline: run.pipeline.name.clone(),
-        owner: run.owner.clone(),
-        state: run.state,
-        interrupted: run.is_interrupted(),
-        priority: run.submitted.priority,
-        queued: false,
-        note: note(run.state, &stages),
-        stages,
-        sweeps: Vec::new(),
-        storage: None,
-        times: Default::default(),
     }
 }
 

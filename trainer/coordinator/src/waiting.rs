@@ -1,12 +1,29 @@
 //! Where the workers are that a stage waits for, in words. The command line and the page show them as they are.
 
+use protocol::units::counted;
+
 use crate::state::State;
 use crate::state::execution::StageExecution;
+use crate::state::run::Run;
 
 impl State {
+    /// Says why a run is queued.
+    pub(crate) fn why_queued(&self, run: &Run) -> String {
+        let group = run.owner.group();
+        let runs = self.groups.get(&group);
+        let at_work = counted(runs.map_or(0, |runs| runs.at_work), "run");
+        let most = self.policy.limits_of(&group).runs.unwrap_or_default();
+        format!("queued: {at_work} of {group} at work, at most {most} allowed")
+    }
+
     /// Says who has the workers that an execution could use; `None` if one is idle or none fits.
     pub(crate) fn where_workers_are(&self, execution: &StageExecution) -> Option<String> {
         let own = self.claimant_of(execution)?;
+        if let Some(most) = self.policy.limits_of(&own.group).workers
+            && self.workers_of(&own.group) >= most
+        {
+            return Some(format!("{} already has {}, the most allowed", own.group, counted(most, "worker")));
+        }
         let mut equal = 0;
         let mut lower = 0;
         let mut yielding = 0;

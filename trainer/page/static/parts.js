@@ -32,6 +32,7 @@ const STATES = {
   failed: ["bad", "✕"],
   paused: ["warn", "‖"],
   interrupted: ["warn", "‖"],
+  queued: ["warn", "◔"],
   cancelled: ["idle", "⊘"],
   skipped: ["idle", "⊘"],
   waiting: ["idle", "○"],
@@ -53,8 +54,11 @@ export const sign = (state) => STATES[state]?.[1] ?? "○";
 export const badge = (state, word = state) =>
   html`<span class="badge ${tone(state)}"><span aria-hidden="true">${sign(state)}</span> ${word}</span>`;
 
-/** A run's state in one word. @param {{state: string, interrupted?: boolean}} run */
-export const runState = (run) => (run.state === "paused" && run.interrupted ? "interrupted" : run.state);
+/** A run's state in one word. @param {{state: string, interrupted?: boolean, queued?: boolean}} run */
+export const runState = (run) => {
+  if (run.state === "paused" && run.interrupted) return "interrupted";
+  return run.state === "running" && run.queued ? "queued" : run.state;
+};
 
 /** @param {{state: string}} run */
 export const isOver = (run) => run.state === "finished" || run.state === "failed" || run.state === "cancelled";

@@ -21,12 +21,12 @@ interface HistoryRow {
 interface Trial { trial: number; values: Record<string, unknown>; state: string; steps: number; results: (number | null)[]; message?: string }
 interface Sweep { stage: string; search: string; metric: string; mode: string; rungs: number[]; over: boolean; spent: number; planned: number; full: number; best: number | null; trials: Trial[] }
 interface Run {
-  run: string; pipeline: string; owner: Owner; state: string; interrupted: boolean; stages: Stage[];
+  run: string; pipeline: string; owner: Owner; state: string; interrupted: boolean; queued?: boolean; stages: Stage[];
   note?: string; sweeps?: Sweep[]; storage?: { since_ms: number; what: string }; times?: Times;
 }
 /** A run in a list. */
 interface RunRow {
-  run: string; pipeline: string; owner?: string; project?: string; state: string; interrupted?: boolean;
+  run: string; pipeline: string; owner?: string; project?: string; state: string; interrupted?: boolean; queued?: boolean;
   created_ms: number; changed_ms: number; done: number; stages: number; wall_s: number; wants_workers?: number; note?: string;
 }
 interface RunList { items: RunRow[]; next?: string }

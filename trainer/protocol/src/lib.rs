@@ -26,6 +26,6 @@ pub use digest::Digest;
 pub use id::{Alias, Attempt, Fence, Generation, Incarnation, ModelName, RunId, Seed, StageName, TaskId, WorkerId};
 pub use labels::Labels;
 pub use model_ref::{ModelRef, Pick};
-pub use owner::{Group, Owner};
+pub use owner::{Group, GroupLimits, Owner};
 pub use printable::{excerpt, excerpts, json_mistake, printable, show_excerpts};
 pub use units::Steps;

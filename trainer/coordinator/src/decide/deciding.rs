@@ -68,7 +68,7 @@ impl<'a> Deciding<'a> {
         let mut runs = Vec::new();
         match fact {
             Fact::Run { run } => runs.push(run.number),
-            Fact::RunState { run, .. } => {
+            Fact::RunState { run, .. } | Fact::RunQueued { run, .. } => {
                 runs.push(*run);
                 let known = self.state.runs.get(run).into_iter();
                 let active: Vec<Digest> = known.flat_map(|run| run.all_active()).map(|(_, key)| key).collect();

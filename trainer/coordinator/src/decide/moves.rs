@@ -7,7 +7,7 @@
 //!
 //! Work of an equal or a higher priority keeps its workers, so two runs never take a worker from each other in turn. A
 //! priority has no effect on other groups. Shards and other short tasks are not stopped, because they would lose their
-//! work. [`Shares`](super::shares::Shares) keeps the freed worker for the work that it was freed for.
+//! work. A group with as many workers as its limit allows gets only those of its own lower priorities. [`Shares`](super::shares::Shares) keeps the freed worker for the work that it was freed for.
 
 use std::cmp::Reverse;
 use std::collections::BTreeMap;
@@ -141,7 +141,7 @@ impl State {
                 && self.goes_on_without(task, name);
             let is_behind = match claimant.group == claim.need.claimant.group {
                 true => claim.need.claimant.precedes(&claimant),
-                false => count >= own + 2,
+                false => count >= own + 2 && !division.is_full(claim),
             };
             let place = (count, Reverse(claimant.priority), task.holders().len(), key, i, name.clone());
             (is_spare && is_behind && claim.execution.takes(worker)).then_some(place)

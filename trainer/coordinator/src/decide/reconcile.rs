@@ -81,7 +81,7 @@ impl Deciding<'_> {
     /// Starts the stages of a running run whose inputs are available.
     fn attach_ready(&mut self, number: u64) {
         let run = Arc::clone(&self.state.runs[&number]);
-        if run.state != RunState::Running {
+        if !run.is_at_work() {
             return;
         }
         let mut stages = Vec::new();
@@ -171,7 +171,7 @@ impl Deciding<'_> {
     /// it.
     fn may_place(&self, run: &Run, execution: &StageExecution) -> bool {
         let others = execution.users.iter().filter_map(|(number, _)| self.state.runs.get(number));
-        others.filter(|other| other.state == RunState::Running).all(|other| run.owner.controls(&other.owner.group()))
+        others.filter(|other| other.is_at_work()).all(|other| run.owner.controls(&other.owner.group()))
     }
 
     /// Reopens an execution that was over, with full budgets. The store is queried for the value first.

@@ -1,11 +1,11 @@
 //! Submission and control of runs.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use pipeline::Pipeline;
 use protocol::message::RunState;
-use protocol::{Digest, Owner, RunId, StageName, limits};
+use protocol::{Digest, Group, GroupLimits, Owner, RunId, StageName, limits};
 use registry::Write;
 
 use super::deciding::Deciding;
@@ -32,7 +32,7 @@ impl Deciding<'_> {
             return Ok(false);
         }
         check_pipeline(&pipeline, until.as_ref())?;
-        let run = Run::new(self.state.submitted + 1, owner, Arc::new(pipeline), key, until);
+        let mut run = Run::new(self.state.submitted + 1, owner, Arc::new(pipeline), key, until);
         if let Some(id) = self.interrupted_twin(&run) {
             self.control(&id, Control::Resume, None)?;
             self.effects.push(Effect::Submitted(id));
@@ -59,8 +59,51 @@ impl Deciding<'_> {
             self.writes.push(Write::Submission { run: run.id.clone(), digest });
         }
         self.effects.push(Effect::Submitted(run.id.clone()));
+        run.queued = self.room_for_runs(&run.owner.group()) == 0;
         self.record(Fact::Run { run: Box::new(run) });
         Ok(true)
+    }
+
+    /// Number of runs of a group that may still begin.
+    fn room_for_runs(&self, group: &Group) -> usize {
+        let at_work = self.state.groups.get(group).map_or(0, |runs| runs.at_work);
+        self.state.policy.limits_of(group).runs.map_or(usize::MAX, |most| most.saturating_sub(at_work))
+    }
+
+    /// Begins queued runs, by priority, in the groups of the runs that this decision changed.
+    pub(crate) fn admit_changed(&mut self) {
+        let changed = self.runs.iter().filter_map(|number| self.state.runs.get(number));
+        let groups: BTreeSet<Group> = changed.map(|run| run.owner.group()).collect();
+        self.admit(groups);
+    }
+
+    /// Begins queued runs of these groups.
+    fn admit(&mut self, groups: BTreeSet<Group>) {
+        for group in groups {
+            while self.room_for_runs(&group) > 0
+                && let Some((_, number)) = self.state.groups.get(&group).and_then(|runs| runs.queued.first()).copied()
+            {
+                self.record(Fact::RunQueued { run: number, queued: false });
+                self.reconcile();
+            }
+        }
+    }
+
+    /// Applies new limits of groups. Runs and workers beyond a lower limit continue.
+    pub(crate) fn limit(&mut self, limits: Arc<BTreeMap<Group, GroupLimits>>) -> bool {
+        if self.state.policy.limits == limits {
+            return false;
+        }
+        self.state.policy.limits = limits;
+        self.admit_all();
+        true
+    }
+
+    /// Begins queued runs of all groups.
+    pub(crate) fn admit_all(&mut self) {
+        let queued = self.state.groups.iter().filter(|(_, runs)| !runs.queued.is_empty());
+        let groups: BTreeSet<Group> = queued.map(|(group, _)| group.clone()).collect();
+        self.admit(groups);
     }
 
     /// Refuses another run if the limit is reached.
@@ -118,6 +161,12 @@ impl Deciding<'_> {
         if !known {
             self.check_room()?;
             self.record(Fact::Run { run: Box::new(Run::clone(&run)) });
+        }
+        if action == Control::Resume && before != RunState::Running {
+            let queued = self.room_for_runs(&run.owner.group()) == 0;
+            if queued != run.queued {
+                self.record(Fact::RunQueued { run: run.number, queued });
+            }
         }
         match action {
             Control::Pause => {}

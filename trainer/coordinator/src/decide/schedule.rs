@@ -52,7 +52,7 @@ pub(crate) fn schedule(cx: &mut Deciding<'_>) {
     for key in cx.touched.clone() {
         let execution = cx.state.executions.get(&key);
         if execution.is_some_and(|execution| execution.state == ExecutionState::Open) {
-            change_gangs(cx, key, |_, _, _| Vec::new());
+            change_gangs(cx, key, None);
         }
     }
     end_backoffs(cx);
@@ -63,10 +63,10 @@ pub(crate) fn schedule(cx: &mut Deciding<'_>) {
         return;
     }
     loop {
-        let shares = Shares::of(cx.state, cx.now());
+        let mut shares = Shares::of(cx.state, cx.now());
         note_idle(cx, &shares);
         let before = cx.facts.len();
-        assign(cx, &shares);
+        assign(cx, &mut shares);
         // Each assignment changes the shares of the workers that are left.
         if cx.facts.len() == before || !shares.are_divided() {
             break;
@@ -77,7 +77,7 @@ pub(crate) fn schedule(cx: &mut Deciding<'_>) {
 }
 
 /// Assigns idle workers within the shares of their groups.
-fn assign(cx: &mut Deciding<'_>, shares: &Shares) {
+fn assign(cx: &mut Deciding<'_>, shares: &mut Shares) {
     while let Some(key) = next_small(cx.state, shares) {
         cx.state.visits += 1;
         small_tasks(cx, key, shares);
@@ -85,7 +85,7 @@ fn assign(cx: &mut Deciding<'_>, shares: &Shares) {
     let prepared = prepared_gangs(cx.state);
     cx.state.visits += prepared.len() as u64;
     for key in &prepared {
-        change_gangs(cx, *key, |state, execution, task| fit(state, shares, execution, task));
+        change_gangs(cx, *key, Some(&mut *shares));
     }
     for key in &prepared {
         start_gangs(cx, *key, shares);
@@ -210,6 +210,7 @@ fn fit(state: &State, shares: &Shares, execution: &StageExecution, task: &Task) 
         of_most.map(|(_, members)| members).unwrap_or_default().into_iter().partition(is_shunned);
     let missing = execution.range().min.max(1).saturating_sub(welcome.len());
     welcome.extend(shunned.into_iter().take(missing));
+    welcome.truncate(state.queue.claimant(&execution.key).map_or(usize::MAX, |claimant| shares.room(&claimant.group)));
     welcome
 }
 
@@ -220,14 +221,15 @@ fn next_worker(state: &State, shares: &Shares, execution: &StageExecution, i: us
     if task.failed_on.is_empty() { idle.next() } else { idle.min_by_key(|member| task.failures_on(&member.worker)) }
 }
 
-fn small_tasks(cx: &mut Deciding<'_>, key: Digest, shares: &Shares) {
+fn small_tasks(cx: &mut Deciding<'_>, key: Digest, shares: &mut Shares) {
     while let Some(i) = cx.state.executions[&key].tasks.first_ready() {
         let Some(worker) = next_worker(cx.state, shares, &cx.state.executions[&key], i) else { return };
-        grant(cx, key, i, vec![worker]);
+        grant(cx, shares, key, i, vec![worker]);
     }
 }
 
-fn change_gangs(cx: &mut Deciding<'_>, key: Digest, joiners: impl Fn(&State, &StageExecution, &Task) -> Vec<Member>) {
+/// Removes members of gangs that are too large. With `shares`, gangs also admit idle workers.
+fn change_gangs(cx: &mut Deciding<'_>, key: Digest, mut shares: Option<&mut Shares>) {
     if !cx.state.executions[&key].is_gang() {
         return;
     }
@@ -236,15 +238,21 @@ fn change_gangs(cx: &mut Deciding<'_>, key: Digest, joiners: impl Fn(&State, &St
         let task = &execution.tasks[i];
         if matches!(task.lease, Lease::Held { drain_by: None, .. }) {
             let holds = |member: &Member| evidence::holds(&cx.state.heard.words, task, member).is_some();
-            match gang::with(task.holders(), &joiners(cx.state, execution, task), execution.range(), holds) {
+            let joiners = shares.as_deref().map(|shares| fit(cx.state, shares, execution, task)).unwrap_or_default();
+            match gang::with(task.holders(), &joiners, execution.range(), holds) {
                 Change::Keep | Change::Disband => {}
-                Change::Regroup(members) => cx.regroup(key, i, members),
+                Change::Regroup(members) => {
+                    if let (Some(shares), Some(claimant)) = (&mut shares, cx.state.claimant_of(execution)) {
+                        shares.took(&claimant.group, members.len().saturating_sub(task.holders().len()));
+                    }
+                    cx.regroup(key, i, members);
+                }
             }
         }
     }
 }
 
-fn start_gangs(cx: &mut Deciding<'_>, key: Digest, shares: &Shares) {
+fn start_gangs(cx: &mut Deciding<'_>, key: Digest, shares: &mut Shares) {
     let now = cx.now();
     if !cx.state.executions[&key].is_gang() {
         return;
@@ -256,12 +264,15 @@ fn start_gangs(cx: &mut Deciding<'_>, key: Digest, shares: &Shares) {
             && (execution.range().max == 1 || !cx.state.queue.is_sharding(execution.backend))
             && let Some(members) = gang::start(&fit(cx.state, shares, execution, task), execution.range())
         {
-            grant(cx, key, i, members);
+            grant(cx, shares, key, i, members);
         }
     }
 }
 
-fn grant(cx: &mut Deciding<'_>, key: Digest, i: usize, holders: Vec<Member>) {
+fn grant(cx: &mut Deciding<'_>, shares: &mut Shares, key: Digest, i: usize, holders: Vec<Member>) {
+    if let Some(claimant) = cx.state.claimant_of(&cx.state.executions[&key]) {
+        shares.took(&claimant.group, holders.len());
+    }
     let secret = cx.secret(&cx.state.executions[&key].tasks[i]);
     if cx.state.executions[&key].tasks[i].newest().is_some() {
         cx.resumed(key);

@@ -29,6 +29,8 @@ pub(crate) struct Shares {
     /// Work of several groups or priorities waits.
     are_divided: bool,
     kept_for: BTreeMap<WorkerId, Claimant>,
+    /// Number of further workers of each group with a limit.
+    room: BTreeMap<Group, usize>,
 }
 
 /// Work that waits for workers, all of one group and priority.
@@ -47,10 +49,27 @@ impl Shares {
         let coming = looked_up(state, &claims);
         claims.extend(coming);
         let claimants: BTreeSet<&Claimant> = claims.iter().map(|claim| &claim.need.claimant).collect();
-        if claimants.len() < 2 {
+        let are_divided = claimants.len() > 1;
+        let is_limited = claimants.iter().any(|claimant| state.policy.limits_of(&claimant.group).workers.is_some());
+        if !are_divided && !is_limited {
             return Self::default();
         }
-        Self { are_divided: true, kept_for: Division::of(state, claims).divide(now) }
+        let mut division = Division::of(state, claims);
+        let room = division.room();
+        let kept_for = if are_divided { division.divide(now) } else { BTreeMap::new() };
+        Self { are_divided, kept_for, room }
+    }
+
+    /// Number of further workers that a group may have.
+    pub(crate) fn room(&self, group: &Group) -> usize {
+        self.room.get(group).copied().unwrap_or(usize::MAX)
+    }
+
+    /// Notes that a group has got workers.
+    pub(crate) fn took(&mut self, group: &Group, workers: usize) {
+        if let Some(room) = self.room.get_mut(group) {
+            *room = room.saturating_sub(workers);
+        }
     }
 
     /// Returns true if workers are divided.
@@ -65,7 +84,8 @@ impl Shares {
 
     /// Returns true if work of `claimant` may take an idle worker.
     pub(crate) fn allow(&self, worker: &WorkerId, claimant: &Claimant) -> bool {
-        self.kept_for.get(worker).is_none_or(|owner| owner == claimant || claimant.precedes(owner))
+        self.room(&claimant.group) > 0
+            && self.kept_for.get(worker).is_none_or(|owner| owner == claimant || claimant.precedes(owner))
     }
 }
 
@@ -88,14 +108,9 @@ impl<'a> Division<'a> {
             let turn = claim.rank.turn();
             turns.entry(&claim.need.claimant.group).and_modify(|first| *first = turn.min(*first)).or_insert(turn);
         }
-        let mut by_execution: BTreeMap<Digest, usize> = BTreeMap::new();
-        for (key, _) in state.workers.values().filter_map(|worker| worker.holds) {
-            *by_execution.entry(key).or_default() += 1;
-        }
         let mut held = BTreeMap::new();
         let mut lowest = BTreeMap::new();
-        for (key, count) in by_execution {
-            let Some(Claimant { group, priority }) = state.claimant_of(&state.executions[&key]) else { continue };
+        for (Claimant { group, priority }, count) in state.held() {
             lowest.entry(group.clone()).and_modify(|least: &mut i32| *least = priority.min(*least)).or_insert(priority);
             *held.entry(group).or_default() += count;
         }
@@ -105,6 +120,24 @@ impl<'a> Division<'a> {
     /// Number of workers of a claim's group.
     pub(super) fn count(&self, claim: &Claim<'_>) -> usize {
         self.held.get(&claim.need.claimant.group).copied().unwrap_or_default()
+    }
+
+    /// Number of further workers of each group with a limit.
+    fn room(&self) -> BTreeMap<Group, usize> {
+        let mut room = BTreeMap::new();
+        for claim in &self.claims {
+            let group = &claim.need.claimant.group;
+            if let Some(most) = self.state.policy.limits_of(group).workers {
+                room.insert(group.clone(), most.saturating_sub(self.count(claim)));
+            }
+        }
+        room
+    }
+
+    /// Returns true if a claim's group has as many workers as it may have.
+    pub(super) fn is_full(&self, claim: &Claim<'_>) -> bool {
+        let most = self.state.policy.limits_of(&claim.need.claimant.group).workers;
+        most.is_some_and(|most| self.count(claim) >= most)
     }
 
     /// The order in which claims get workers: the groups with few workers first, and within a group by priority.
@@ -129,8 +162,8 @@ impl<'a> Division<'a> {
             if idle_ms > self.state.policy.share_ms {
                 continue;
             }
-            let fits = |claim: &&Claim<'_>| claim.room > 0 && claim.execution.takes(worker);
-            let fitting = (0..self.claims.len()).filter(|i| fits(&&self.claims[*i]));
+            let fits = |claim: &Claim<'_>| claim.room > 0 && claim.execution.takes(worker) && !self.is_full(claim);
+            let fitting = (0..self.claims.len()).filter(|i| fits(&self.claims[*i]));
             let Some(first) = fitting.min_by_key(|i| self.place(&self.claims[*i])) else { continue };
             let claim = &mut self.claims[first];
             claim.room -= 1;
@@ -149,6 +182,26 @@ impl<'a> Division<'a> {
 }
 
 impl State {
+    /// Number of workers at work for each group and priority.
+    fn held(&self) -> BTreeMap<Claimant, usize> {
+        let mut by_execution: BTreeMap<Digest, usize> = BTreeMap::new();
+        for (key, _) in self.workers.values().filter_map(|worker| worker.holds) {
+            *by_execution.entry(key).or_default() += 1;
+        }
+        let mut held = BTreeMap::new();
+        for (key, count) in by_execution {
+            if let Some(claimant) = self.claimant_of(&self.executions[&key]) {
+                *held.entry(claimant).or_default() += count;
+            }
+        }
+        held
+    }
+
+    /// Number of workers at work for a group.
+    pub(crate) fn workers_of(&self, group: &Group) -> usize {
+        self.held().into_iter().filter(|(claimant, _)| claimant.group == *group).map(|(_, count)| count).sum()
+    }
+
     /// Returns true if runs have let a worker idle for too long and this is not noted yet.
     pub(crate) fn share_is_over(&self, now: Millis) -> bool {
         self.kept_idle().any(|idle| {

@@ -58,5 +58,7 @@ impl Deciding<'_> {
                 }
             }
         }
+        // The limits may have changed since the last start.
+        self.admit_all();
     }
 }

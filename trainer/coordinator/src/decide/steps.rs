@@ -24,6 +24,7 @@ pub fn decide(state: &mut State, moment: Moment, event: Event) -> Result<Vec<Eff
         return Ok(cx.effects);
     }
     cx.reconcile();
+    cx.admit_changed();
     cx.drain();
     cx.count_time();
     schedule::schedule(&mut cx);
@@ -82,6 +83,7 @@ impl Deciding<'_> {
             Event::GangDivided { task, fence } => return self.gang_divided(&task, fence),
             Event::GangStalled { task, fence } => return self.gang_stalled(&task, fence),
             Event::Unshared => return Ok(self.share()),
+            Event::Limits { limits } => return Ok(self.limit(limits)),
             Event::Quiet { key, for_ms } => return Ok(self.quiet(key, for_ms)),
             Event::Checkpoint { commit } => return self.checkpoint(commit),
             Event::Outcome { report } => return self.outcome(report),

@@ -8,6 +8,7 @@ use futures::FutureExt as _;
 use pipeline::Pipeline;
 use protocol::message::{Poll, RunView, StorageProblem, Submit};
 use protocol::stage::Register;
+use protocol::units::size;
 use protocol::{Alias, Digest, Group, ModelName, Owner, RunId, StageName, WorkerId, canonical, limits};
 use registry::{Proof, QueryError, ReadStore, RunRow, Store, WriteError};
 use tokio::sync::{Semaphore, mpsc, oneshot, watch};
@@ -231,6 +232,7 @@ impl ActorHandle {
         if let Some(run) = self.sent_before(&sent).await? {
             return Ok(run);
         }
+        self.check_bytes(&owner.group()).await?;
         self.check_registrations(&pipeline, &owner).await?;
         let seen = self.seen_store(sees.as_ref());
         resolve_versions(&mut pipeline, &seen).await.map_err(|error| match error {
@@ -301,6 +303,17 @@ impl ActorHandle {
                 }
             }
         }
+    }
+
+    /// Refuses a submission of a group that has stored as much as it may.
+    async fn check_bytes(&self, group: &Group) -> Result<(), Refused> {
+        let Some(most) = self.state().policy.limits_of(group).bytes else { return Ok(()) };
+        let stored = self.store.group_bytes(group).await.map_err(WriteError::from)?;
+        if stored < most {
+            return Ok(());
+        }
+        let message = format!("{group} has stored {}; the limit is {}", size(stored), size(most));
+        Err(Rejected::UsedUp(message).into())
     }
 
     /// Refuses a pipeline that would move an alias or extend a model without the owner's permission.

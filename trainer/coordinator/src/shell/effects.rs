@@ -194,6 +194,18 @@ pub(crate) async fn let_go(actor_handle: &ActorHandle) {
     }
 }
 
+/// Decides the limits of groups if the token file has changed them.
+async fn apply_limits(actor_handle: &ActorHandle) {
+    let limits = actor_handle.tokens.current().limits();
+    if limits == *actor_handle.state().policy.limits {
+        return;
+    }
+    match actor_handle.decide(Event::Limits { limits: Arc::new(limits) }).await {
+        Ok(_) | Err(Refused::Stopped | Refused::Failed(_)) => {}
+        Err(error) => tracing::warn!(%error, "new limits were not stored; trying again"),
+    }
+}
+
 /// Runs the timer until the coordinator stops. It does not wait for a tick to be handled, which may take as long as the
 /// disk does. Only its own late wake-ups therefore indicate that this process received no polls.
 pub(crate) async fn tick(actor_handle: Arc<ActorHandle>, every_ms: u64, mut stopped: watch::Receiver<bool>) {
@@ -213,6 +225,7 @@ pub(crate) async fn tick(actor_handle: Arc<ActorHandle>, every_ms: u64, mut stop
             let actor_handle = Arc::clone(&actor_handle);
             let overslept = u64::try_from(std::mem::take(&mut overslept).as_millis()).unwrap_or(u64::MAX);
             pending = Some(tokio::spawn(async move {
+                apply_limits(&actor_handle).await;
                 match actor_handle.observe(Observation::Tick { overslept }).await {
                     Ok(()) | Err(Refused::Stopped | Refused::Failed(_)) => {}
                     Err(error) => tracing::warn!(%error, "a tick was not stored; trying again"),

@@ -87,6 +87,10 @@ impl From<Rejected> for Failure {
             Rejected::NotFound(_) => (StatusCode::NOT_FOUND, "not-found"),
             Rejected::Conflict(_) => (StatusCode::CONFLICT, "conflict"),
             Rejected::Invalid(_) => (StatusCode::BAD_REQUEST, "invalid"),
+            Rejected::UsedUp(_) => {
+                let hint = "`registry forget --ended-before 30d` removes the data of ended runs; the limit is `max_gib=` in the server's token file";
+                return Self::new(StatusCode::PAYLOAD_TOO_LARGE, "used-up", rejected.to_string()).hint(hint);
+            }
             Rejected::Full(_) => {
                 let hint = "wait until some have ended, cancel some, or start the server with a larger `--max-runs`";
                 return Self::busy(rejected.to_string()).hint(hint);

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use protocol::Digest;
-use protocol::message::{Progress, RunState};
+use protocol::message::Progress;
 use tokio::time::{Instant, timeout};
 
 use super::actor_handle::ActorHandle;
@@ -32,7 +32,7 @@ impl Pace {
     fn of(state: &State, execution: &StageExecution) -> Option<Self> {
         let mut users = execution.users.iter().filter_map(|(run, _)| state.runs.get(run));
         let has_begun = execution.tasks.iter().any(|task| task.attempt.0 > 0);
-        if execution.is_over() || !has_begun || !users.any(|run| run.state == RunState::Running) {
+        if execution.is_over() || !has_begun || !users.any(|run| run.is_at_work()) {
             return None;
         }
         let tasks_done = execution.tasks.iter().filter(|task| matches!(task.lease, Lease::Done { .. })).count();

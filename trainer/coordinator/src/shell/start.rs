@@ -31,7 +31,8 @@ impl Coordinator {
     /// Recovers the state from `store` and starts listening.
     pub async fn start(store: Store, config: Config) -> Result<Handle, StartError> {
         config.check()?;
-        let policy = Policy { live_runs: config.allowances.runs, ..config.policy.clone() };
+        let limits = Arc::new(config.tokens.limits());
+        let policy = Policy { live_runs: config.allowances.runs, limits, ..config.policy.clone() };
         let recovered = journal::recover_both(policy, &store.recovery().await?)?;
         let listen = |address| move |cause| StartError::Listen { address, cause };
         let main = Listener::bind(config.listen, config.tls.as_ref().map(ServerTls::config))

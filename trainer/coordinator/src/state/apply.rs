@@ -7,6 +7,7 @@ use protocol::{Digest, WorkerId};
 
 use super::State;
 use super::execution::StageExecution;
+use super::group_runs::GroupRuns;
 use super::run::{Run, Status};
 use super::shared::{Map, Set};
 use super::task::Task;
@@ -36,7 +37,7 @@ impl State {
         let mut keys = BTreeSet::new();
         match fact {
             Fact::Run { run } => keys.extend(run.stages.iter().filter_map(Status::key)),
-            Fact::RunState { run, .. } => {
+            Fact::RunState { run, .. } | Fact::RunQueued { run, .. } => {
                 keys.extend(self.runs.get(run).into_iter().flat_map(|run| run.all_active()).map(|(_, key)| key));
             }
             Fact::Stages { run, stages } => {
@@ -78,6 +79,7 @@ impl State {
         match fact {
             Fact::Run { .. }
             | Fact::RunState { .. }
+            | Fact::RunQueued { .. }
             | Fact::Stages { .. }
             | Fact::Resolved { .. }
             | Fact::StagesAdded { .. }
@@ -114,13 +116,15 @@ impl State {
                     self.idempotent.insert_mut(key.clone(), run.number);
                 }
                 self.note_parked(run.number, run.parked);
-                self.runs.insert_mut(run.number, run);
+                let number = run.number;
+                self.runs.insert_mut(number, run);
+                self.count_run(number, true);
             }
             Fact::RunState { run: number, state, parked } => {
-                let run = self.run_mut(*number)?;
-                (run.state, run.parked) = (*state, *parked);
+                self.change_count(*number, |run| (run.state, run.parked) = (*state, *parked))?;
                 self.note_parked(*number, *parked);
             }
+            Fact::RunQueued { run: number, queued } => self.change_count(*number, |run| run.queued = *queued)?,
             Fact::Stages { run: number, stages } => {
                 let run = self.run_mut(*number)?;
                 if let Some((i, _)) = stages.iter().find(|(i, _)| *i >= run.stages.len()) {
@@ -158,6 +162,7 @@ impl State {
 
     fn forget_run(&mut self, number: u64) -> Result {
         let run = self.runs.get(&number).cloned().ok_or_else(|| UnknownObject(format!("run {number}")))?;
+        self.count_run(number, false);
         self.runs.remove_mut(&number);
         for (i, status) in run.stages.iter().enumerate() {
             self.use_execution(number, i, status, false);
@@ -267,7 +272,32 @@ impl State {
         let keys = self.runs.values().filter_map(|run| Some((run.idempotency_key.clone()?, run.number)));
         self.idempotent = keys.collect();
         self.parked = self.runs.values().filter(|run| run.parked).map(|run| run.number).collect::<Set<u64>>();
+        self.groups = Map::default();
+        for number in self.runs.keys().copied().collect::<Vec<_>>() {
+            self.count_run(number, true);
+        }
         self.index_queue();
+    }
+
+    /// Changes a run and how it counts among those of its group.
+    fn change_count(&mut self, number: u64, change: impl FnOnce(&mut Run)) -> Result {
+        self.count_run(number, false);
+        change(self.run_mut(number)?);
+        self.count_run(number, true);
+        Ok(())
+    }
+
+    /// Adds a run to those of its group, or removes it.
+    fn count_run(&mut self, number: u64, is_there: bool) {
+        let Some(run) = self.runs.get(&number) else { return };
+        let group = run.owner.group();
+        let mut runs = self.groups.get(&group).cloned().unwrap_or_default();
+        runs.count(run, is_there);
+        if runs == GroupRuns::default() {
+            self.groups.remove_mut(&group);
+        } else {
+            self.groups.insert_mut(group, runs);
+        }
     }
 
     fn note_parked(&mut self, run: u64, parked: bool) {

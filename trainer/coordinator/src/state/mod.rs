@@ -6,7 +6,7 @@
 //! - the task that a worker holds, and the workers without a task;
 //! - the runs that use an execution, and the active stages of a run;
 //! - the executions that need workers (`queue::Queue`);
-//! - the runs that are parked or have an idempotency key.
+//! - the runs that are parked or have an idempotency key, and the running ones of each group.
 //!
 //! Invariant C14 checks them.
 //!
@@ -21,6 +21,7 @@ mod apply;
 pub mod evidence;
 pub mod execution;
 pub mod gang;
+pub mod group_runs;
 mod lookup;
 pub mod queue;
 mod queueing;
@@ -33,10 +34,11 @@ pub mod worker;
 use std::sync::Arc;
 
 use protocol::message::Progress;
-use protocol::{Digest, Fence, Incarnation, TaskId, WorkerId};
+use protocol::{Digest, Fence, Group, Incarnation, TaskId, WorkerId};
 
 use self::evidence::Words;
 use self::execution::StageExecution;
+use self::group_runs::GroupRuns;
 use self::queue::{Claimant, Queue};
 use self::run::Run;
 use self::shared::{Map, Set};
@@ -105,6 +107,8 @@ pub struct State {
     pub idempotent: Map<String, u64>,
     /// Runs that a restart paused.
     pub parked: Set<u64>,
+    /// Running runs by group.
+    pub groups: Map<Group, GroupRuns>,
     /// Set before a shutdown: no grants, and workers save and leave.
     pub draining: bool,
     pub heard: Heard,

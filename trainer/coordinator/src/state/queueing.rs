@@ -4,7 +4,6 @@ use std::cmp::Reverse;
 use std::collections::BTreeSet;
 
 use protocol::Digest;
-use protocol::message::RunState;
 use protocol::stage::Shape;
 
 use super::State;
@@ -87,9 +86,9 @@ impl State {
     /// The positions of the first running runs that wait for an execution.
     fn waits_at(&self, execution: &StageExecution) -> impl Iterator<Item = Rank> {
         let is_active = |(run, stage): &&(u64, usize)| {
-            self.runs.get(run).is_some_and(|run| {
-                run.state == RunState::Running && matches!(run.stages.get(*stage), Some(Status::Active { .. }))
-            })
+            self.runs
+                .get(run)
+                .is_some_and(|run| run.is_at_work() && matches!(run.stages.get(*stage), Some(Status::Active { .. })))
         };
         execution.users.iter().filter(is_active).take(COUNTED).map(|(run, stage)| self.rank(*run, *stage))
     }

@@ -125,6 +125,8 @@ pub struct Run {
     pub state: RunState,
     /// Set if a restart of the coordinator paused it, not a user.
     pub parked: bool,
+    /// Set if it waits until fewer runs of its group are at work.
+    pub queued: bool,
     /// The status of each stage of the pipeline.
     pub stages: Vec<Status>,
     /// Sweeps that have started.
@@ -156,6 +158,8 @@ struct Stored {
     state: RunState,
     #[serde(default)]
     parked: bool,
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    queued: bool,
     stages: Vec<Status>,
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     sweeps: Vec<Sweeping>,
@@ -176,6 +180,7 @@ impl From<Run> for Stored {
             until: run.until,
             state: run.state,
             parked: run.parked,
+            queued: run.queued,
             stages: run.stages,
             sweeps: run.sweeps.into_iter().map(Arc::unwrap_or_clone).collect(),
             resolved: run.resolved,
@@ -196,6 +201,7 @@ impl From<Stored> for Run {
             until: stored.until,
             state: stored.state,
             parked: stored.parked,
+            queued: stored.queued,
             stages: Vec::new(),
             sweeps: stored.sweeps.into_iter().map(Arc::new).collect(),
             resolved: stored.resolved,
@@ -247,6 +253,7 @@ impl Run {
             until,
             state: RunState::Running,
             parked: false,
+            queued: false,
             stages,
             sweeps: Vec::new(),
             resolved: BTreeMap::new(),
@@ -291,9 +298,14 @@ impl Run {
         self.stages.get(self.position(stage)?)
     }
 
-    /// The active stages with their keys. Paused and ended runs have none.
+    /// Returns true if its stages are computed now: it is neither paused, queued nor over.
+    pub fn is_at_work(&self) -> bool {
+        self.state == RunState::Running && !self.queued
+    }
+
+    /// The active stages with their keys. Paused, queued and ended runs have none.
     pub fn active(&self) -> impl Iterator<Item = (usize, Digest)> + '_ {
-        let places = (self.state == RunState::Running).then_some(&self.active);
+        let places = self.is_at_work().then_some(&self.active);
         places.into_iter().flatten().filter_map(|i| Some((*i, self.stages[*i].key()?)))
     }
 

@@ -8,6 +8,7 @@ mod batches;
 mod demand;
 mod gangs;
 mod history;
+mod limits;
 mod liveness;
 mod priorities;
 mod promises;

@@ -10,7 +10,13 @@ use protocol::{Digest, Owner, RunId};
 use crate::common::{PureCoordinator, pipelines};
 
 /// A run up to its training `vae`.
-fn submit(coordinator: &mut PureCoordinator, owner: &str, seed: u64, priority: i32, workers: WorkerRange) -> RunId {
+pub(super) fn submit(
+    coordinator: &mut PureCoordinator,
+    owner: &str,
+    seed: u64,
+    priority: i32,
+    workers: WorkerRange,
+) -> RunId {
     let mut pipeline = pipelines::quickstart(seed, workers, &[]);
     pipeline.priority = priority;
     for stage in &mut pipeline.stages {
@@ -34,11 +40,11 @@ fn submit(coordinator: &mut PureCoordinator, owner: &str, seed: u64, priority: i
     run.expect("a run")
 }
 
-const ALONE: WorkerRange = WorkerRange { min: 1, max: 1 };
-const MANY: WorkerRange = WorkerRange { min: 1, max: 8 };
+pub(super) const ALONE: WorkerRange = WorkerRange { min: 1, max: 1 };
+pub(super) const MANY: WorkerRange = WorkerRange { min: 1, max: 8 };
 
 /// The task that a worker holds; empty without one.
-fn task(coordinator: &PureCoordinator, worker: &str) -> String {
+pub(super) fn task(coordinator: &PureCoordinator, worker: &str) -> String {
     coordinator.assignment(worker).map(|held| held.grant.task.to_string()).unwrap_or_default()
 }
 
@@ -47,7 +53,7 @@ fn training(run: &RunId) -> String {
 }
 
 /// Ends the task that a worker holds alone, such as a data set.
-fn finish_small(coordinator: &mut PureCoordinator, worker: &str) {
+pub(super) fn finish_small(coordinator: &mut PureCoordinator, worker: &str) {
     let held = coordinator.assignment(worker).expect("a task");
     assert_eq!(held.role, Role::Alone, "{}", held.grant.task);
     let output = Digest::of(held.grant.task.as_str().as_bytes());
@@ -70,7 +76,7 @@ fn save(coordinator: &mut PureCoordinator, worker: &str, step: u64) {
 }
 
 /// All workers poll as holders of their tasks' state, and a second passes.
-fn beat(coordinator: &mut PureCoordinator) {
+pub(super) fn beat(coordinator: &mut PureCoordinator) {
     let names: Vec<_> = coordinator.state.workers.keys().cloned().collect();
     for name in names {
         let worker = &coordinator.state.workers[&name];

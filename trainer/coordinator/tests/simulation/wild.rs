@@ -1,6 +1,7 @@
 //! Every kind of event, for every object in a state and for some that do not exist.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 use coordinator::state::execution::StageExecution;
 use coordinator::state::run::Run;
@@ -16,6 +17,8 @@ pub(crate) fn events(state: &State, ended: &[Run]) -> Vec<Event> {
         Event::Started { alone: false, park: false },
         Event::Started { alone: true, park: true },
         Event::Drain,
+        Event::Limits { limits: Arc::default() },
+        Event::Limits { limits: crate::world::limits(1) },
         Event::Submit {
             submission: None,
             pipeline: Box::new(crate::pipelines::quickstart(0, Default::default(), &[])),

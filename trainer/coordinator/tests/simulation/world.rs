@@ -12,7 +12,7 @@ use coordinator::{Control, Effect, Event, Millis, Policy, Refused, State, journa
 use pipeline::Pipeline;
 use protocol::message::{Member, RunState};
 use protocol::stage::WorkerRange;
-use protocol::{Attempt, Digest, Incarnation, RunId, TaskId, WorkerId};
+use protocol::{Attempt, Digest, Group, GroupLimits, Incarnation, RunId, TaskId, WorkerId};
 
 use self::disk::{Disk, Ticket};
 use crate::pipelines;
@@ -123,6 +123,12 @@ pub(crate) struct World {
     pub(crate) asleep: Option<(Millis, Millis)>,
 }
 
+/// Limits of the group whose runs are most of them.
+pub(crate) fn limits(most: usize) -> Arc<BTreeMap<Group, GroupLimits>> {
+    let limits = GroupLimits { workers: Some(1 + most), runs: Some(most), bytes: None };
+    Arc::new(BTreeMap::from([(Group::new("me"), limits)]))
+}
+
 fn policy() -> Policy {
     let budgets = Policy { fault_budget: 1000, infrastructure_budget: 1000, ..Policy::default() };
     Policy { grace_ms: 10_000, stall_ms: 30_000, ..budgets }
@@ -159,12 +165,14 @@ impl World {
                 (Millis(random.below(CHAOS_MS / 2)), event)
             })
             .collect();
+        let limits = if priorities.chance(40) { limits(1) } else { Arc::default() };
+        let policy = Policy { limits, ..policy() };
         Self {
             random,
             now: Millis(0),
             store: FakeStore::default(),
-            policy: policy(),
-            batches: Batches::new(State::new(policy())),
+            policy: policy.clone(),
+            batches: Batches::new(State::new(policy)),
             disk: Disk::Idle,
             asked: BTreeMap::new(),
             tickets: 0,

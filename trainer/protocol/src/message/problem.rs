@@ -73,7 +73,7 @@ pub const CODES: [(&str, &str); 26] = [
     ("unproven", "The data is not proven complete"),
     ("unreachable", "The blob storage does not answer"),
     ("unvouched", "The call does not prove its upload"),
-    ("used-up", "The run has used up its limit"),
+    ("used-up", "A limit is used up"),
 ];
 
 #[cfg(test)]

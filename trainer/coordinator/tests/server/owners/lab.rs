@@ -72,6 +72,11 @@ impl Kind {
         KINDS.iter().find(|kind| kind.name == name).unwrap_or_else(|| panic!("no token `{name}`"))
     }
 
+    /// The words of its line after the token.
+    pub(crate) fn more(&self) -> &'static str {
+        self.more
+    }
+
     pub(crate) fn has(&self, scope: &str) -> bool {
         let implied = match scope {
             "read" => !matches!(self.scopes, "worker" | "launch"),

@@ -5,6 +5,7 @@ mod audit;
 mod draws;
 mod fuzz;
 mod lab;
+mod limits;
 mod matrix;
 mod promotion;
 mod tokens;
