@@ -34,16 +34,18 @@ impl State {
             let other = &self.executions[&key];
             match self.claimant_of(other) {
                 Some(claimant) if claimant.group != own.group => foreign += 1,
-                _ if other.tasks[i].is_preempted() => yielding += 1,
+                Some(_) if other.tasks[i].is_preempted() => yielding += 1,
                 Some(claimant) if own.precedes(&claimant) => lower += 1,
-                Some(_) | None => equal += 1,
+                Some(_) => equal += 1,
+                // Its run was cancelled; the worker has not yielded yet.
+                None => foreign += 1,
             }
         }
         let counts = [
             (equal, "with work of equal or higher priority"),
             (yielding, "about to save and make way"),
             (lower, "with work of a lower priority, which ends first"),
-            (foreign, "with other groups' work"),
+            (foreign, "with other work"),
         ];
         let all = equal + lower + yielding + foreign;
         let mut parts = Vec::new();

@@ -593,6 +593,24 @@ fn how_checkpoints_are_kept_is_no_part_of_a_stage_s_key() {
 }
 
 #[test]
+fn a_priority_is_part_of_no_digest_and_of_no_key() {
+    let plain = read("p.yaml", GOOD, &[]).unwrap();
+    let urgent = read("p.yaml", GOOD, &["priority=-7".to_owned()]).unwrap();
+    assert_eq!((plain.priority, urgent.priority), (0, -7));
+    assert_eq!(plain.digest(), urgent.digest());
+    let vae = |pipeline: &Pipeline| pipeline.identity(pipeline.stage(&"vae".into()).unwrap(), &BTreeMap::new());
+    assert_eq!(vae(&plain), vae(&urgent));
+    let again: Pipeline = serde_json::from_value(serde_json::to_value(&urgent).unwrap()).unwrap();
+    assert_eq!(again, urgent);
+    for priority in [101, -101] {
+        let expected = format!("`priority` is {priority}; expected -100 to 100");
+        let mistakes = read("p.yaml", GOOD, &[format!("priority={priority}")]).unwrap_err();
+        assert!(mistakes.to_string().contains(&expected), "{mistakes}");
+        assert_eq!(Pipeline { priority, ..plain.clone() }.check(), Err(expected));
+    }
+}
+
+#[test]
 fn a_pipeline_keeps_the_code_versions_that_it_was_read_with() {
     let now = read("p.yaml", GOOD, &[]).unwrap();
     let recon = now.stage(&"recon".into()).unwrap();

@@ -53,8 +53,11 @@ pub(crate) fn config(verb: &ConfigVerb) -> Result<u8> {
         return Ok(0);
     }
     let fault = |error: serde_json::Error| Problem::new(exit::FAULT, error);
-    let mut text =
-        format!("name: {}\nseed: {}\nbackend: {}\nstages:\n", pipeline.name, pipeline.seed, pipeline.backend.name());
+    let mut text = format!("name: {}\nseed: {}\nbackend: {}\n", pipeline.name, pipeline.seed, pipeline.backend.name());
+    if pipeline.priority != 0 {
+        text.push_str(&format!("priority: {}\n", pipeline.priority));
+    }
+    text.push_str("stages:\n");
     for stage in &pipeline.stages {
         text.push_str(&format!("  {}:\n    kind: {}\n", stage.name, stage.settings.kind()));
         let mut settings = serde_json::to_value(&stage.settings).map_err(fault)?;

@@ -155,8 +155,12 @@ class RunSummary(Answer):
     """Name of the token that submitted it, if it is known."""
     pipeline: str
     """The pipeline's name."""
+    priority: int | None = None
+    """Order among the runs of its group: the highest is served first."""
     project: str | None = None
     """The token's project."""
+    queued: bool | None = None
+    """It waits until fewer runs of its group are at work."""
     run: str
     stages: int
     """Number of stages that were asked for, without those of sweeps."""
@@ -178,6 +182,10 @@ class RunView(Answer):
     """The token that submitted it."""
     pipeline: str
     """The pipeline's name."""
+    priority: int | None = None
+    """Order among the runs of its group: the highest is served first."""
+    queued: bool | None = None
+    """It waits until fewer runs of its group are at work."""
     run: str
     stages: list[StageView]
     """Stages in topological order, then the stages made by sweeps."""

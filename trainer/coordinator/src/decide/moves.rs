@@ -97,7 +97,7 @@ impl State {
     ) -> Option<Move> {
         let is_usable = |name: &WorkerId| self.workers.get(name).is_some_and(|worker| claim.execution.takes(worker));
         let idle = kept.iter().filter(|(name, owner)| **owner == claim.need.claimant && is_usable(name)).count();
-        let coming = idle + self.yielding(claim);
+        let coming = idle + self.yielding(claim, division);
         let wanted = if claim.need.gang { claim.execution.range().min.max(1) } else { 1 };
         // Frees one worker at a time, or as many as the work needs to begin.
         if coming >= wanted {
@@ -107,7 +107,7 @@ impl State {
             return Some(leave);
         }
         let is_computed = claim.need.gang && claim.execution.tasks.is_any_held();
-        let preemptible = if is_computed { Vec::new() } else { self.preemptible(claim, now) };
+        let preemptible = if is_computed { Vec::new() } else { self.preemptible(claim, division, now) };
         let workers: usize = preemptible.iter().map(|training| training.workers).sum();
         let last = preemptible.into_iter().max_by_key(|training| training.rank);
         last.filter(|_| coming + workers >= wanted)
@@ -115,13 +115,12 @@ impl State {
     }
 
     /// Number of workers that preempted trainings of the claim's group are about to leave.
-    fn yielding(&self, claim: &Claim<'_>) -> usize {
+    fn yielding(&self, claim: &Claim<'_>, division: &Division<'_>) -> usize {
         let leaves = |worker: &&Worker| {
             let Some((key, i)) = worker.holds else { return false };
-            let execution = &self.executions[&key];
-            execution.tasks[i].is_preempted()
+            self.executions[&key].tasks[i].is_preempted()
                 && claim.execution.takes(worker)
-                && self.claimant_of(execution).is_some_and(|claimant| claimant.group == claim.need.claimant.group)
+                && division.claimant(&key).is_some_and(|claimant| claimant.group == claim.need.claimant.group)
         };
         self.workers.values().filter(leaves).count()
     }
@@ -133,14 +132,14 @@ impl State {
             let (key, i) = worker.holds.filter(|_| worker.is_available())?;
             let execution = &self.executions[&key];
             let task = &execution.tasks[i];
-            let claimant = self.claimant_of(execution)?;
+            let claimant = division.claimant(&key)?;
             let count = division.held.get(&claimant.group).copied().unwrap_or_default();
             let is_spare = task.part == Part::Gang
                 && matches!(task.lease, Lease::Held { drain_by: None, .. })
                 && task.holders().len() > execution.range().min.max(1)
                 && self.goes_on_without(task, name);
             let is_behind = match claimant.group == claim.need.claimant.group {
-                true => claim.need.claimant.precedes(&claimant),
+                true => claim.need.claimant.precedes(claimant),
                 false => count >= own + 2 && !division.is_full(claim),
             };
             let place = (count, Reverse(claimant.priority), task.holders().len(), key, i, name.clone());
@@ -151,7 +150,7 @@ impl State {
     }
 
     /// Trainings of the claim's group with a lower priority, without those that were resumed a moment ago.
-    fn preemptible(&self, claim: &Claim<'_>, now: Millis) -> Vec<Preemptible> {
+    fn preemptible(&self, claim: &Claim<'_>, division: &Division<'_>, now: Millis) -> Vec<Preemptible> {
         let mut found: BTreeMap<(Digest, usize), Preemptible> = BTreeMap::new();
         for worker in self.workers.values().filter(|worker| worker.is_available() && claim.execution.takes(worker)) {
             let Some((key, i)) = worker.holds else { continue };
@@ -161,7 +160,7 @@ impl State {
                 task.attempt.0 <= 1 || execution.busy_since.is_none_or(|since| now.since(since) >= self.policy.stay_ms);
             let can_yield = task.part == Part::Gang && matches!(task.lease, Lease::Held { drain_by: None, .. });
             let Some(rank) = self.queue.rank(&key).filter(|_| can_yield && has_stayed) else { continue };
-            if self.claimant(rank).is_some_and(|claimant| claim.need.claimant.precedes(&claimant)) {
+            if division.claimant(&key).is_some_and(|claimant| claim.need.claimant.precedes(claimant)) {
                 let training = Preemptible { rank, key, task: i, workers: 0 };
                 found.entry((key, i)).or_insert(training).workers += 1;
             }

@@ -99,6 +99,8 @@ pub(super) struct Division<'a> {
     pub(super) held: BTreeMap<Group, usize>,
     /// The lowest priority of each group's work under way.
     lowest: BTreeMap<Group, i32>,
+    /// The runs that work under way is for.
+    claimants: BTreeMap<Digest, Claimant>,
 }
 
 impl<'a> Division<'a> {
@@ -110,11 +112,20 @@ impl<'a> Division<'a> {
         }
         let mut held = BTreeMap::new();
         let mut lowest = BTreeMap::new();
-        for (Claimant { group, priority }, count) in state.held() {
+        let mut claimants = BTreeMap::new();
+        for (key, count) in state.held() {
+            let Some(claimant) = state.claimant_of(&state.executions[&key]) else { continue };
+            let Claimant { group, priority } = claimant.clone();
             lowest.entry(group.clone()).and_modify(|least: &mut i32| *least = priority.min(*least)).or_insert(priority);
             *held.entry(group).or_default() += count;
+            claimants.insert(key, claimant);
         }
-        Self { state, claims, turns, held, lowest }
+        Self { state, claims, turns, held, lowest, claimants }
+    }
+
+    /// The runs that an execution under way is for.
+    pub(super) fn claimant(&self, key: &Digest) -> Option<&Claimant> {
+        self.claimants.get(key)
     }
 
     /// Number of workers of a claim's group.
@@ -182,24 +193,19 @@ impl<'a> Division<'a> {
 }
 
 impl State {
-    /// Number of workers at work for each group and priority.
-    fn held(&self) -> BTreeMap<Claimant, usize> {
+    /// Number of workers of each execution under way.
+    fn held(&self) -> BTreeMap<Digest, usize> {
         let mut by_execution: BTreeMap<Digest, usize> = BTreeMap::new();
         for (key, _) in self.workers.values().filter_map(|worker| worker.holds) {
             *by_execution.entry(key).or_default() += 1;
         }
-        let mut held = BTreeMap::new();
-        for (key, count) in by_execution {
-            if let Some(claimant) = self.claimant_of(&self.executions[&key]) {
-                *held.entry(claimant).or_default() += count;
-            }
-        }
-        held
+        by_execution
     }
 
-    /// Number of workers at work for a group.
+    /// Number of workers of a group.
     pub(crate) fn workers_of(&self, group: &Group) -> usize {
-        self.held().into_iter().filter(|(claimant, _)| claimant.group == *group).map(|(_, count)| count).sum()
+        let is_its = |key: &Digest| self.claimant_of(&self.executions[key]).is_some_and(|of| of.group == *group);
+        self.held().into_iter().filter(|(key, _)| is_its(key)).map(|(_, count)| count).sum()
     }
 
     /// Returns true if runs have let a worker idle for too long and this is not noted yet.
@@ -225,10 +231,13 @@ impl State {
         lately || self.kept_idle().any(is_unused)
     }
 
-    /// The runs for which an execution is computed: those whose group waits for it first.
+    /// The runs for which an execution is computed: those whose group waits for it first, or else a paused one. Runs
+    /// that have ended do not count, although this decision may still have them in memory.
     pub(crate) fn claimant_of(&self, execution: &StageExecution) -> Option<Claimant> {
         let waiting = self.queue.rank(&execution.key).and_then(|rank| self.claimant(rank));
-        waiting.or_else(|| self.registrant(execution).and_then(|run| self.claimant(self.rank(run.number, 0))))
+        let is_live = |number: &u64| self.runs.get(number).is_some_and(|run| !run.state.is_final());
+        let paused = || execution.users.iter().map(|(number, _)| *number).find(is_live);
+        waiting.or_else(|| paused().and_then(|number| self.claimant(self.rank(number, 0))))
     }
 }
 
