@@ -1,4 +1,4 @@
-//! Where the workers are that a stage waits for, in words. The command line and the page show them as they are.
+//! Says in words who has the workers that a stage waits for. The command line and the page show the words as they are.
 
 use protocol::units::counted;
 
