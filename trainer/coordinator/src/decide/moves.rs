@@ -70,7 +70,7 @@ impl State {
     /// The next worker, or the next training, that waiting work should get at `now`.
     pub(crate) fn next_move(&self, now: Millis) -> Option<Move> {
         let mut waiting = claims(self);
-        waiting.retain(|claim| !self.declines(&claim.need.claimant, now));
+        waiting.retain(|claim| !self.declines(|of| *of == claim.need.claimant, now));
         if waiting.is_empty() {
             return None;
         }
@@ -103,7 +103,7 @@ impl State {
         if coming >= wanted {
             return None;
         }
-        if let Some(leave) = self.spare_member(claim, division) {
+        if let Some(leave) = self.spare_member(claim, division, now) {
             return Some(leave);
         }
         let is_computed = claim.need.gang && claim.execution.tasks.is_any_held();
@@ -126,8 +126,10 @@ impl State {
     }
 
     /// A member that a gang can spare for `claim`: of the group with the most workers, and there of the lowest priority.
-    fn spare_member(&self, claim: &Claim<'_>, division: &Division<'_>) -> Option<Move> {
+    fn spare_member(&self, claim: &Claim<'_>, division: &Division<'_>, now: Millis) -> Option<Move> {
         let own = division.count(claim);
+        // Another priority is no way to get a worker of another group again.
+        let is_entitled = !division.is_full(claim) && !self.declines(|of| of.group == claim.need.claimant.group, now);
         let can_leave = |(name, worker): (&WorkerId, &Worker)| {
             let (key, i) = worker.holds.filter(|_| worker.is_available())?;
             let execution = &self.executions[&key];
@@ -140,7 +142,7 @@ impl State {
                 && self.goes_on_without(task, name);
             let is_behind = match claimant.group == claim.need.claimant.group {
                 true => claim.need.claimant.precedes(claimant),
-                false => count >= own + 2 && !division.is_full(claim),
+                false => is_entitled && count >= own + 2,
             };
             let place = (count, Reverse(claimant.priority), task.holders().len(), key, i, name.clone());
             (is_spare && is_behind && claim.execution.takes(worker)).then_some(place)

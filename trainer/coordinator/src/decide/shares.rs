@@ -223,11 +223,12 @@ impl State {
         self.unused.iter().filter(is_here).filter_map(|name| self.heard.idle.get(name))
     }
 
-    /// Returns true if these runs have lately let a worker idle that was kept for them.
-    pub(super) fn declines(&self, claimant: &Claimant, now: Millis) -> bool {
+    /// Returns true if runs of these claimants have lately let a worker idle that was kept for them.
+    pub(super) fn declines(&self, are_these: impl Fn(&Claimant) -> bool, now: Millis) -> bool {
         let Policy { share_ms, share_again_ms, .. } = self.policy;
-        let lately = self.heard.declined.get(claimant).is_some_and(|at| now.since(*at) < share_again_ms);
-        let is_unused = |idle: &Idle| idle.kept_for.as_ref() == Some(claimant) && now.since(idle.since) > share_ms;
+        let lately = self.heard.declined.iter().any(|(of, at)| are_these(of) && now.since(*at) < share_again_ms);
+        let is_unused =
+            |idle: &Idle| idle.kept_for.as_ref().is_some_and(&are_these) && now.since(idle.since) > share_ms;
         lately || self.kept_idle().any(is_unused)
     }
 

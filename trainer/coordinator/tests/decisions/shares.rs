@@ -179,4 +179,9 @@ fn a_worker_that_its_group_does_not_use_goes_back() {
         beat(&mut coordinator);
         assert_eq!(holding(&coordinator, [&mine, &yours]), [4, 0], "a group that lets workers idle gets no other one");
     }
+    let urgent = super::priorities::submit(&mut coordinator, "you", 3, 9, super::priorities::MANY);
+    for _ in 0..30 {
+        beat(&mut coordinator);
+        assert_eq!(holding(&coordinator, [&mine, &urgent]), [4, 0], "nor with a priority");
+    }
 }
