@@ -129,7 +129,8 @@ impl Deciding<'_> {
         }
         let same = |old: &&Arc<Run>| {
             run.owner.controls(&old.owner.group())
-                && (&old.until, old.submitted.priority) == (&run.until, run.submitted.priority)
+                && old.until == run.until
+                && old.submitted.priority == run.submitted.priority
                 && old.submitted.digest() == run.submitted.digest()
         };
         self.interrupted().iter().rev().find(same).map(|old| old.id.clone())
