@@ -61,18 +61,17 @@ impl Claimant {
 /// Merges the work of several groups into one order. Each group keeps the turns of its work; a higher priority gets an
 /// earlier turn of the same group.
 pub fn in_turn<'a>(work: impl IntoIterator<Item = (&'a Group, Rank, Digest)>) -> Vec<Digest> {
-    let mut groups: BTreeMap<&Group, (BTreeSet<Turn>, BTreeSet<(Rank, Digest)>)> = BTreeMap::new();
+    let mut groups: BTreeMap<&Group, BTreeSet<(Rank, Digest)>> = BTreeMap::new();
     for (group, rank, key) in work {
-        let (turns, ranks) = groups.entry(group).or_default();
-        turns.insert(rank.turn());
-        ranks.insert((rank, key));
+        groups.entry(group).or_default().insert((rank, key));
     }
-    let in_order: BTreeMap<Turn, Digest> = groups
-        .into_values()
-        .flat_map(|(turns, ranks)| turns.into_iter().zip(ranks))
-        .map(|(turn, (_, key))| (turn, key))
-        .collect();
-    in_order.into_values().collect()
+    let mut in_order: BTreeSet<(Turn, Digest)> = BTreeSet::new();
+    for ranks in groups.into_values() {
+        let mut turns: Vec<Turn> = ranks.iter().map(|(rank, _)| rank.turn()).collect();
+        turns.sort_unstable();
+        in_order.extend(turns.into_iter().zip(ranks.into_iter().map(|(_, key)| key)));
+    }
+    in_order.into_iter().map(|(_, key)| key).collect()
 }
 
 /// The kind of workers that an execution needs.
