@@ -36,7 +36,7 @@ fn of_run(coordinator: &PureCoordinator, run: &RunId) -> Vec<&'static str> {
 
 #[test]
 fn a_group_gets_no_more_workers_than_its_limit() {
-    let mut coordinator = limited(workers(2));
+    let mut coordinator = limited(workers(1));
     let mine = submit(&mut coordinator, "me", 1, 0, MANY);
     coordinator.join("a");
     finish_small(&mut coordinator, "a");
@@ -45,7 +45,9 @@ fn a_group_gets_no_more_workers_than_its_limit() {
         beat(&mut coordinator);
     }
     beat(&mut coordinator);
-    assert_eq!(of_run(&coordinator, &mine).len(), 2, "two workers stay idle");
+    assert_eq!(of_run(&coordinator, &mine).len(), 1, "three workers stay idle");
+    coordinator.happen(Event::Limits { limits: of_me(workers(2)) }).expect("taken");
+    assert_eq!(of_run(&coordinator, &mine).len(), 2, "only one of three idle workers joins");
     let next = submit(&mut coordinator, "me", 2, 0, ALONE);
     beat(&mut coordinator);
     assert_eq!(of_run(&coordinator, &next).len(), 0);
