@@ -298,7 +298,9 @@ async fn mark(place: &BlobCalls, rows: &Rows, mut queue: Vec<Digest>, marks: &mu
         let each = (queue.len() / AT_ONCE).clamp(1, MANIFESTS);
         let batches: Vec<Vec<Digest>> = queue.chunks(each).map(<[Digest]>::to_vec).collect();
         let read = |batch: Vec<Digest>| {
-            place.ask(move |blobs| batch.into_iter().map(|digest| (digest, blobs.manifest(digest))).collect::<Vec<_>>())
+            place.ask(move |blobs| {
+                batch.into_iter().map(|digest| (digest, blobs.manifest_of_many(digest))).collect::<Vec<_>>()
+            })
         };
         let mut reading = stream::iter(batches).map(read).buffer_unordered(AT_ONCE);
         while let Some(batch) = reading.next().await {

@@ -5,6 +5,7 @@ use protocol::artifact::Chunk;
 use protocol::{Digest, Manifest};
 
 use super::BlobStore;
+use super::reader::Reader;
 
 /// Size limit of a manifest that is read; ours have at most a few megabytes.
 pub const MANIFEST_BYTES: u64 = 64 << 20;
@@ -102,22 +103,28 @@ impl BlobStore {
         if let Some(content) = self.seen().content(digest) {
             return Ok((parse(digest, &content)?, content.len() as u64));
         }
-        let bytes = self.manifest_bytes(digest)?;
+        let bytes = self.manifest_bytes(digest, |reader| reader)?;
         Ok((parse(digest, &bytes)?, bytes.len() as u64))
     }
 
     /// Returns the manifest named `digest`.
     pub fn manifest(&self, digest: Digest) -> Result<Manifest, ManifestError> {
-        parse(digest, &self.manifest_bytes(digest)?)
+        parse(digest, &self.manifest_bytes(digest, |reader| reader)?)
     }
 
-    fn manifest_bytes(&self, digest: Digest) -> Result<Vec<u8>, ManifestError> {
+    /// Like [`Self::manifest`], for one of very many.
+    pub(crate) fn manifest_of_many(&self, digest: Digest) -> Result<Manifest, ManifestError> {
+        parse(digest, &self.manifest_bytes(digest, Reader::without_record)?)
+    }
+
+    fn manifest_bytes(&self, digest: Digest, with: impl Fn(Reader) -> Reader) -> Result<Vec<u8>, ManifestError> {
         let stat = self.must_stat(digest).map_err(ManifestError::Blob)?;
         if stat.bytes > MANIFEST_BYTES {
             let cause = format!("it has {} bytes; expected at most {MANIFEST_BYTES}", stat.bytes);
             return Err(ManifestError::NotAManifest { digest, cause });
         }
-        self.get(digest).map_err(ManifestError::Blob)
+        let reader = self.reader(digest, stat).map_err(ManifestError::Blob)?;
+        with(reader).all().map_err(ManifestError::Blob)
     }
 
     /// Returns the manifest named `digest` after checking that every listed blob exists with the right length.

@@ -23,6 +23,8 @@ pub struct Reader {
     source: Box<dyn Read + Send>,
     state: State,
     held_back: Option<Vec<u8>>,
+    /// True if a whole blob is recorded, which spares the next reader's hashing.
+    records_whole: bool,
 }
 
 enum State {
@@ -48,7 +50,13 @@ impl Reader {
     ) -> Result<Self, BlobError> {
         let source = backend.read(digest, 0)?;
         let findings = Arc::clone(findings);
-        Ok(Self { findings, digest, stat, source, state: State::Hashing(Hasher::default()), held_back: None })
+        let state = State::Hashing(Hasher::default());
+        Ok(Self { findings, digest, stat, source, state, held_back: None, records_whole: true })
+    }
+
+    /// Leaves no record of a whole blob, which would take memory for each of very many.
+    pub(super) fn without_record(self) -> Self {
+        Self { records_whole: false, ..self }
     }
 
     /// Reads a verified blob from byte `from` on.
@@ -61,12 +69,21 @@ impl Reader {
     ) -> Result<Self, BlobError> {
         let source = backend.read(digest, from)?;
         let findings = Arc::clone(findings);
-        Ok(Self { findings, digest, stat, source, state: State::Verified, held_back: None })
+        Ok(Self { findings, digest, stat, source, state: State::Verified, held_back: None, records_whole: true })
     }
 
     /// Returns the blob's length.
     pub fn bytes(&self) -> u64 {
         self.stat.bytes
+    }
+
+    /// Returns the rest of the bytes in memory.
+    pub(super) fn all(mut self) -> Result<Vec<u8>, BlobError> {
+        let mut bytes = Vec::with_capacity(usize::try_from(self.bytes()).unwrap_or_default());
+        while let Some(part) = self.next_part()? {
+            bytes.extend_from_slice(&part);
+        }
+        Ok(bytes)
     }
 
     /// Returns the next bytes, or `None` after the last ones. Returns [`BlobError::Corrupt`] instead of a damaged
@@ -76,12 +93,12 @@ impl Reader {
             let hasher = match &mut self.state {
                 State::Hashing(hasher) => hasher,
                 State::Verified => {
-                    let part = read_part(&mut *self.source, self.digest)?;
+                    let part = read_part(&mut *self.source, self.digest, self.stat.bytes)?;
                     return Ok((!part.is_empty()).then_some(part));
                 }
                 State::Ended => return Ok(self.held_back.take()),
             };
-            let part = read_part(&mut *self.source, self.digest)?;
+            let part = read_part(&mut *self.source, self.digest, self.stat.bytes)?;
             hasher.update(&part);
             if part.is_empty() {
                 let found = std::mem::take(hasher).finish();
@@ -91,7 +108,9 @@ impl Reader {
                     self.findings.note(self.digest, &self.stat, Finding::Damaged(found));
                     return Err(BlobError::Corrupt { expected: self.digest, found });
                 }
-                self.findings.note(self.digest, &self.stat, Finding::Whole);
+                if self.records_whole {
+                    self.findings.note(self.digest, &self.stat, Finding::Whole);
+                }
             } else if let Some(before) = self.held_back.replace(part) {
                 return Ok(Some(before));
             }
@@ -99,9 +118,10 @@ impl Reader {
     }
 }
 
-/// Reads up to [`PART_BYTES`]; fewer only at the end.
-fn read_part(source: &mut (dyn Read + Send), digest: Digest) -> Result<Vec<u8>, BlobError> {
-    let mut part = Vec::with_capacity(PART_BYTES);
+/// Reads up to [`PART_BYTES`] of a blob of `bytes`; fewer only at the end.
+fn read_part(source: &mut (dyn Read + Send), digest: Digest, bytes: u64) -> Result<Vec<u8>, BlobError> {
+    let most = usize::try_from(bytes).map_or(PART_BYTES, |bytes| bytes.min(PART_BYTES));
+    let mut part = Vec::with_capacity(most);
     source.take(PART_BYTES as u64).read_to_end(&mut part).map_err(|e| read_error(digest, &e))?;
     Ok(part)
 }

@@ -134,28 +134,34 @@ impl BlobStore {
     /// Refuses a blob that was found damaged and not written since.
     pub(super) fn not_damaged(&self, digest: Digest) -> Result<Stat, BlobError> {
         let stat = self.must_stat(digest)?;
+        self.refuse_damaged(digest, &stat)?;
+        Ok(stat)
+    }
+
+    fn refuse_damaged(&self, digest: Digest, stat: &Stat) -> Result<(), BlobError> {
         match self.known().finding(digest, &stat.stamp) {
             Some(Finding::Damaged(found)) => {
                 self.seen().forget(digest);
                 Err(BlobError::Corrupt { expected: digest, found })
             }
-            Some(Finding::Whole) | None => Ok(stat),
+            Some(Finding::Whole) | None => Ok(()),
         }
     }
 
     /// Returns the verified bytes of a blob in memory.
     pub fn get(&self, digest: Digest) -> Result<Vec<u8>, BlobError> {
-        let mut reader = self.read(digest)?;
-        let mut bytes = Vec::with_capacity(usize::try_from(reader.bytes()).unwrap_or_default());
-        while let Some(part) = reader.next_part()? {
-            bytes.extend_from_slice(&part);
-        }
-        Ok(bytes)
+        self.read(digest)?.all()
     }
 
     /// Opens a blob for reading in parts; it is verified before its last part is returned.
     pub fn read(&self, digest: Digest) -> Result<Reader, BlobError> {
-        let stat = self.not_damaged(digest)?;
+        let stat = self.must_stat(digest)?;
+        self.reader(digest, stat)
+    }
+
+    /// Opens a blob with this metadata for reading.
+    pub(super) fn reader(&self, digest: Digest, stat: Stat) -> Result<Reader, BlobError> {
+        self.refuse_damaged(digest, &stat)?;
         Reader::new(self.backend(), &self.0.known, digest, stat)
     }
 
