@@ -113,9 +113,9 @@ async fn main() -> Result {
     let dir = tempfile::tempdir()?;
     let begun = Instant::now();
     fill(dir.path()).await?;
-    println!("{RESULTS} results written in {:.0?}", begun.elapsed());
+    writeln!(std::io::stdout(), "{RESULTS} results written in {:.0?}", begun.elapsed())?;
     let (took, peak) = run(dir.path())?;
-    println!("collected in {took:.1?} with {} MB at most", peak / 1_000_000);
+    writeln!(std::io::stdout(), "collected in {took:.1?} with {} MB at most", peak / 1_000_000)?;
     let left = fs::read_dir(dir.path().join("blobs/sha256"))?
         .map(|shard| Ok(fs::read_dir(shard?.path())?.count() as u64))
         .collect::<Result<Vec<_>>>()?
