@@ -67,7 +67,7 @@ fn putting_twice_stores_once(store: &BlobStore) {
 }
 
 fn what_is_put_again_is_young_again(store: &BlobStore) {
-    let digest = store.put(b"again").unwrap();
+    store.put(b"again").unwrap();
     let first = store.list().unwrap()[0].put_ms;
     std::thread::sleep(std::time::Duration::from_millis(20));
     store.put(b"again").unwrap();
