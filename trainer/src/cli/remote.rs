@@ -27,8 +27,8 @@ pub(crate) struct SubmitArgs {
     /// Stop after this stage
     #[arg(long, value_name = "STAGE")]
     until: Option<String>,
-    /// Order among the runs of your project or token, from -100 to 100: a higher one comes first, and takes workers from
-    /// trainings of a lower one [default: the pipeline's, or 0]
+    /// Priority among the runs of your project or token, -100 to 100; a higher one takes workers from a lower one
+    /// [default: the pipeline's, or 0]
     #[arg(long, value_name = "N", value_parser = args::priority, allow_negative_numbers = true)]
     priority: Option<i32>,
     /// Submitting twice with the same key starts one run

@@ -1,9 +1,10 @@
 //! Gradients between two members of one machine, by memory instead of by their connection.
 //!
-//! A member makes memory of a fixed size for a peer and announces it in its greeting: process, file descriptor, size and
-//! a random mark. A peer that opens it by `/proc` and finds the mark maps it for reading only, and says so in its next
-//! greeting. Later frames of the exchange have no payload, and their numbers are in the memory. All frames still pass over
-//! the connection, which shows their order, the silence of a peer and its loss.
+//! A member makes memory for a peer and announces it in its greeting: process, file descriptor, size and a random mark.
+//! A peer that opens it by `/proc` and finds the mark maps it for reading only, and says so in its next greeting. Later
+//! frames of the exchange have no payload, and their numbers are in the memory. All frames still pass over the connection,
+//! which shows their order, the silence of a peer and its loss. A buffer that no longer fits gets larger memory, which is
+//! announced in the same way.
 //!
 //! A peer does not read while the owner writes. It sends its sum after it has copied the parts, and it begins the next step
 //! after it has copied the sum. A peer that reads at another time gets wrong numbers, and no more.

@@ -7,7 +7,8 @@
 //!
 //! Work of an equal or a higher priority keeps its workers, so two runs never take a worker from each other in turn. A
 //! priority has no effect on other groups. Shards and other short tasks are not stopped, because they would lose their
-//! work. A group with as many workers as its limit allows gets only those of its own lower priorities. [`Shares`](super::shares::Shares) keeps the freed worker for the work that it was freed for.
+//! work. A group with as many workers as its limit allows gets only those of its own lower priorities.
+//! [`Shares`](super::shares::Shares) keeps the freed worker for the work that it was freed for.
 
 use std::cmp::Reverse;
 use std::collections::BTreeMap;
@@ -151,7 +152,7 @@ impl State {
         last.map(|(.., key, task, worker)| Move::Leave { key, task, worker })
     }
 
-    /// Trainings of the claim's group with a lower priority, without those that were resumed a moment ago.
+    /// Trainings of a lower priority in the claim's group. A training that has just been resumed is left out.
     fn preemptible(&self, claim: &Claim<'_>, division: &Division<'_>, now: Millis) -> Vec<Preemptible> {
         let mut found: BTreeMap<(Digest, usize), Preemptible> = BTreeMap::new();
         for worker in self.workers.values().filter(|worker| worker.is_available() && claim.execution.takes(worker)) {

@@ -1,4 +1,4 @@
-//! The runs of a group that count against its limit: those at work, and those that wait for them.
+//! The running runs of a group. Those at work count against its limit, and the others are queued.
 
 use std::cmp::Reverse;
 

@@ -1,36 +1,18 @@
 //! Workers are shared between groups: a second group gets its part of running gangs, and gives it back.
 
-use coordinator::{Control, Effect, Event, Observation, Policy};
+use coordinator::{Control, Event, Observation, Policy};
 use protocol::message::{Doing, Poll, Progress, Role, TaskOutcome};
 use protocol::stage::WorkerRange;
-use protocol::{Digest, Owner, RunId};
+use protocol::{Digest, RunId};
 
-use crate::common::{PureCoordinator, pipelines};
+use crate::common::PureCoordinator;
+use crate::priorities;
 
 const NAMES: [&str; 4] = ["a", "b", "c", "d"];
 
 /// Submits a training of `owner`, with seeds apart, so that no stage is shared.
 fn submit(coordinator: &mut PureCoordinator, owner: &str, seed: u64, min: usize) -> RunId {
-    let mut pipeline = pipelines::quickstart(seed, WorkerRange { min, max: 8 }, &[]);
-    for stage in &mut pipeline.stages {
-        if let Some(training) = stage.settings.training_mut() {
-            training.batch.slices = 8;
-        }
-    }
-    let event = Event::Submit {
-        submission: None,
-        owner: Owner::local(owner),
-        pipeline: Box::new(pipeline),
-        source: String::new(),
-        idempotency_key: None,
-        until: Some("vae".into()),
-    };
-    let effects = coordinator.happen(event).expect("submitted");
-    let run = effects.into_iter().find_map(|effect| match effect {
-        Effect::Submitted(run) => Some(run),
-        _ => None,
-    });
-    run.expect("a run")
+    priorities::submit(coordinator, owner, seed, 0, WorkerRange { min, max: 8 })
 }
 
 /// Ends the task of the worker that works for `run` alone, such as its dataset.

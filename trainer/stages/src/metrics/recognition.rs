@@ -39,7 +39,7 @@ pub fn describe(rows: &[f32], skeleton: &Skeleton) -> Vec<f64> {
     channels.flat_map(|values: Vec<f64>| statistics(&running_mean(&values, around))).collect()
 }
 
-/// Means over `around` values on each side. At both ends the first or last value is repeated.
+/// Means over `around` values on each side. The first and the last value are repeated at the ends.
 fn running_mean(values: &[f64], around: usize) -> Vec<f64> {
     let last = values.len().saturating_sub(1);
     let at = |i: usize| values[i.saturating_sub(around).min(last)];
