@@ -38,6 +38,7 @@ fn pipeline(seed: u64) -> Pipeline {
             external: BTreeMap::new(),
             sweep: None,
             derived: None,
+            copy_of: None,
         }
     };
     Pipeline {

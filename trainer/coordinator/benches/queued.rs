@@ -46,6 +46,7 @@ fn pipeline(seed: u64) -> Pipeline {
             external: BTreeMap::new(),
             sweep: None,
             derived: None,
+            copy_of: None,
         }
     };
     let (stages, shards) = if seed == 0 { (SHARDED, SHARDS) } else { (1, 4) };

@@ -40,6 +40,7 @@ fn pipeline(shards: usize) -> Pipeline {
             external: BTreeMap::new(),
             sweep: None,
             derived: None,
+            copy_of: None,
         }
     };
     Pipeline {

@@ -68,11 +68,12 @@ impl Pipeline {
             return Err(message);
         }
         for stage in &self.stages {
-            if !protocol::id::is_stage_name(stage.name.as_str()) {
+            let names = std::iter::once(&stage.name).chain(&stage.copy_of);
+            if let Some(name) = names.into_iter().find(|name| !protocol::id::is_stage_name(name.as_str())) {
                 return Err(format!(
                     "`{}` is not a valid stage name; expected a lowercase letter, then lowercase letters, digits, `_` \
                      or `-`, at most 64 characters",
-                    shown(stage.name.as_str())
+                    shown(name.as_str())
                 ));
             }
             if stage.inputs.len() > 2 * limits::LIST {

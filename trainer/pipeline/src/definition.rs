@@ -47,6 +47,9 @@ pub struct PipelineStage {
     /// Origin of a stage that a sweep made during the run; never present in a submitted pipeline.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub derived: Option<Derived>,
+    /// The stage of the file that this one is a copy of, if the file wants several.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub copy_of: Option<StageName>,
 }
 
 /// An edge of the DAG.
@@ -65,6 +68,11 @@ impl Pipeline {
     /// Finds the stage with this name.
     pub fn stage(&self, name: &StageName) -> Option<&PipelineStage> {
         self.stages.iter().find(|stage| &stage.name == name)
+    }
+
+    /// Stages that a user means by `name`: the stage with this name, or the copies of that stage of the file.
+    pub fn named(&self, name: &StageName) -> impl Iterator<Item = &PipelineStage> {
+        self.stages.iter().filter(move |stage| &stage.name == name || stage.copy_of.as_ref() == Some(name))
     }
 
     /// Digest that names the pipeline. It covers everything except the priority, and paths of folders outside the

@@ -5,6 +5,7 @@
 //! supplies the content digests of folders ([`Pipeline::fill_external`]).
 
 mod check;
+mod copies;
 mod definition;
 mod described;
 mod diagnostic;
@@ -30,6 +31,8 @@ pub use rules::broken_rules;
 pub use trial_values::with_values;
 pub use yaml::yaml_as_json;
 
+#[cfg(test)]
+mod copies_tests;
 #[cfg(test)]
 mod mdm_tests;
 #[cfg(test)]

@@ -21,7 +21,7 @@ use crate::reader::Reader;
 use crate::rules::{self, Problem};
 use crate::schema::{Mistake, list_keys, overlay};
 use crate::yaml::{self, Budget, Content, Entry, Node};
-use crate::{graph, sweep_rules, trial};
+use crate::{copies, graph, sweep_rules, trial};
 
 /// Reads a pipeline. `file` is its name in messages, `sets` are overrides such as `stages.vae.lr=1e-4`.
 ///
@@ -109,6 +109,8 @@ struct Written {
 struct Found {
     written: Vec<Written>,
     stages: Vec<PipelineStage>,
+    /// Number of copies of those with the key `seeds`.
+    seeds: copies::Counts,
 }
 
 /// Place of the key of a stage under `stages`.
@@ -148,8 +150,11 @@ impl Reader {
             forget_keys_of_another_format(&mut root);
         }
         let head = self.head(&root);
-        let (written, stages) = self.stages(&root);
+        let Found { written, mut stages, seeds } = self.stages(&root);
+        let names = written.iter().map(|written| written.name.clone()).collect();
+        let pins = if seeds.is_empty() { copies::Pins::new() } else { copies::pin(&mut stages, &names) };
         let stages = self.connect(&root, &written, stages);
+        let stages = self.copy(&written, stages, &seeds, &pins);
         let head = head?;
         let stages = stages?;
         let Head { name, seed, backend, priority } = head;
@@ -187,12 +192,12 @@ impl Reader {
 
     /// All stages of the file, and the readable ones with their settings. A stage with mistakes is only in the first
     /// list.
-    fn stages(&mut self, root: &Node) -> (Vec<Written>, Vec<PipelineStage>) {
+    fn stages(&mut self, root: &Node) -> Found {
         let mut found = Found::default();
         self.dataset_stage(root, &mut found);
         self.text_stage(root, &mut found);
         self.named_stages(root, &mut found);
-        (found.written, found.stages)
+        found
     }
 
     /// The stage of the top-level key `dataset`.
@@ -273,6 +278,9 @@ impl Reader {
                             node: Some(entry.value.clone()),
                             path: format!("stages.{}", entry.key),
                         });
+                        if let Some(seeds) = self.seeds(entry) {
+                            found.seeds.insert(StageName::new(&*entry.key), seeds);
+                        }
                         if let Some((settings, placement, sweep)) = self.stage(entry) {
                             let mut stage = stage(&entry.key, settings, placement);
                             stage.sweep = sweep;
@@ -372,13 +380,48 @@ impl Reader {
             ),
         };
         let placement = self.overlaid::<Placement>(Placement::example(), &placed, &owner, &path, &[]);
-        let skip = ["workers", "requires", "checkpoint", "sweep"];
+        let skip = ["workers", "requires", "checkpoint", "sweep", copies::KEY];
         let sweep = match node.entry("sweep") {
             Some(entry) => self.sweep(entry, name, &default).map(Some),
             None => Some(None),
         };
         let settings = self.overlaid(default.example(), node, &owner, &path, &skip);
         Some((settings?, placement?, sweep?))
+    }
+
+    /// Reads the number of copies of a stage.
+    fn seeds(&mut self, entry: &Entry) -> Option<usize> {
+        let found = &entry.value.entry(copies::KEY)?.value;
+        let number = found.to_json().as_ref().and_then(Value::as_u64).and_then(|number| usize::try_from(number).ok());
+        let number = number.filter(|number| (1..=limits::SEEDS).contains(number));
+        if number.is_none() {
+            let (name, key) = (&entry.key, copies::KEY);
+            let shown = found.describe();
+            let message =
+                format!("`{key}` of stage `{name}` is {shown}; expected a whole number, 1 to {}", limits::SEEDS);
+            self.mistake(found.at, &format!("stages.{name}.{key}"), message, None);
+        }
+        number
+    }
+
+    /// Makes the copies of a pipeline without mistakes.
+    fn copy(
+        &mut self,
+        written: &[Written],
+        stages: Option<Vec<PipelineStage>>,
+        seeds: &copies::Counts,
+        pins: &copies::Pins,
+    ) -> Option<Vec<PipelineStage>> {
+        if !self.mistakes.is_empty() {
+            return stages;
+        }
+        match copies::expand(stages?, seeds, pins) {
+            Ok(stages) => Some(stages),
+            Err((stage, problem)) => {
+                self.problem(written, &stage, problem);
+                None
+            }
+        }
     }
 
     /// Adds edges, applies rules, sorts. Rules between stages wait until every stage could be read.
@@ -494,5 +537,14 @@ fn is_implicit(written: &[Written], name: &StageName) -> bool {
 fn stage(name: &str, settings: StageSettings, placement: Placement) -> PipelineStage {
     let inputs = graph::references(&settings);
     let external = BTreeMap::new();
-    PipelineStage { name: name.into(), settings, placement, inputs, external, sweep: None, derived: None }
+    PipelineStage {
+        name: name.into(),
+        settings,
+        placement,
+        inputs,
+        external,
+        sweep: None,
+        derived: None,
+        copy_of: None,
+    }
 }

@@ -7,12 +7,13 @@
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
 
+use protocol::limits;
 use protocol::stage::{DataOpen, DataSynthetic, ImportModel, Placement, Shape, StageSettings, Target, TextEmbed};
 use schemars::JsonSchema as _;
 use serde_json::{Map, Value, json};
 
 use crate::described::{described, described_as, generator};
-use crate::{read, sweep};
+use crate::{copies, read, sweep};
 
 /// JSON Schema (draft 2020-12) of a pipeline file.
 pub fn json_schema() -> Value {
@@ -59,17 +60,27 @@ pub fn json_schema() -> Value {
     top
 }
 
-fn schema_of_placement() -> Value {
-    Placement::json_schema(&mut generator()).to_value()
+/// Schema of the keys of every stage: its placement and the number of its copies.
+fn schema_of_every_stage() -> Value {
+    let schema = Placement::json_schema(&mut generator()).to_value();
+    let mut schema = described_as(schema, &Placement::example());
+    schema["properties"][copies::KEY] = json!({
+        "description": copies::MEANING,
+        "type": "integer",
+        "minimum": 1,
+        "maximum": limits::SEEDS,
+        "default": 1,
+    });
+    schema
 }
 
 /// Schema of a stage of this kind.
 fn stage(settings: &StageSettings) -> Value {
     let mut schema = described_kind(settings);
-    let placement = described_as(schema_of_placement(), &Placement::example());
+    let every = schema_of_every_stage();
     let properties = &mut schema["properties"];
     properties["kind"] = json!({"const": settings.kind()});
-    for (key, value) in placement["properties"].as_object().into_iter().flatten() {
+    for (key, value) in every["properties"].as_object().into_iter().flatten() {
         properties[key] = value.clone();
     }
     if settings.training().is_some() {
@@ -124,9 +135,11 @@ pub fn markdown() -> String {
     for settings in &all {
         let _ = writeln!(text, "- [`{0}`](#{1})", settings.kind(), settings.kind().replace('.', ""));
     }
-    let placement = described_as(schema_of_placement(), &Placement::example());
-    let _ = writeln!(text, "\n## Every stage\n\n{}\n", sentence(&placement));
-    table(&mut text, &placement);
+    let _ = writeln!(
+        text,
+        "\n## Every stage\n\nAll keys but `seeds` only say where and how a stage is computed; they cannot change its value.\n"
+    );
+    table(&mut text, &schema_of_every_stage());
     let _ = writeln!(text, "\nA training stage may have a hyperparameter search, `sweep`:\n");
     table(&mut text, &sweep::described());
     for settings in &all {

@@ -89,10 +89,19 @@ impl PipelineStage {
             external: self.external_of(true),
             sweep: None,
             derived: derived(StageName::new(format!("{}.eval", self.name))),
+            copy_of: None,
         };
         let external = self.external_of(false);
-        let train =
-            Self { name, settings, placement, inputs, external, sweep: None, derived: derived(self.name.clone()) };
+        let train = Self {
+            name,
+            settings,
+            placement,
+            inputs,
+            external,
+            sweep: None,
+            derived: derived(self.name.clone()),
+            copy_of: None,
+        };
         Ok([train, eval])
     }
 
@@ -114,7 +123,7 @@ impl PipelineStage {
         external.extend(self.external_of(false));
         external.insert(STATE_OUTPUT.to_owned(), state);
         let placement = Placement { workers: WorkerRange { min: 1, max: 1 }, ..Placement::default() };
-        Ok(Self { name, settings, placement, inputs: Vec::new(), external, sweep: None, derived: None })
+        Ok(Self { name, settings, placement, inputs: Vec::new(), external, sweep: None, derived: None, copy_of: None })
     }
 }
 

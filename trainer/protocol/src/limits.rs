@@ -5,6 +5,8 @@
 /// Largest number of stages of a submitted pipeline. Stages that a sweep adds during its run are limited by
 /// [`MAX_TRIALS`](crate::sweep::MAX_TRIALS) instead.
 pub const STAGES: usize = 1_000;
+/// Copies of a stage by `seeds`.
+pub const SEEDS: usize = 100;
 /// Highest priority of a run; its negative is the lowest. It is low because a decision compares the waiting work of each
 /// priority.
 pub const PRIORITY: i32 = 100;

@@ -179,7 +179,7 @@ pub(crate) async fn resolve_versions(pipeline: &mut Pipeline, store: Option<&Rea
 /// Checks that the stage of `--until` exists.
 pub(crate) fn check_stage(pipeline: &Pipeline, until: Option<&StageName>) -> Result<()> {
     match until {
-        Some(until) if pipeline.stage(until).is_none() => {
+        Some(until) if pipeline.named(until).next().is_none() => {
             let names: Vec<&str> = pipeline.stages.iter().map(|stage| stage.name.as_str()).collect();
             let meant = spelling::question(until.as_str(), names.iter().copied());
             Err(Problem::usage(format!("`--until {until}`: the pipeline has no such stage{meant}"))

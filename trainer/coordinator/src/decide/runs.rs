@@ -217,7 +217,7 @@ fn check_pipeline(pipeline: &Pipeline, until: Option<&StageName>) -> Result<(), 
         }
     }
     match until {
-        Some(until) if !seen.contains(until) => {
+        Some(until) if pipeline.named(until).next().is_none() => {
             let names: Vec<&str> = seen.iter().map(|name| name.as_str()).collect();
             Err(Rejected::Invalid(format!("`until`: unknown stage `{until}`; expected one of: {}", names.join(", "))))
         }

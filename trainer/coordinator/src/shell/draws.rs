@@ -208,6 +208,7 @@ fn drawing(draw: &Draw) -> Result<Pipeline, Failure> {
             external: BTreeMap::new(),
             sweep: None,
             derived: None,
+            copy_of: None,
         });
     }
     let backend = Backend::default();

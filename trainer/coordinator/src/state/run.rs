@@ -440,10 +440,10 @@ fn not_asked_for() -> Status {
     Status::Skipped { key: None, reason: StageView::NOT_ASKED_FOR.to_owned() }
 }
 
-/// Indexes of `until` and all of its dependencies; all stages if it is `None`.
+/// Indexes of the stages that `until` names and all of their dependencies; all stages if it is `None`.
 fn wanted(pipeline: &Pipeline, until: Option<&StageName>) -> BTreeSet<usize> {
     let Some(until) = until else { return (0..pipeline.stages.len()).collect() };
-    let mut names = BTreeSet::from([until]);
+    let mut names: BTreeSet<&StageName> = pipeline.named(until).map(|stage| &stage.name).collect();
     let mut wanted = BTreeSet::new();
     for (i, stage) in pipeline.stages.iter().enumerate().rev() {
         if names.contains(&stage.name) {
@@ -472,6 +472,7 @@ mod tests {
             external: BTreeMap::new(),
             sweep: None,
             derived: None,
+            copy_of: None,
         };
         let pipeline = Pipeline {
             name: "p".into(),

@@ -121,6 +121,7 @@ fn pipeline() -> Pipeline {
             external: BTreeMap::new(),
             sweep: None,
             derived: None,
+            copy_of: None,
         }
     };
     Pipeline {

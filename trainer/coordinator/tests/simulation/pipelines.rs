@@ -57,6 +57,7 @@ pub(crate) fn quickstart(seed: u64, workers: WorkerRange, require: &[&str]) -> P
             external: BTreeMap::new(),
             sweep: None,
             derived: None,
+            copy_of: None,
         }
     });
     let (name, stages) = ("quickstart".into(), stages.to_vec());
