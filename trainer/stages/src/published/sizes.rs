@@ -124,6 +124,7 @@ pub fn of_vae(found: &Found<'_>, heads: usize) -> Result<VaeConfig> {
         },
         network,
         projection,
+        smooth: 0,
     })
 }
 
