@@ -6,6 +6,7 @@
 //! [`open`](Dataset::open) reads a folder, and [`Dataset::to_files`] writes the artifact's files.
 
 mod entries;
+mod folds;
 mod open;
 mod pack;
 mod statistics;
@@ -16,9 +17,10 @@ use protocol::stage::DataFormat;
 use serde::{Deserialize, Serialize};
 
 pub use entries::Unusable;
+pub use folds::{Fold, FoldError};
 pub(crate) use open::MANY_PROBLEMS;
 pub use open::{OpenError, OpenReport, Problem, ProblemKind, Skip, SkipReason, is_clip_id};
-pub use pack::PackError;
+pub use pack::{DivideError, Divided, INDEX, PackError};
 pub use statistics::statistics;
 
 use crate::Floats;

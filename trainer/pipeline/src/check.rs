@@ -2,7 +2,7 @@
 
 use std::collections::BTreeSet;
 
-use protocol::stage::{Register, StageSettings};
+use protocol::stage::{DataFold, Register, StageSettings};
 use protocol::{StageName, limits};
 
 use crate::definition::{Pipeline, PipelineStage, StageInput};
@@ -105,6 +105,9 @@ impl PipelineStage {
             wrong.push(format!(
                 "stage `{name}` is marked as created by a sweep; only a running sweep creates such stages"
             ));
+        }
+        if self.settings.get::<DataFold>().is_some_and(|data| data.fold == 0) {
+            wrong.push(format!("stage `{name}` holds out fold 0; a pipeline as submitted has one stage for each fold"));
         }
         let own = graph::references(&self.settings);
         let swept = trial::references(self);

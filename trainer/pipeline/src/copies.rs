@@ -1,4 +1,5 @@
-//! Stages that exist several times: `seeds: 3` makes `vae_1`, `vae_2` and `vae_3` of the stage `vae`.
+//! Stages that exist several times: `seeds: 3` makes `vae_1`, `vae_2` and `vae_3` of the stage `vae`, and `data.fold` one
+//! stage for each fold.
 //!
 //! A stage's name keys its draws, so the copies differ in all random draws and in nothing else. Every stage that reads a
 //! copied stage is copied with it, unless it names one copy, such as `vae_1`. A `register` stage is not copied: its `from`
@@ -8,7 +9,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use protocol::id::is_stage_name;
-use protocol::stage::{Register, Shape, StageSettings, Target};
+use protocol::stage::{DataFold, Register, Shape, StageSettings, Target};
 use protocol::{StageName, limits};
 
 use crate::definition::{IN_EVALUATION, PipelineStage};
@@ -86,7 +87,10 @@ pub(crate) fn expand(stages: Vec<PipelineStage>, written: &Counts, pins: &Pins) 
     // One training after the other, so that the first is whole before the others.
     for number in 1..=most {
         for stage in copied.iter().filter(|stage| number <= counts[&stage.name]) {
-            let mut copy = stage.clone();
+            let mut copy = (*stage).clone();
+            if let Some(fold) = every_fold(&stage.settings) {
+                copy.settings = DataFold { fold: number, ..fold.clone() }.into();
+            }
             refer(&mut copy, Some(number), &counts, pins);
             copy.name = numbered(&stage.name, number);
             copy.copy_of = Some(stage.name.clone());
@@ -145,7 +149,7 @@ fn counts(stages: &[PipelineStage], written: &Counts, pins: &Pins) -> Result<Cou
             }
             read = Some((name, count));
         }
-        let own = written.get(&stage.name).copied();
+        let own = every_fold(&stage.settings).map(|fold| fold.folds).or_else(|| written.get(&stage.name).copied());
         if own.is_some() && stage.settings.shape() == Shape::Registry {
             let message = format!("it has `{KEY}`, but a stage that registers exists once");
             return Err((stage.name.clone(), problem(KEY, message, "its `from` takes all copies of a stage")));
@@ -164,6 +168,11 @@ fn counts(stages: &[PipelineStage], written: &Counts, pins: &Pins) -> Result<Cou
         }
     }
     Ok(counts)
+}
+
+/// The settings of a stage that stands for all folds.
+fn every_fold(settings: &StageSettings) -> Option<&DataFold> {
+    settings.get::<DataFold>().filter(|fold| fold.fold == 0)
 }
 
 /// Fields of a stage that name one stage each, with that name: those of its settings and of its sweep's evaluation.

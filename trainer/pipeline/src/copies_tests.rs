@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use protocol::StageName;
-use protocol::stage::{DistillPcm, EvaluateLatentFid, Register};
+use protocol::stage::{DataFold, DistillPcm, EvaluateLatentFid, Register};
 
 use crate::{Pipeline, read};
 
@@ -141,15 +141,15 @@ fn mistakes_are_told_at_their_place() {
         (
             "{kind: train.mld}",
             "{kind: train.mld, seeds: 2}",
-            "6:28",
-            "`seeds` is 2, but `vae`, which it reads, exists 3 times",
+            "6:33",
+            "`seeds` is 2, but `latents`, which it reads, exists 3 times",
         ),
         ("  mld:", "  vae_2: {kind: train.vae}\n  mld:", "4:3", "another stage is called `vae_2`"),
-        ("from: pcm}", "from: pcm, seeds: 2}", "9:57", "a stage that registers exists once"),
+        ("from: pcm}", "from: pcm, seeds: 2}", "9:53", "a stage that registers exists once"),
         (
             "from: pcm}",
             "from: pcm, metric: fid.latent_fid}",
-            "9:58",
+            "9:54",
             "`metric` names a value of `fid`, which exists 3 times",
         ),
     ];
@@ -170,6 +170,32 @@ fn mistakes_are_told_at_their_place() {
         let mistakes = read("p.yaml", &text, &[]).unwrap_err().to_string();
         assert!(mistakes.contains(&format!("p.yaml:{place}")) && mistakes.contains(part), "{new}: {mistakes}");
     }
+}
+
+#[test]
+fn each_fold_has_its_own_stages() {
+    let text = "name: p
+stages:
+  recordings: {kind: data.synthetic}
+  dataset: {kind: data.fold, dataset: recordings, folds: 3}
+  evaluator: {kind: train.evaluator, dataset: recordings}
+  vae: {kind: train.vae}
+";
+    let read = pipeline(text);
+    assert_eq!(
+        names(&read),
+        ["recordings", "evaluator", "dataset_1", "vae_1", "dataset_2", "vae_2", "dataset_3", "vae_3"]
+    );
+    for (i, stage) in read.named(&StageName::new("dataset")).enumerate() {
+        assert_eq!(
+            stage.settings.get::<DataFold>().unwrap(),
+            &DataFold { dataset: "recordings".into(), folds: 3, fold: i + 1 }
+        );
+    }
+    read.check().unwrap();
+    // One fold alone is one stage.
+    let one = pipeline(&text.replace("folds: 3", "folds: 3, fold: 2"));
+    assert_eq!(names(&one), ["recordings", "dataset", "evaluator", "vae"]);
 }
 
 #[test]

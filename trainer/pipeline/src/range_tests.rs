@@ -60,6 +60,7 @@ fn stages() -> Vec<(String, StageSettings)> {
             "jumps",
             StageSettings::DistillDiscord(DistillDiscord { teacher: "train_discord".into(), ..Default::default() }),
         ),
+        ("one_fold", StageSettings::DataFold(DataFold { fold: 1, ..DataFold::default() })),
         ("evaluator", StageSettings::TrainEvaluator(TrainEvaluator::default())),
         ("imported", StageSettings::ImportEvaluator(ImportEvaluator { path: "t2m".into(), ..Default::default() })),
         (

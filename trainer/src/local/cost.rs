@@ -7,7 +7,7 @@ use std::time::Duration;
 use motion::DataPath;
 use pipeline::Pipeline;
 use protocol::StageName;
-use protocol::stage::{DataFeatures, DataFormat, DataOpen, DataSynthetic};
+use protocol::stage::{DataFeatures, DataFold, DataFormat, DataOpen, DataSynthetic};
 use stages::run::estimate::{Entries, Estimate, estimate};
 
 /// Time limit of all trial runs; the stage that reaches it is the last.
@@ -16,18 +16,17 @@ const BUDGET: Duration = Duration::from_secs(30);
 /// Estimates each stage that can be tried.
 pub(crate) fn estimates(pipeline: &Pipeline) -> BTreeMap<StageName, Estimate> {
     let Ok(device) = models::device::open(pipeline.backend, 0) else { return BTreeMap::new() };
-    let entries: BTreeMap<StageName, Entries> = pipeline
-        .stages
-        .iter()
-        .filter_map(|stage| {
-            let settings = &stage.settings;
-            let open = settings.get::<DataOpen>().map(listed);
-            let made = || settings.get::<DataSynthetic>().map(synthetic);
-            let recorded = || settings.get::<DataFeatures>().map(recorded);
-            let entries = open.or_else(made).or_else(recorded)?;
-            Some((stage.name.clone(), entries))
-        })
-        .collect();
+    let mut entries: BTreeMap<StageName, Entries> = BTreeMap::new();
+    for stage in &pipeline.stages {
+        let settings = &stage.settings;
+        let open = settings.get::<DataOpen>().map(listed);
+        let made = || settings.get::<DataSynthetic>().map(synthetic);
+        let recorded = || settings.get::<DataFeatures>().map(recorded);
+        let fold = || settings.get::<DataFold>().and_then(|fold| folded(fold, &entries));
+        if let Some(found) = open.or_else(made).or_else(recorded).or_else(fold) {
+            entries.insert(stage.name.clone(), found);
+        }
+    }
     let pipeline = pipeline.clone();
     // Computes as a worker does: one thread, with a stack for deep graphs.
     let thread = std::thread::Builder::new().name("estimate".to_owned()).stack_size(64 << 20);
@@ -60,6 +59,13 @@ fn synthetic(data: &DataSynthetic) -> Entries {
 fn recorded(data: &DataFeatures) -> Entries {
     let files = mocap::listing::list(&DataPath::local(&data.path), None).map_or(100, |listing| listing.clips.len());
     divided(files, data.mirror, data.val, data.test)
+}
+
+fn folded(data: &DataFold, entries: &BTreeMap<StageName, Entries>) -> Option<Entries> {
+    let of = entries.get(&StageName::new(&*data.dataset))?;
+    let all = of.train + of.val;
+    let val = all / data.folds.max(1);
+    Some(Entries { train: all - val, val, test: of.test })
 }
 
 fn divided(clips: usize, mirror: bool, val: f64, test: f64) -> Entries {

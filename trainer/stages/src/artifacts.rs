@@ -265,7 +265,12 @@ impl Draft {
         Self { manifest: Manifest::new(kind, meta), blobs: cx.blobs(), chunk_bytes: cx.chunk_bytes() }
     }
 
-    /// Uploads one file.
+    /// Starts an artifact with the meta and the files of another one.
+    pub fn again(cx: &dyn AttemptContext, manifest: &Manifest) -> Self {
+        Self { manifest: manifest.clone(), ..Self::new(cx, manifest.kind, serde_json::Value::Null) }
+    }
+
+    /// Uploads one file, in place of one with this name.
     pub fn add(&mut self, name: &str, bytes: Vec<u8>) -> Result<(), StageError> {
         self.add_pieces(name, &[&bytes])
     }

@@ -16,6 +16,9 @@ use crate::context::{AttemptContext, Outcome, StageError};
 /// The file that lists the clips and captions left out.
 const REPORT_FILE: &str = "report.txt";
 
+/// The file with the recording of each clip, for `data.fold`.
+pub(crate) const SOURCES_FILE: &str = "sources.json";
+
 /// An additional file of a dataset.
 pub(crate) type Extra = (&'static str, Vec<u8>);
 

@@ -13,12 +13,13 @@ use protocol::stage::DataFormat;
 use safetensors::tensor::{Dtype, SafeTensors, View};
 use serde::{Deserialize, Serialize};
 
-use super::{Clip, Dataset, Entry};
+use super::{Clip, Dataset, Entry, Fold, FoldError};
 use crate::Floats;
 use crate::skeleton::Skeleton;
 use crate::text::Caption;
 
-const INDEX: &str = "dataset.json";
+/// The file with everything but the features.
+pub const INDEX: &str = "dataset.json";
 const SHARD_BYTES: usize = 64 << 20;
 
 /// The files of an artifact are not a dataset.
@@ -48,14 +49,14 @@ pub enum PackError {
 }
 
 #[derive(Serialize, Deserialize)]
-struct Index {
-    version: u32,
-    format: DataFormat,
-    mean: Vec<f64>,
-    std: Vec<f64>,
-    clips: Vec<ClipRow>,
-    captions: Vec<Caption>,
-    entries: Vec<Entry>,
+pub(super) struct Index {
+    pub(super) version: u32,
+    pub(super) format: DataFormat,
+    pub(super) mean: Vec<f64>,
+    pub(super) std: Vec<f64>,
+    pub(super) clips: Vec<ClipRow>,
+    pub(super) captions: Vec<Caption>,
+    pub(super) entries: Vec<Entry>,
 }
 
 impl Index {
@@ -66,10 +67,28 @@ impl Index {
 }
 
 #[derive(Serialize, Deserialize)]
-struct ClipRow {
-    id: String,
-    frames: usize,
-    shard: usize,
+pub(super) struct ClipRow {
+    pub(super) id: String,
+    pub(super) frames: usize,
+    pub(super) shard: usize,
+}
+
+/// The index of a dataset with other splits.
+#[derive(Debug)]
+pub struct Divided {
+    /// Content of [`INDEX`].
+    pub index: Vec<u8>,
+    /// Number of entries of train, validation and test.
+    pub counts: [usize; 3],
+}
+
+/// A dataset that cannot be divided into folds.
+#[derive(Debug, thiserror::Error)]
+pub enum DivideError {
+    #[error(transparent)]
+    Pack(#[from] PackError),
+    #[error(transparent)]
+    Fold(#[from] FoldError),
 }
 
 struct Rows<'a> {
@@ -156,6 +175,22 @@ impl Dataset {
             Ok(())
         })?;
         Ok(files)
+    }
+
+    /// Divides the dataset with this index into folds, without a clip.
+    ///
+    /// # Errors
+    /// If the index does not read, has an entry of a clip that it does not list, or has too few recordings.
+    pub fn divided(index: &[u8], fold: &Fold<'_>) -> Result<Divided, DivideError> {
+        let bad = |what: String| PackError::Content { file: INDEX.into(), what };
+        let mut index: Index = serde_json::from_slice(index).map_err(|e| bad(e.to_string()))?;
+        if let Some(entry) = index.entries.iter().find(|entry| entry.clip >= index.clips.len()) {
+            return Err(bad(format!("entry {} is of clip {}, which is not listed", entry.id, entry.clip)).into());
+        }
+        index.divide(fold)?;
+        let counts = super::Split::ALL.map(|split| index.entries.iter().filter(|entry| entry.split == split).count());
+        let index = serde_json::to_vec(&index).map_err(|e| bad(e.to_string()))?;
+        Ok(Divided { index, counts })
     }
 
     /// Reads only the captions, without fetching a clip.

@@ -115,7 +115,8 @@ impl DataFeatures {
 
 impl StageSpec for DataFeatures {
     const KIND: &'static str = "data.features";
-    const VERSION: u32 = 2;
+    // Version 3 lists the recording of each clip.
+    const VERSION: u32 = 3;
     const SHAPE: Shape = Shape::Map;
     const OUTPUT: Output = Output { name: "dataset", kind: ArtifactKind::Dataset };
 

@@ -2,6 +2,7 @@
 //! lists.
 
 mod data_features;
+mod data_fold;
 mod data_open;
 mod data_synthetic;
 mod distill_discord;
@@ -38,6 +39,7 @@ super::spec::stage_kinds! {
     data_open: DataOpen,
     data_synthetic: DataSynthetic,
     data_features: DataFeatures,
+    data_fold: DataFold,
     text_embed: TextEmbed,
     train_vae: TrainVae,
     encode_latents: EncodeLatents,

@@ -23,7 +23,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::artifacts::{self, Draft, Tensors, to_meta};
 use crate::context::{AttemptContext, Outcome, StageError};
-use crate::dataset::{Extra, pack};
+use crate::dataset::{Extra, SOURCES_FILE, pack};
 use crate::external::{self, Given};
 use crate::kinds::shape::Map;
 use crate::shards::shard_range;
@@ -90,8 +90,12 @@ impl Map for DataFeatures {
             Splits::Lists => Division::Lists,
             Splits::Source => Division::Sources { seed: cx.task().seed, val: self.val, test: self.test },
         };
+        let sources: BTreeMap<String, String> =
+            made.iter().map(|clip| (clip.id.clone(), clip.source.clone())).collect();
         let dataset = corpus::assemble(self.format, made, division, &mut report).map_err(StageError::Input)?;
-        let extras = extras(&dataset)?;
+        let mut extras = extras(&dataset)?;
+        let sources = serde_json::to_vec(&sources).map_err(|e| StageError::Fault(e.to_string()))?;
+        extras.push((SOURCES_FILE, sources));
         for note in &report.notes {
             cx.log(&format!("warning: {note}"));
         }

@@ -1,10 +1,11 @@
 //! The kinds `data.*`: datasets.
 
 mod features;
+mod fold;
 mod open;
 mod synthetic;
 
 runners! {
-    Plain: DataOpen, DataSynthetic;
+    Plain: DataFold, DataOpen, DataSynthetic;
     Map: DataFeatures;
 }
