@@ -16,6 +16,24 @@ pub struct Postgres {
     dir: TempDir,
     bin: PathBuf,
     user: Option<(u32, u32)>,
+    /// True if commits reach the disk, as in use; for measurements.
+    writes_through: bool,
+}
+
+/// Gives a new store in `dir` a database in PostgreSQL if the variable `STRIDE_TEST_CATALOG` is `postgres`, or `durable`,
+/// whose commits reach the disk.
+///
+/// # Panics
+/// If PostgreSQL is not installed or does not start.
+pub fn place_catalog(dir: &Path) {
+    let asked = std::env::var("STRIDE_TEST_CATALOG").unwrap_or_default();
+    let is_asked = matches!(&*asked, "postgres" | "durable");
+    if !is_asked || fs::read_dir(dir).is_ok_and(|mut entries| entries.next().is_some()) {
+        return;
+    }
+    let server = Postgres::shared().expect("PostgreSQL");
+    fs::create_dir_all(dir).expect("a folder");
+    fs::write(dir.join("CATALOG"), server.address(&server.create())).expect("a file");
 }
 
 /// Returns the folder of the newest installed server's programs.
@@ -46,7 +64,8 @@ impl Postgres {
         if let Some((uid, gid)) = user {
             chown(dir.path(), Some(uid), Some(gid)).expect("a folder of the server's user");
         }
-        let server = Self { dir, bin, user };
+        let writes_through = std::env::var("STRIDE_TEST_CATALOG").is_ok_and(|catalog| catalog == "durable");
+        let server = Self { dir, bin, user, writes_through };
         let data = server.data();
         server.run(
             "initdb",
@@ -63,8 +82,12 @@ impl Postgres {
     pub fn begin(&self) {
         let (data, socket) = (self.data(), self.dir.path().display().to_string());
         let log = format!("{socket}/log");
+        let (fsync, settings) = match self.writes_through {
+            true => ("on", ""),
+            false => ("off", " -c autovacuum=off"),
+        };
         let options = format!(
-            "-c listen_addresses= -c unix_socket_directories={socket} -c max_connections=200 -c fsync=off -c autovacuum=off"
+            "-c listen_addresses= -c unix_socket_directories={socket} -c max_connections=200 -c fsync={fsync}{settings}"
         );
         self.run("pg_ctl", &["-D", &data, "-w", "-l", &log, "-o", &options, "start"]);
     }

@@ -15,7 +15,7 @@ use serde_json::json;
 /// Opens a store. Retries while it is busy, because a child process of another test may briefly inherit a released
 /// lock.
 pub async fn try_open(dir: &std::path::Path) -> Result<Store, OpenError> {
-    place_catalog(dir);
+    cluster_tests::postgres::place_catalog(dir);
     let until = std::time::Instant::now() + std::time::Duration::from_secs(10);
     loop {
         match Store::open(dir, Holder::this_process("test")).await {
@@ -23,17 +23,6 @@ pub async fn try_open(dir: &std::path::Path) -> Result<Store, OpenError> {
             opened => return opened,
         }
     }
-}
-
-/// Gives a new store a database in PostgreSQL if the variable `STRIDE_TEST_CATALOG` is `postgres`.
-fn place_catalog(dir: &std::path::Path) {
-    let is_asked = std::env::var("STRIDE_TEST_CATALOG").is_ok_and(|catalog| catalog == "postgres");
-    if !is_asked || std::fs::read_dir(dir).is_ok_and(|mut entries| entries.next().is_some()) {
-        return;
-    }
-    let server = cluster_tests::postgres::Postgres::shared().expect("PostgreSQL");
-    std::fs::create_dir_all(dir).unwrap();
-    std::fs::write(dir.join("CATALOG"), server.address(&server.create())).unwrap();
 }
 
 /// Opens a store over the test's backend of blobs.

@@ -16,7 +16,6 @@ use pipeline::{Pipeline, PipelineStage, StageInput};
 use protocol::Seed;
 use protocol::message::{Assignment, MetricBatch, MetricRow, Submit};
 use protocol::stage::{Backend, DataSynthetic, EncodeLatents, Placement, StageSettings, TrainVae, WorkerRange};
-use registry::{Holder, Store};
 
 use crate::common::{Result, Worker};
 
@@ -92,7 +91,7 @@ async fn heartbeats(workers: Vec<Worker>, seconds: u64) -> Result<(Vec<Worker>, 
 #[tokio::main(flavor = "multi_thread", worker_threads = 2)]
 async fn main() -> Result {
     let dir = tempfile::tempdir()?;
-    let store = Store::open(dir.path(), Holder::this_process("a bench")).await?;
+    let store = common::open(dir.path()).await?;
     coordinator::shell::raise_descriptor_limit();
     // Workers that wait for their turn in this bench are idle for longer than real ones.
     let connections = Connections { idle: Duration::from_secs(600), ..Connections::default() };
@@ -190,7 +189,7 @@ async fn main() -> Result {
 
     // Connections hold the store until their tasks notice the stop.
     let store = loop {
-        match Store::open(dir.path(), Holder::this_process("a bench")).await {
+        match common::open(dir.path()).await {
             Err(registry::OpenError::Busy { .. }) => tokio::time::sleep(Duration::from_millis(20)).await,
             opened => break opened?,
         }

@@ -23,7 +23,6 @@ use protocol::message::{
 use protocol::proof::SECRET_HEADER;
 use protocol::stage::Backend;
 use registry::cli::Command;
-use registry::{Holder, Store};
 
 type Result<T = ()> = std::result::Result<T, Box<dyn std::error::Error + Send + Sync>>;
 
@@ -49,7 +48,7 @@ fn pipeline(seed: u64) -> Result<Pipeline> {
 }
 
 async fn start(dir: &Path) -> Result<Handle> {
-    let store = Store::open(dir, Holder::this_process("a bench")).await?;
+    let store = common::open(dir).await?;
     Ok(Coordinator::start(store, Config { alone: false, park: false, ..Config::embedded() }).await?)
 }
 
@@ -445,7 +444,7 @@ async fn main() -> Result {
     }
     let mut out = std::io::stdout();
     let dir = tempfile::tempdir()?;
-    let store = Store::open(dir.path(), Holder::this_process("a bench")).await?;
+    let store = common::open(dir.path()).await?;
     let export = store.blobs().put(&vec![7; EXPORT])?;
     drop(store);
     let handle = Arc::new(start(dir.path()).await?);

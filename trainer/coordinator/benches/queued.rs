@@ -18,7 +18,6 @@ use pipeline::{Pipeline, PipelineStage, StageInput};
 use protocol::Seed;
 use protocol::message::Submit;
 use protocol::stage::{Backend, DataSynthetic, EncodeLatents, Placement, StageSettings, TrainVae, WorkerRange};
-use registry::{Holder, Store};
 
 use crate::common::{Result, Worker};
 
@@ -85,7 +84,7 @@ async fn submit(handle: &Handle, seed: u64) -> Result {
 
 async fn prepare(runs: u64) -> Result<Size> {
     let dir = tempfile::tempdir()?;
-    let store = Store::open(dir.path(), Holder::this_process("a bench")).await?;
+    let store = common::open(dir.path()).await?;
     let connections = Connections { idle: Duration::from_secs(600), ..Connections::default() };
     // Workers that wait for their turn in this bench are silent for longer than real ones.
     let policy = Policy { lease_ms: 600_000, ..Policy::default() };

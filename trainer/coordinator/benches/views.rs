@@ -17,7 +17,7 @@ use std::time::{Duration, Instant};
 use coordinator::{Config, Coordinator};
 use protocol::message::{Grant, MetricRow, Submit};
 use protocol::{Attempt, Fence, Incarnation, RunId, StageName, TaskId};
-use registry::{Holder, Store, Write};
+use registry::{Store, Write};
 use sqlx::sqlite::SqliteConnectOptions;
 use sqlx::{ConnectOptions as _, Connection as _};
 
@@ -93,7 +93,7 @@ impl Server {
 }
 
 async fn submit_runs(dir: &Path) -> Result<Vec<RunId>> {
-    let store = Store::open(dir, Holder::this_process("a bench")).await?;
+    let store = common::open(dir).await?;
     let handle = Coordinator::start(store, Config { alone: false, park: false, ..Config::embedded() }).await?;
     let mut runs = Vec::new();
     for seed in 0..CURVES {
@@ -112,7 +112,7 @@ async fn submit_runs(dir: &Path) -> Result<Vec<RunId>> {
 /// Opens the store once the tasks of its last server have ended.
 async fn reopen(dir: &Path) -> Result<Store> {
     loop {
-        match Store::open(dir, Holder::this_process("a bench")).await {
+        match common::open(dir).await {
             Err(registry::OpenError::Busy { .. }) => tokio::time::sleep(Duration::from_millis(20)).await,
             opened => return Ok(opened?),
         }

@@ -3,6 +3,7 @@
 
 use std::collections::{BTreeMap, HashMap};
 use std::net::SocketAddr;
+use std::path::Path;
 
 use protocol::message::{
     Assignment, DesiredAssignments, Join, Joined, PROTOCOL_VERSION, Poll, ReportOutcome, TaskOutcome,
@@ -10,12 +11,19 @@ use protocol::message::{
 use protocol::proof::{BlobStored, GRANT_HEADER, SECRET_HEADER, Vouched};
 use protocol::stage::Backend;
 use protocol::{ArtifactKind, Digest, Incarnation, Manifest, TaskId};
+use registry::{Holder, OpenError, Store};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 
 pub(crate) type Result<T = ()> = std::result::Result<T, Box<dyn std::error::Error + Send + Sync>>;
+
+/// Opens a store; a new one has its catalog in PostgreSQL if `STRIDE_TEST_CATALOG` is `durable`.
+pub(crate) async fn open(dir: &Path) -> std::result::Result<Store, OpenError> {
+    cluster_tests::postgres::place_catalog(dir);
+    Store::open(dir, Holder::this_process("a bench")).await
+}
 
 /// A persistent connection.
 pub(crate) struct Connection {
