@@ -109,29 +109,37 @@ impl Records {
     /// # Errors
     /// If `after` is of no list, or the tables cannot be read.
     pub async fn run_list(&self, asked: &RunListQuery) -> Result<Listing<RunSummary>, Refused> {
-        let asked = RunListQuery { limit: asked.limit.clamp(1, limits::RUNS_LISTED), ..asked.clone() };
-        let page = self.store.run_list(&asked).await.map_err(|error| match error {
-            QueryError::Invalid(why) => Refused::from(Rejected::Invalid(why)),
-            error => WriteError::from(error).into(),
-        })?;
-        let mut items = Vec::with_capacity(page.rows.len());
-        for row in page.rows {
-            let summary = match (self.state.run(&row.run), self.ending.get(&row.run)) {
-                (Ok(run), _) => self.state.summary(run, self.now),
-                (Err(_), Some(view)) => RunSummary::of(&read(&row.run, view)?),
-                (Err(_), None) if row.state.is_final() => {
-                    items.push(row);
-                    continue;
-                }
-                // It was submitted after this state.
-                (Err(_), None) => continue,
-            };
-            items.push(RunSummary { created_ms: row.created_ms, changed_ms: row.changed_ms, ..summary });
+        let mut asked = RunListQuery { limit: asked.limit.clamp(1, limits::RUNS_LISTED), ..asked.clone() };
+        let wanted = asked.limit;
+        let mut items = Vec::new();
+        loop {
+            let page = self.store.run_list(&asked).await.map_err(|error| match error {
+                QueryError::Invalid(why) => Refused::from(Rejected::Invalid(why)),
+                error => WriteError::from(error).into(),
+            })?;
+            for row in page.rows {
+                items.extend(self.summary(row)?);
+            }
+            // The state and the tables are not of one moment.
+            items.retain(|row: &RunSummary| asked.states.is_empty() || asked.states.contains(&row.state));
+            asked.limit = wanted.saturating_sub(u32::try_from(items.len()).unwrap_or(u32::MAX));
+            asked.after = page.next;
+            if asked.limit == 0 || asked.after.is_none() {
+                return Ok(Listing { items, next: asked.after });
+            }
         }
-        // The state and the tables are not of one moment.
-        items.retain(|row| asked.states.is_empty() || asked.states.contains(&row.state));
-        let items = items.into_iter().map(RunSummary::shortened).collect();
-        Ok(Listing { items, next: page.next })
+    }
+
+    /// The summary of a run of the tables; `None` if it was submitted after this state.
+    fn summary(&self, row: RunSummary) -> Result<Option<RunSummary>, Refused> {
+        let summary = match (self.state.run(&row.run), self.ending.get(&row.run)) {
+            (Ok(run), _) => self.state.summary(run, self.now),
+            (Err(_), Some(view)) => RunSummary::of(&read(&row.run, view)?),
+            (Err(_), None) if row.state.is_final() => row.clone(),
+            (Err(_), None) => return Ok(None),
+        };
+        let summary = RunSummary { created_ms: row.created_ms, changed_ms: row.changed_ms, ..summary };
+        Ok(Some(summary.shortened()))
     }
 
     /// A run as clients see it, active or ended.

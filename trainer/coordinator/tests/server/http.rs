@@ -658,6 +658,9 @@ async fn a_run_that_is_younger_than_the_records_is_not_in_their_list() -> TestRe
     handle.submit(submission(Some("second"))?).await?;
     let listed = records.run_list(&RunListQuery { limit: 10, ..RunListQuery::default() }).await?.items;
     assert_eq!(listed.iter().map(|row| &row.run).collect::<Vec<_>>(), [&first]);
+    // As `@last` asks: the younger run must not use up the limit.
+    let newest = records.run_list(&RunListQuery { limit: 1, ..RunListQuery::default() }).await?.items;
+    assert_eq!(newest.iter().map(|row| &row.run).collect::<Vec<_>>(), [&first]);
     records.run_view(&listed[0].run).await?;
     records.close().await;
     handle.shutdown().await;
