@@ -162,6 +162,7 @@ fn reconstruction_is_the_same_however_the_clips_are_cut() {
     assert!(metrics["clip_mean_sjpe_static"] > 0.9, "the held mean does not move its wrists: {metrics:?}");
     assert!(metrics["sjpe_noise"] > 0.5, "an untrained VAE shakes: {metrics:?}");
     assert!((0.0..0.2).contains(&metrics["real_skating_ratio"]), "synthetic clips hardly skate: {metrics:?}");
+    assert!((0.2..0.6).contains(&metrics["real_still_ratio"]), "their feet stand still: {metrics:?}");
     assert!(metrics["clip_mean_mpjpe_mm"] < metrics["mpjpe_mm"], "an untrained VAE is no better than the clip's mean");
 }
 

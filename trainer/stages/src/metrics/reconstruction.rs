@@ -16,6 +16,9 @@ use serde::{Deserialize, Serialize};
 use super::jerk::{JerkError, jerk, joints_of};
 use super::{joints, procrustes, skating};
 
+/// Jerk of a joint at rest in m/s^3, that of waves of some hundredths of a millimetre at 20 frames a second.
+const STILL: f64 = 1.0;
+
 /// Errors of one clip, summed over its frames, in the unit of the data.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct ClipErrors {
@@ -87,11 +90,14 @@ fn in_metres(mut joints: Vec<f64>, skeleton: &Skeleton) -> Vec<f64> {
     joints
 }
 
+/// Jerks of the joints that move freely.
+fn jerks(joints: &[f64], skeleton: &Skeleton) -> Vec<f64> {
+    jerk(&in_metres(joints.to_vec(), skeleton), skeleton.joints, joints_of(skeleton.format), skeleton.fps)
+}
+
 fn clip_jerk(truth: &[f64], guess: &[f64], skeleton: &Skeleton) -> Option<ClipJerk> {
-    let of = joints_of(skeleton.format);
-    let jerks = |joints: &[f64]| jerk(&in_metres(joints.to_vec(), skeleton), skeleton.joints, of, skeleton.fps);
-    let truth = jerks(truth);
-    let guess = jerks(guess);
+    let truth = jerks(truth, skeleton);
+    let guess = jerks(guess, skeleton);
     if truth.is_empty() {
         return None;
     }
@@ -107,6 +113,14 @@ fn skates(joints: Vec<f64>, skeleton: &Skeleton) -> f64 {
 /// The skating ratio of the original clip, rows `[L, D]` of normalised features.
 pub fn real_skating(truth: &[f32], mean: &[f32], std: &[f32], skeleton: &Skeleton) -> f64 {
     skates(recover_joints_wide(&natural(truth, mean, std), skeleton), skeleton)
+}
+
+/// Share of the jerks of the original clip, rows `[L, D]` of normalised features, that are below [`STILL`]. There sJPE
+/// counts any shaking almost whole, however small it is.
+pub fn real_still(truth: &[f32], mean: &[f32], std: &[f32], skeleton: &Skeleton) -> Option<f64> {
+    let jerks = jerks(&recover_joints_wide(&natural(truth, mean, std), skeleton), skeleton);
+    let still = jerks.iter().filter(|jerk| **jerk < STILL).count();
+    (!jerks.is_empty()).then(|| still as f64 / jerks.len() as f64)
 }
 
 /// Summarises a set of clips as metrics; their names start with `prefix`, distances are in millimetres.
@@ -195,6 +209,9 @@ mod tests {
             expect("sjpe", share / 2.0);
             expect("skating_ratio", 0.0);
             let smooth = summary(&[errors(12, &jump, &rest)], skeleton, "");
+            let moved = still(skeleton, 12, jump);
+            let at_rest = real_still(&moved, &mean, &std, skeleton).expect("twelve frames have jerks");
+            assert!((at_rest - (1.0 - share)).abs() < 1e-9, "{at_rest}");
             assert!((smooth["sjpe_static"] - share).abs() < 1e-6 && smooth["sjpe_noise"] == 0.0, "{smooth:?}");
             let short = summary(&clips[2..], skeleton, "");
             assert!(!short.contains_key("sjpe") && short["acceleration_mm"] == 0.0, "{short:?}");

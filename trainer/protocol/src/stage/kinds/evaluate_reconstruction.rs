@@ -53,7 +53,8 @@ impl Default for EvaluateReconstruction {
 impl StageSpec for EvaluateReconstruction {
     const KIND: &'static str = "evaluate.reconstruction";
     // Version 2 adds PA-MPJPE, accelerations, sJPE, skating. Version 3 adds the length of a unit.
-    const VERSION: u32 = 4;
+    // Version 5 adds the share of still frames.
+    const VERSION: u32 = 5;
     const SHAPE: Shape = Shape::Map;
     const OUTPUT: Output = Output { name: "report", kind: ArtifactKind::Report };
 

@@ -25,7 +25,7 @@ use crate::evaluation::report::{REPORT_FILE, no_entries};
 use crate::kinds::shape::Map;
 use crate::metrics::frechet::{Gaussian, to_f64};
 use crate::metrics::joints::time_mean;
-use crate::metrics::reconstruction::{ClipErrors, real_skating, summary};
+use crate::metrics::reconstruction::{ClipErrors, real_skating, real_still, summary};
 use crate::parts::evaluator::TrainedEvaluator;
 use crate::shards::shard_range;
 
@@ -44,6 +44,8 @@ struct Row {
     clip_mean: ClipErrors,
     /// Skating ratio of the original clip.
     real_skating: f64,
+    /// Share of its jerks in which feet and wrists are still; `None` for fewer than 4 frames.
+    real_still: Option<f64>,
 }
 
 /// Results of a shard.
@@ -175,6 +177,7 @@ impl Map for EvaluateReconstruction {
                 mu: mu.map(|mu| errors(&mu)),
                 clip_mean: errors(&time_mean(&truth, width)),
                 real_skating: real_skating(&truth, mean, std, skeleton),
+                real_still: real_still(&truth, mean, std, skeleton),
             });
             cx.progress(rows.len() as u64, total, "clips", &[]);
         }
@@ -220,6 +223,10 @@ impl Map for EvaluateReconstruction {
         metrics.extend(summary(&column(|r| r.clip_mean), skeleton, "clip_mean_"));
         let skating = rows.iter().map(|row| row.real_skating).sum::<f64>() / rows.len() as f64;
         metrics.insert("real_skating_ratio".into(), skating);
+        let still: Vec<f64> = rows.iter().filter_map(|row| row.real_still).collect();
+        if !still.is_empty() {
+            metrics.insert("real_still_ratio".into(), still.iter().sum::<f64>() / still.len() as f64);
+        }
         metrics.insert("millimetres_per_unit".into(), 1000.0 * skeleton.metres_per_unit);
         let mut meta = json!({"kind": cx.task().settings.kind()});
         if let Some((digest, evaluator)) = evaluator(cx, &self.evaluator)? {
