@@ -62,7 +62,6 @@ fn vae(device: &Device) -> Trained<Vae> {
         latent: LatentShape { tokens: 16, dim: 32 },
         network: Network { width: 128, layers: 5, heads: 4, feed_forward: 256, ..Network::default() },
         projection: true,
-        smooth: 0,
     };
     Trained::new(Vae::new(&config, &mut Init::new(Seed(1), "vae", Positions::Sinusoid, &device.clone().autodiff())))
 }

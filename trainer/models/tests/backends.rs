@@ -44,7 +44,6 @@ fn vae(device: &Device) -> Step {
         latent: LatentShape { tokens: 2, dim: 8 },
         network: Network { width: 32, layers: 3, heads: 2, feed_forward: 48, ..Network::default() },
         projection: true,
-        smooth: 0,
     };
     let tracked = device.clone().autodiff();
     let vae = Vae::new(&config, &mut Init::new(Seed(3), "backends", Positions::Uniform, &tracked));

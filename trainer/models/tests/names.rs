@@ -129,7 +129,7 @@ fn vae_has_the_published_names() {
     let mut expected = listed(&format!("{v2}{}{}", stack("encoder", false), stack("decoder", true)));
     assert_eq!(sorted(&with(|init| Vae::new(&small_vae(), init))), expected);
     expected.retain(|name, _| !name.starts_with("latent_"));
-    let v1 = VaeConfig { projection: false, smooth: 0, latent: LatentShape { tokens: 2, dim: 8 }, ..small_vae() };
+    let v1 = VaeConfig { projection: false, latent: LatentShape { tokens: 2, dim: 8 }, ..small_vae() };
     assert_eq!(sorted(&with(|init| Vae::new(&v1, init))), expected);
 }
 

@@ -17,7 +17,6 @@ fn vae_config() -> VaeConfig {
         latent: LatentShape { tokens: 3, dim: 6 },
         network: Network { width: 16, layers: 5, heads: 2, feed_forward: 24, ..Network::default() },
         projection: true,
-        smooth: 0,
     }
 }
 

@@ -77,9 +77,6 @@ pub struct VaeMeta {
     /// transformer's.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub projection: Option<bool>,
-    /// Number of frames on either side with which the decoder averages a frame.
-    #[serde(default)]
-    pub smooth: usize,
 }
 
 /// Meta of an artifact of kind `latents`.

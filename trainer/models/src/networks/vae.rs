@@ -22,9 +22,6 @@ pub struct VaeConfig {
     pub network: Network,
     /// Adds linear layers around the bottleneck (v2); without them d is H (v1).
     pub projection: bool,
-    /// Number of frames on either side with which the decoder averages a frame ([`average_of_neighbours`]); 0 for none, as
-    /// published.
-    pub smooth: usize,
 }
 
 /// A diagonal normal distribution over latents.
@@ -88,28 +85,6 @@ pub struct Vae {
     /// H -> features.
     pub final_layer: Linear,
     tokens: usize,
-    smooth: usize,
-}
-
-/// Matrix `[frames, frames]` that averages each of the first `length` frames with up to `reach` frames on either side, with
-/// binomial weights: `[1, 2, 1] / 4` for 1, `[1, 4, 6, 4, 1] / 16` for 2. At the ends the weights of the frames that exist
-/// are scaled to the sum 1. Other rows are 0.
-fn average_of_neighbours(length: usize, frames: usize, reach: usize) -> Vec<f32> {
-    let mut weights = vec![1.0_f64];
-    for _ in 0..2 * reach {
-        let shifted = std::iter::once(0.0).chain(weights.clone());
-        weights.push(0.0);
-        weights = weights.iter().zip(shifted).map(|(a, b)| a + b).collect();
-    }
-    let mut matrix = vec![0.0; frames * frames];
-    for t in 0..length {
-        let near = t.saturating_sub(reach)..(t + reach + 1).min(length);
-        let sum: f64 = near.clone().map(|other| weights[other + reach - t]).sum();
-        for other in near {
-            matrix[t * frames + other] = (weights[other + reach - t] / sum) as f32;
-        }
-    }
-    matrix
 }
 
 impl Vae {
@@ -129,7 +104,6 @@ impl Vae {
             latent_post: config.projection.then(|| Linear::new(init, dim, width)),
             final_layer: Linear::new(init, width, features),
             tokens,
-            smooth: config.smooth,
         }
     }
 
@@ -165,40 +139,11 @@ impl Vae {
         let width = rows.dims()[2];
         let mask = KeyMask::new(lengths, 0);
         let x = self.decoder.forward(rows.expand([batch, frames, width]), Some(&memory), Some(&mask), dropout);
-        // The average commutes with the last layer, and is cheaper before it.
-        let x = if self.smooth == 0 { x } else { self.averaged(x, lengths) };
         let out = self.final_layer.forward(x);
         if lengths.iter().all(|l| *l == frames) {
             return out;
         }
         let live = lengths.iter().flat_map(|l| (0..frames).map(move |t| if t < *l { 1.0_f32 } else { 0.0 })).collect();
         out * Tensor::from_data(TensorData::new(live, [batch, frames, 1]), &device)
-    }
-
-    /// Averages each valid frame of `x_bth` [B, T, H] with its neighbours.
-    fn averaged(&self, x_bth: Tensor<3>, lengths: &[usize]) -> Tensor<3> {
-        let [batch, frames, _] = x_bth.dims();
-        let of = |length: &usize| average_of_neighbours(*length, frames, self.smooth);
-        let matrices = lengths.iter().flat_map(of).collect();
-        let matrices = Tensor::<3>::from_data(TensorData::new(matrices, [batch, frames, frames]), &x_bth.device());
-        matrices.matmul(x_bth)
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn neighbours_have_binomial_weights_and_ends_sum_to_one() {
-        let found = average_of_neighbours(4, 5, 2);
-        let row = |t: usize| &found[t * 5..][..5];
-        let near = |t: usize, expected: [f32; 5]| {
-            assert!(row(t).iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-6), "{t}: {:?}", row(t));
-        };
-        near(0, [6.0 / 11.0, 4.0 / 11.0, 1.0 / 11.0, 0.0, 0.0]);
-        near(2, [1.0 / 15.0, 4.0 / 15.0, 6.0 / 15.0, 4.0 / 15.0, 0.0]);
-        near(4, [0.0; 5]);
-        assert_eq!(average_of_neighbours(2, 2, 0), [1.0, 0.0, 0.0, 1.0]);
     }
 }

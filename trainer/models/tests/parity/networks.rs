@@ -76,7 +76,6 @@ pub(crate) fn vae_at(config: &Value, weights: &Path, prefix: &str, device: &Devi
             ..Network::default()
         },
         projection,
-        smooth: 0,
     };
     load(Vae::new(&config, &mut draws(device)), weights, prefix)
 }

@@ -35,7 +35,6 @@ impl VaeMeta {
             latent: self.latent,
             network: self.network.clone(),
             projection: self.projection.unwrap_or(self.latent.dim != self.network.width),
-            smooth: self.smooth,
         }
     }
 }

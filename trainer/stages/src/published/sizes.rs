@@ -124,7 +124,6 @@ pub fn of_vae(found: &Found<'_>, heads: usize) -> Result<VaeConfig> {
         },
         network,
         projection,
-        smooth: 0,
     })
 }
 

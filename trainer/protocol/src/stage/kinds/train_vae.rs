@@ -91,10 +91,6 @@ pub struct TrainVae {
     pub latent: LatentShape,
     /// Size of encoder and decoder.
     pub network: Network,
-    /// Number of frames on either side with which the decoder averages each frame, with binomial weights; 0 for none, as
-    /// published. It removes shaking that is faster than motion (our choice).
-    #[schemars(range(min = 0, max = 16), extend("x-unit" = "frames"))]
-    pub smooth: usize,
     /// Weights of the loss terms.
     pub loss: VaeLoss,
     /// Short crops for the first part of the training.
@@ -120,7 +116,6 @@ impl Default for TrainVae {
             dataset: "dataset".into(),
             latent: LatentShape::default(),
             network: Network::default(),
-            smooth: 0,
             loss: VaeLoss::default(),
             windows: Windows::default(),
             augment: Augment::default(),

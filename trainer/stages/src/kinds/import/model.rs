@@ -220,7 +220,6 @@ impl Import<'_> {
             network: config.network,
             mean,
             std,
-            smooth: config.smooth,
         };
         let network = self.network(&found, |init| Vae::new(&meta.config(), init))?;
         Ok(cx.put_manifest(&part(cx, ArtifactKind::Vae, &meta, &[network])?)?)

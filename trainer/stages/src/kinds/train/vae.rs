@@ -151,7 +151,6 @@ impl Gang for TrainVae {
             mean: dataset.mean.clone(),
             std: dataset.std.clone(),
             projection: None,
-            smooth: self.smooth,
         };
         let seed = cx.task().seed;
         let device = cx.device().autodiff();
