@@ -22,7 +22,7 @@ pub(crate) use measures::{in_brief, in_order, measured};
 pub use print::Style;
 pub(crate) use print::in_words;
 pub use row::{Measure, Row};
-pub use table::{Leaderboard, evaluations, leaderboard};
+pub use table::{Evaluation, Leaderboard, evaluations, leaderboard};
 
 #[cfg(test)]
 mod tests;

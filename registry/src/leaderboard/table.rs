@@ -1,6 +1,6 @@
 //! Tables of models and of evaluations.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use super::column::{Better, COLUMNS, better};
 use super::measures::{measured, measures};
 use super::published;
-use super::row::Row;
+use super::row::{Measure, Row};
 use crate::versions::Version;
 
 /// A table of rows.
@@ -53,14 +53,70 @@ pub fn leaderboard(title: String, versions: &[Version], metric: Option<&str>, pu
     Leaderboard { title, rows: ours }
 }
 
-/// Builds a table of named evaluations in the given order; `None` if no metric has a column.
-pub fn evaluations(title: &str, all: impl IntoIterator<Item = (String, BTreeMap<String, f64>)>) -> Option<Leaderboard> {
+/// Values of an evaluation of a run.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Evaluation {
+    /// Name of its stage.
+    pub name: String,
+    /// The stage that it is a copy of, for one of several trainings or folds.
+    pub copy_of: Option<String>,
+    /// Values by metric.
+    pub metrics: BTreeMap<String, f64>,
+}
+
+/// Builds a table of evaluations in the given order; `None` if no metric has a column. Copies of one stage follow each
+/// other, and then their mean.
+pub fn evaluations(title: &str, all: &[Evaluation]) -> Option<Leaderboard> {
+    let row = |evaluation: &Evaluation| {
+        let measures = measures(&evaluation.metrics);
+        let shown = COLUMNS.iter().any(|column| measures.contains_key(column.key));
+        let label = evaluation.name.clone();
+        shown.then(|| Row { source: label.clone(), label, published: false, measures })
+    };
     let mut rows = Vec::new();
-    for (label, metrics) in all {
-        let measures = measures(&metrics);
-        if COLUMNS.iter().any(|column| measures.contains_key(column.key)) {
-            rows.push(Row { source: label.clone(), label, published: false, measures });
+    let mut told: BTreeSet<&str> = BTreeSet::new();
+    for evaluation in all {
+        let Some(of) = &evaluation.copy_of else {
+            rows.extend(row(evaluation));
+            continue;
+        };
+        if !told.insert(of) {
+            continue;
         }
+        let copies: Vec<Row> = all.iter().filter(|other| other.copy_of.as_ref() == Some(of)).filter_map(row).collect();
+        let mean = (copies.len() > 1).then(|| mean(of, &copies));
+        rows.extend(copies);
+        rows.extend(mean);
     }
     (!rows.is_empty()).then(|| Leaderboard { title: title.to_owned(), rows })
+}
+
+/// The mean of the copies of a stage, with the 95 % interval of Student's distribution, for the metrics that all of them
+/// have.
+fn mean(of: &str, copies: &[Row]) -> Row {
+    let mut measures = BTreeMap::new();
+    for key in copies[0].measures.keys() {
+        let values: Vec<f64> =
+            copies.iter().filter_map(|copy| copy.measures.get(key)).map(|measure| measure.value).collect();
+        if values.len() < copies.len() {
+            continue;
+        }
+        let count = values.len() as f64;
+        let value = values.iter().sum::<f64>() / count;
+        let variance = values.iter().map(|one| (one - value).powi(2)).sum::<f64>() / (count - 1.0);
+        let half = quantile(values.len() - 1) * (variance / count).sqrt();
+        measures.insert(key.clone(), Measure { value, half: Some(half) });
+    }
+    let label = format!("{of}, mean of {}", copies.len());
+    Row { source: label.clone(), label, published: false, measures }
+}
+
+/// The 97.5 % quantile of Student's distribution; above ten degrees of freedom by the first terms of its expansion.
+fn quantile(degrees: usize) -> f64 {
+    const TABLE: [f64; 10] = [12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228];
+    let normal = 1.96;
+    match TABLE.get(degrees.saturating_sub(1)) {
+        Some(value) => *value,
+        None => normal + (normal.powi(3) + normal) / (4.0 * degrees as f64),
+    }
 }

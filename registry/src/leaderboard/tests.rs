@@ -3,7 +3,7 @@
 use serde_json::json;
 
 use super::compare::{Verdict, compare};
-use super::table::leaderboard;
+use super::table::{Evaluation, evaluations, leaderboard};
 use crate::versions::Version;
 
 fn version(number: u64, metrics: &[(&str, f64)]) -> Version {
@@ -16,6 +16,34 @@ fn version(number: u64, metrics: &[(&str, f64)]) -> Version {
         created_ms: 0,
         aliases: Vec::new(),
     }
+}
+
+#[test]
+fn copies_of_an_evaluation_have_a_mean_with_its_interval() {
+    let evaluation = |name: &str, of: Option<&str>, metrics: &[(&str, f64)]| Evaluation {
+        name: name.to_owned(),
+        copy_of: of.map(str::to_owned),
+        metrics: metrics.iter().map(|(key, value)| ((*key).to_owned(), *value)).collect(),
+    };
+    let of = Some("fid");
+    // Alone, one of them has another value that the others lack.
+    let all = [
+        evaluation("fid_1", of, &[("fid", 0.2), ("skating_ratio", 0.1)]),
+        evaluation("real", None, &[("fid", 0.01)]),
+        evaluation("fid_2", of, &[("fid", 0.3)]),
+        evaluation("fid_3", of, &[("fid", 0.4)]),
+    ];
+    let table = evaluations("evaluate.t2m", &all).unwrap();
+    let labels: Vec<&str> = table.rows.iter().map(|row| row.label.as_str()).collect();
+    assert_eq!(labels, ["fid_1", "fid_2", "fid_3", "fid, mean of 3", "real"]);
+    let mean = &table.rows[3].measures;
+    assert_eq!(mean.len(), 1, "{mean:?}");
+    let fid = mean["fid"];
+    // Standard deviation .1, 4.303 for two degrees of freedom.
+    assert!(
+        (fid.value - 0.3).abs() < 1e-12 && (fid.half.unwrap() - 4.303 * 0.1 / 3.0_f64.sqrt()).abs() < 1e-9,
+        "{fid:?}"
+    );
 }
 
 #[test]

@@ -189,6 +189,7 @@ impl State {
             message: None,
             wants_workers: None,
             of: stage.derived.as_ref().map(|derived| derived.of.clone()),
+            copy_of: stage.copy_of.clone(),
             times: Default::default(),
             needs: needs.into_iter().cloned().collect(),
         };

@@ -9,6 +9,7 @@ use protocol::message::{RunState, RunView, StageState, StageView, StorageProblem
 use protocol::stage::Register;
 use protocol::units::{grouped, size};
 use protocol::{Digest, StageName};
+use registry::leaderboard::Evaluation;
 use serde::Serialize;
 
 use crate::report::print;
@@ -53,6 +54,9 @@ struct StageSummary {
     /// The swept stage, if this stage is one of its trials.
     #[serde(skip_serializing_if = "Option::is_none")]
     of: Option<StageName>,
+    /// The stage of the file that this one is a copy of.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    copy_of: Option<StageName>,
 }
 
 /// Why stages were computed, in the server's words.
@@ -84,6 +88,7 @@ impl Summary {
             why: whys.get(&stage.name).cloned(),
             message: stage.message.clone(),
             of: stage.of.clone(),
+            copy_of: stage.copy_of.clone(),
         };
         let interrupted = run.interrupted || (interrupted && !run.state.is_final());
         Self {
@@ -195,8 +200,13 @@ pub(crate) fn evaluations(run: &RunView) -> String {
     kinds.dedup();
     let of_kind = |kind: &&str| {
         let stages = run.stages.iter().filter(|stage| stage.kind == *kind && !stage.metrics.is_empty());
-        let all: Vec<_> = stages.map(|stage| (stage.name.to_string(), stage.metrics.clone())).collect();
-        if all.len() < 2 { None } else { registry::leaderboard::evaluations(kind, all) }
+        let evaluation = |stage: &StageView| Evaluation {
+            name: stage.name.to_string(),
+            copy_of: stage.copy_of.as_ref().map(ToString::to_string),
+            metrics: stage.metrics.clone(),
+        };
+        let all: Vec<_> = stages.map(evaluation).collect();
+        if all.len() < 2 { None } else { registry::leaderboard::evaluations(kind, &all) }
     };
     let tables =
         kinds.iter().filter_map(of_kind).map(|table| format!("\n{}", table.render(registry::leaderboard::Style::Text)));
@@ -255,6 +265,7 @@ mod tests {
             message: None,
             wants_workers: None,
             of: None,
+            copy_of: None,
             times: Default::default(),
             needs: vec![],
         };

@@ -275,6 +275,9 @@ pub struct StageView {
     /// Swept stage that it belongs to, if a sweep made it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub of: Option<StageName>,
+    /// The stage of the pipeline's file that it is a copy of, if the file wants several by `seeds` or folds.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub copy_of: Option<StageName>,
     #[serde(default, skip_serializing_if = "Times::are_unknown")]
     pub times: Times,
     /// Stages that it reads.

@@ -191,6 +191,7 @@ mod tests {
             message: None,
             wants_workers: None,
             of: None,
+            copy_of: None,
             times: Default::default(),
             needs: vec![],
         }
