@@ -110,6 +110,12 @@ impl HttpContext {
         }
     }
 
+    /// The generation of the connections in use.
+    #[cfg(any(test, feature = "testing"))]
+    pub(crate) fn generation(&self) -> Option<protocol::Generation> {
+        self.mesh.as_ref().map(|mesh| mesh.config.generation)
+    }
+
     /// Waits until all recorded metrics and log lines are stored.
     pub(crate) fn flush(&self) -> Result<(), ContextError> {
         self.telemetry.flush().map_err(given_up)

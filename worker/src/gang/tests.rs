@@ -12,11 +12,9 @@ use std::sync::{Arc, Mutex};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use burn::tensor::Device;
 use proptest::prelude::*;
-use protocol::message::{Assignment, Grant, LossCause, LostPeer, Member, Role, StageTask};
-use protocol::stage::{CheckpointPolicy, StageSettings, TrainVae};
-use protocol::{Attempt, Fence, Generation, Incarnation, RunId, Seed, StageName, TaskId, WorkerId};
+use protocol::message::{LossCause, LostPeer, Member};
+use protocol::{Generation, Incarnation, TaskId, WorkerId};
 use stages::context::{Adopted, ContextError, Exchange, GangContext, Rendezvous};
 use tokio::runtime::Runtime;
 
@@ -27,10 +25,9 @@ use super::mesh::{Halt, Mesh};
 use super::tree;
 use super::{exchange, rendezvous};
 use crate::active_assignment::ActiveAssignment;
-use crate::cache::{Bounds, Cache};
-use crate::client::Client;
 use crate::context::HttpContext;
 use crate::event_count::{EventCount, lock};
+use crate::testing::{self, assignment, task};
 
 /// Short limits, so that silent peers are found within a test.
 const QUICK: Timing = Timing {
@@ -41,31 +38,6 @@ const QUICK: Timing = Timing {
     slow: Duration::from_secs(60),
     refused: Duration::from_millis(500),
 };
-
-fn task() -> TaskId {
-    TaskId::from("run/vae")
-}
-
-pub(crate) fn assignment(worker: &WorkerId, generation: u64, members: &[Member], secret: &str) -> Assignment {
-    let grant = Grant {
-        task: task(),
-        attempt: Attempt(1),
-        fence: Fence(generation),
-        worker: worker.clone(),
-        incarnation: Incarnation(1),
-    };
-    let stage = StageTask {
-        run: RunId::from("run"),
-        name: StageName::from("vae"),
-        settings: StageSettings::TrainVae(TrainVae::default()),
-        inputs: BTreeMap::new(),
-        seed: Seed(1),
-        checkpoint: CheckpointPolicy::default(),
-    };
-    let role =
-        Role::Member { generation: Generation(generation), members: members.to_vec(), secret: secret.to_owned() };
-    Assignment { grant, secret: "secret".to_owned(), stage, role, resume: None, drain: false }
-}
 
 /// One worker with its address, and its assignment once it is a member.
 #[derive(Debug)]
@@ -127,11 +99,7 @@ impl Gang {
     }
 
     fn context(&self, seat: usize) -> HttpContext {
-        let held = self.held(seat).expect("a member");
-        // No server listens there; these tests record and upload nothing.
-        let client = Client::new(crate::tests::server_at("http://127.0.0.1:9"), self.runtime.handle().clone());
-        let cache = Arc::new(Cache::new(None, None, Bounds::default()).expect("memory"));
-        HttpContext::new(held, client, cache, Arc::default(), Device::default())
+        testing::context(self.held(seat).expect("a member"), self.runtime.handle().clone())
     }
 
     /// Acts as the coordinator: drops members that another one cannot reach, and takes back suspects that are alive.
