@@ -94,7 +94,7 @@ pub(crate) fn exchange(mesh: &Mesh, contribution: &Contribution<'_>, interrupt: 
     let length = received.length.ok_or_else(|| Halt::Fault(format!("{barrier}: no member has a slice")))?;
 
     // Sum our chunk up to the root of the tree.
-    let chunk = tree::share(length, own, size);
+    let chunk = tree::chunk(length, own, size);
     let mut known: Vec<(Node, &[f32])> =
         contribution.parts.iter().map(|(slice, part)| (slice.clone(), &part[chunk.clone()])).collect();
     known.extend(received.sums.iter().map(|(node, sum)| (node.clone(), sum.as_slice())));
@@ -166,7 +166,7 @@ fn receive_parts(
         if at != length {
             return Err(disagree(peer, format!("has a buffer of {at} numbers; expected {length}")));
         }
-        let chunk = tree::share(length, own, size);
+        let chunk = tree::chunk(length, own, size);
         for (n, node) in nodes.into_iter().enumerate() {
             let (at, numbers) = receive_part(mesh, barrier, peer, n, &chunk, interrupt)?;
             came = at.unwrap_or(came);
@@ -222,9 +222,9 @@ fn gather(
     let length = sum.len();
     // In a member's memory for a peer, the parts of its nodes come first.
     let begin = |from: usize, to: usize| {
-        tree::cover(slices, &tree::share(slices, from, size)).len() * tree::share(length, to, size).len()
+        tree::cover(slices, &tree::share(slices, from, size)).len() * tree::chunk(length, to, size).len()
     };
-    let chunk = tree::share(length, own, size);
+    let chunk = tree::chunk(length, own, size);
     for peer in mesh.others() {
         if let Some(memory) = mesh.memory(peer).outgoing().filter(|_| !chunk.is_empty()) {
             let at = begin(own, peer);
@@ -238,7 +238,7 @@ fn gather(
         }
     }
     for peer in mesh.others() {
-        let chunk = tree::share(length, peer, size);
+        let chunk = tree::chunk(length, peer, size);
         for (p, range) in pieces(&chunk).enumerate() {
             let frame = mesh.next(peer, barrier, interrupt)?;
             let unexpected = || disagree(mesh, barrier, peer, &format!("sends an unexpected sum at piece {p}"));
@@ -268,8 +268,8 @@ fn send_parts(
 ) -> Result<(), Halt> {
     let step = contribution.step;
     let length = contribution.parts.first().map_or(0, |(_, part)| part.len());
-    let chunk = tree::share(length, peer, mesh.size());
-    let own = tree::share(length, mesh.config.rank, mesh.size());
+    let chunk = tree::chunk(length, peer, mesh.size());
+    let own = tree::chunk(length, mesh.config.rank, mesh.size());
     let local = mesh.may_share_memory(peer, barrier, interrupt)?;
     let mut memory = mesh.memory(peer);
     let numbers = Some(nodes.len() * chunk.len() + own.len()).filter(|numbers| local && *numbers > 0);
