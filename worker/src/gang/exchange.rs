@@ -195,7 +195,7 @@ fn receive_part(
         let place = (frame.a, frame.b) == (number(n), number(p));
         if place && p == 0 && frame.kind == Kind::SharedPart {
             numbers = vec![0.0; chunk.len()];
-            if !mesh.memory(peer).read(n * chunk.len(), &mut numbers) {
+            if !mesh.memory(peer).read_parts(n * chunk.len(), &mut numbers) {
                 return Err(unexpected());
             }
             break;
@@ -216,19 +216,13 @@ fn gather(
     interrupt: Interrupt<'_>,
 ) -> Result<(), Halt> {
     let step = contribution.step;
-    let slices = contribution.slices;
     let own = mesh.config.rank;
     let size = mesh.size();
     let length = sum.len();
-    // In a member's memory for a peer, the parts of its nodes come first.
-    let begin = |from: usize, to: usize| {
-        tree::cover(slices, &tree::share(slices, from, size)).len() * tree::chunk(length, to, size).len()
-    };
     let chunk = tree::chunk(length, own, size);
     for peer in mesh.others() {
         if let Some(memory) = mesh.memory(peer).outgoing().filter(|_| !chunk.is_empty()) {
-            let at = begin(own, peer);
-            memory.numbers(at..at + chunk.len()).copy_from_slice(&sum[chunk.clone()]);
+            memory.sum(chunk.len()).copy_from_slice(&sum[chunk.clone()]);
             mesh.send(peer, barrier, Head::new(Kind::SharedSum, step, 0, 0), &[], interrupt)?;
             continue;
         }
@@ -244,7 +238,7 @@ fn gather(
             let unexpected = || disagree(mesh, barrier, peer, &format!("sends an unexpected sum at piece {p}"));
             let place = frame.b == number(p) && frame.step == step;
             if place && p == 0 && frame.kind == Kind::SharedSum {
-                if !mesh.memory(peer).read(begin(peer, own), &mut sum[chunk.clone()]) {
+                if !mesh.memory(peer).read_sum(&mut sum[chunk.clone()]) {
                     return Err(unexpected());
                 }
                 break;
@@ -272,8 +266,8 @@ fn send_parts(
     let own = tree::chunk(length, mesh.config.rank, mesh.size());
     let local = mesh.may_share_memory(peer, barrier, interrupt)?;
     let mut memory = mesh.memory(peer);
-    let numbers = Some(nodes.len() * chunk.len() + own.len()).filter(|numbers| local && *numbers > 0);
-    let announced = numbers.and_then(|numbers| memory.announce(step, numbers));
+    let (parts, sums) = (nodes.len() * chunk.len(), own.len());
+    let announced = if local && parts + sums > 0 { memory.announce(step, parts, sums) } else { None };
     let greeting = Greeting { length: length as u64, durable: contribution.durable, announced };
     let flags = [(contribution.drain, DRAIN), (contribution.saved, SAVED), (memory.has_incoming(), MAPPED)];
     let flags = flags.iter().filter(|(is_set, _)| *is_set).fold(0, |all, (_, flag)| all | flag);
@@ -288,7 +282,7 @@ fn send_parts(
     let mut piece = vec![0.0f32; PIECE.min(chunk.len())];
     for (n, node) in nodes.iter().enumerate() {
         if let Some(memory) = memory.outgoing().filter(|_| !chunk.is_empty()) {
-            sum(node, chunk.clone(), memory.numbers(n * chunk.len()..(n + 1) * chunk.len()));
+            sum(node, chunk.clone(), memory.parts(n * chunk.len()..(n + 1) * chunk.len()));
             let head = Head::new(Kind::SharedPart, step, number(n), 0);
             mesh.send(peer, barrier, head, &[], interrupt)?;
             continue;
