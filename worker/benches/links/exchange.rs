@@ -75,7 +75,11 @@ fn row(program: Program<'_>, name: &'static str, line: Line, members: usize, par
     let (times, digest) = run(steps)?;
     let after: Vec<Sent> = all.iter().map(|who| network.sent(*who)).collect();
     let of = |count: fn(Sent) -> u64| -> Vec<f64> {
-        after.iter().zip(&before).map(|(after, before)| (count(*after) - count(*before)) as f64 / steps as f64).collect()
+        after
+            .iter()
+            .zip(&before)
+            .map(|(after, before)| (count(*after) - count(*before)) as f64 / steps as f64)
+            .collect()
     };
     let mean = |counts: &[f64]| counts.iter().sum::<f64>() / members as f64;
     let bytes = of(Sent::payload);
@@ -116,7 +120,9 @@ fn print(row: &Row) {
 }
 
 pub(crate) fn measure(plan: &Plan) -> Result<Vec<Row>> {
-    println!("| program | line | members | parameters | ms | formula, ms | bytes | on the line | of a ring | most | sum | load |");
+    println!(
+        "| program | line | members | parameters | ms | formula, ms | bytes | on the line | of a ring | most | sum | load |"
+    );
     println!("|---|---|---|---|---|---|---|---|---|---|---|---|");
     let mut rows: Vec<Row> = Vec::new();
     for (name, line) in plan.lines() {

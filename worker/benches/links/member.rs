@@ -74,7 +74,8 @@ impl Trainee {
             let share = self.context.gang().share(self.slices);
             self.parts.retain(|slice, _| share.contains(slice));
             let length = self.parameters;
-            let parts = share.map(|slice| (slice, self.parts.remove(&slice).unwrap_or_else(|| gradient(slice, length))));
+            let parts =
+                share.map(|slice| (slice, self.parts.remove(&slice).unwrap_or_else(|| gradient(slice, length))));
             let parts: Vec<_> = parts.collect();
             let exchanged = self.context.gang().exchange(step, self.slices, &parts)?;
             self.parts.extend(parts);

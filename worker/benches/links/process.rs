@@ -75,11 +75,8 @@ impl<'a> Processes<'a> {
         let (parameters, copies) = self.size;
         command.extend([format!("w{who}"), self.address(who)]);
         command.extend([parameters, copies, SLICES].map(|number| number.to_string()));
-        let mut child = Command::new(&command[0])
-            .args(&command[1..])
-            .stdin(Stdio::piped())
-            .stdout(Stdio::piped())
-            .spawn()?;
+        let mut child =
+            Command::new(&command[0]).args(&command[1..]).stdin(Stdio::piped()).stdout(Stdio::piped()).spawn()?;
         let stdin = child.stdin.take().ok_or("no standard input")?;
         let stdout = BufReader::new(child.stdout.take().ok_or("no standard output")?);
         let sender = self.sender.clone();

@@ -26,9 +26,11 @@ pub(crate) struct Row {
     /// Members of the larger gang.
     members: usize,
     parameters: usize,
-    /// Median of a step before the change.
-    step_ms: f64,
-    /// From the last step before the change to the first one after it: of each round, the longest of all members that stay.
+    /// Median of a step before the change and after it.
+    before_ms: f64,
+    after_ms: f64,
+    /// From the last step before the change, or from the kill, to the first step after it: of each round, the longest of
+    /// all members that stay. It includes that step.
     pauses_ms: Vec<f64>,
     load: String,
 }
@@ -103,7 +105,16 @@ fn rows(name: &'static str, line: Line, members: usize, parameters: usize) -> Re
     let mut few = gang.processes.regroup(&stay);
     stay.iter().for_each(|who| gang.processes.tell(*who, "go"));
     gang.await_steps(&stay, few, STEPS)?;
-    let row = |change| Row { line: name, change, members, parameters, step_ms: 0.0, pauses_ms: Vec::new(), load: load() };
+    let row = |change| Row {
+        line: name,
+        change,
+        members,
+        parameters,
+        before_ms: 0.0,
+        after_ms: 0.0,
+        pauses_ms: Vec::new(),
+        load: load(),
+    };
     let mut found = ["joins", "leaves", "dies"].map(row);
     for round in 0..2 * ROUNDS {
         let dies = round % 2 == 1;
@@ -111,7 +122,8 @@ fn rows(name: &'static str, line: Line, members: usize, parameters: usize) -> Re
         let many = gang.processes.regroup(&all);
         gang.processes.tell(last, "go");
         gang.await_steps(&all, many, STEPS)?;
-        found[0].step_ms = gang.usual(0, few) * 1e3;
+        found[0].before_ms = gang.usual(0, few) * 1e3;
+        found[0].after_ms = gang.usual(0, many) * 1e3;
         found[0].pauses_ms.push(gang.pause(&stay, few, many) * 1e3);
         let at = if dies {
             let killed = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH)?;
@@ -126,7 +138,8 @@ fn rows(name: &'static str, line: Line, members: usize, parameters: usize) -> Re
         };
         gang.await_steps(&stay, few, STEPS)?;
         let row = &mut found[1 + usize::from(dies)];
-        row.step_ms = gang.usual(0, many) * 1e3;
+        row.before_ms = gang.usual(0, many) * 1e3;
+        row.after_ms = gang.usual(0, few) * 1e3;
         let pause = match at {
             // Lines that were passed over while waiting for the report are steps of before.
             Some(killed) => {
@@ -144,17 +157,19 @@ fn rows(name: &'static str, line: Line, members: usize, parameters: usize) -> Re
 }
 
 pub(crate) fn measure(plan: &Plan) -> Result<Vec<Row>> {
-    println!("| line | members | parameters | change | step, ms | pauses, ms | load |");
-    println!("|---|---|---|---|---|---|---|");
+    println!("| line | members | parameters | change | step before, ms | after | pauses, ms | load |");
+    println!("|---|---|---|---|---|---|---|---|");
     let mut all = Vec::new();
     for (name, line) in plan.lines() {
         for parameters in plan.numbers("parameters", &PARAMETERS)? {
             for members in plan.numbers("members", &MEMBERS)?.into_iter().filter(|members| *members > 1) {
                 for row in rows(name, line, members, parameters)? {
                     let pauses: Vec<String> = row.pauses_ms.iter().map(|pause| format!("{pause:.0}")).collect();
-                    let Row { change, step_ms, load, .. } = &row;
+                    let Row { change, before_ms, after_ms, load, .. } = &row;
                     let pauses = pauses.join(" ");
-                    println!("| {name} | {members} | {parameters} | {change} | {step_ms:.1} | {pauses} | {load} |");
+                    println!(
+                        "| {name} | {members} | {parameters} | {change} | {before_ms:.1} | {after_ms:.1} | {pauses} | {load} |"
+                    );
                     all.push(row);
                 }
             }

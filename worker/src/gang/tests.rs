@@ -1,6 +1,7 @@
 //! Gangs of threads over loopback, with a minimal coordinator that handles losses as the real one does.
 
 mod eavesdropper;
+mod handover;
 mod relay;
 mod silence;
 mod states;
@@ -74,23 +75,25 @@ impl Gang {
     /// Starts a generation with these seats and ends the assignments of other members.
     fn regroup(&self, seats: &[usize], drain: bool) {
         let generation = self.generation.fetch_add(1, Ordering::SeqCst) + 1;
+        for i in 0..self.seats.len() {
+            if seats.contains(&i) {
+                self.order(i, generation, seats, drain);
+            } else if let Some(held) = lock(&self.seats[i].held).take() {
+                held.end("dropped from the gang");
+            }
+        }
+    }
+
+    /// Tells one seat of a generation.
+    fn order(&self, i: usize, generation: u64, seats: &[usize], drain: bool) {
         let members: Vec<Member> = seats.iter().map(|&i| self.seats[i].member.clone()).collect();
-        for (i, seat) in self.seats.iter().enumerate() {
-            let mut held = lock(&seat.held);
-            if !seats.contains(&i) {
-                if let Some(held) = held.take() {
-                    held.end("dropped from the gang");
-                }
-                continue;
-            }
-            let mut desired = assignment(&seat.member.worker, generation, &members, &format!("secret {generation}"));
-            desired.drain = drain;
-            match &*held {
-                Some(held) => held.update(desired),
-                None => {
-                    *held = Some(ActiveAssignment::new(desired, seat.endpoint.clone(), Arc::default(), Arc::default()));
-                }
-            }
+        let seat = &self.seats[i];
+        let mut desired = assignment(&seat.member.worker, generation, &members, &format!("secret {generation}"));
+        desired.drain = drain;
+        let mut held = lock(&seat.held);
+        match &*held {
+            Some(held) => held.update(desired),
+            None => *held = Some(ActiveAssignment::new(desired, seat.endpoint.clone(), Arc::default(), Arc::default())),
         }
     }
 
@@ -397,7 +400,7 @@ fn mesh(gang: &Gang, seats: &[usize], own: usize, secret: &str) -> (Arc<Mesh>, A
         busy: Busy::default(),
     };
     let event_count: Arc<EventCount> = Arc::default();
-    (Mesh::open(config, &gang.seats[seats[own]].endpoint, event_count.clone(), Arc::default()), event_count)
+    (Mesh::open(config, &gang.seats[seats[own]].endpoint, event_count.clone(), Arc::default(), None), event_count)
 }
 
 fn unreachable(worker: &str) -> LostPeer {

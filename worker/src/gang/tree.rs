@@ -53,8 +53,7 @@ pub(crate) fn share(slices: usize, rank: usize, members: usize) -> Range<usize> 
     for at in 1..=rank + 1 {
         let after = members - at;
         let fits = |end: &usize| {
-            (own.end + least..=own.end + most).contains(end)
-                && (after * least..=after * most).contains(&(slices - end))
+            (own.end + least..=own.end + most).contains(end) && (after * least..=after * most).contains(&(slices - end))
         };
         let even = slices * at / members;
         let ends = even..=(slices * at).div_ceil(members);
@@ -133,7 +132,8 @@ mod tests {
 
     #[test]
     fn borders_lie_where_large_nodes_begin() {
-        let lengths = |slices, members| -> Vec<usize> { (0..members).map(|r| share(slices, r, members).len()).collect() };
+        let lengths =
+            |slices, members| -> Vec<usize> { (0..members).map(|r| share(slices, r, members).len()).collect() };
         assert_eq!(lengths(16, 3), [6, 4, 6]);
         assert_eq!(lengths(8, 5), [2, 2, 1, 1, 2]);
         assert_eq!(lengths(16, 16), [1; 16]);
