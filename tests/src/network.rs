@@ -139,7 +139,8 @@ impl Network {
 
     /// Address of host `i`.
     pub fn host(&self, i: usize) -> Ipv4Addr {
-        let [id, own] = [self.id, u32::try_from(i).expect("few hosts") + 2].map(|n| u8::try_from(n).expect("below 250"));
+        let [id, own] =
+            [self.id, u32::try_from(i).expect("few hosts") + 2].map(|n| u8::try_from(n).expect("below 250"));
         Ipv4Addr::new(10, 77, id, own)
     }
 

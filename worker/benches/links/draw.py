@@ -35,7 +35,7 @@ def main(measured: str, drawing: str) -> None:
     out.append(f'<circle cx="{at + 125}" cy="42" r="4" fill="none" stroke="#282a30" stroke-width="1.5"/>')
     out.append(f'<text x="{at + 134}" y="46">gloo</text>')
 
-    low, high = math.log10(TICKS[0]), math.log10(TICKS[-1] * 2)
+    low, high = math.log10(TICKS[0]), math.log10(TICKS[-1] * 3)
 
     def y(milliseconds: float) -> float:
         return TOP + HEIGHT * (high - math.log10(milliseconds)) / (high - low)
