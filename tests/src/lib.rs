@@ -5,6 +5,7 @@
 
 pub mod book;
 pub mod bucket;
+pub mod cable;
 pub mod cluster;
 pub mod disk;
 pub mod documented;

@@ -1,13 +1,53 @@
-//! Separate hosts for workers: one network namespace each, all on one bridge with the coordinator. Also slow lines
-//! without namespaces.
+//! Separate hosts for workers: one network namespace each, all on one bridge with the coordinator, by lines of a chosen
+//! bandwidth and latency. Also slow lines without namespaces.
 
 use std::io::{Read, Write};
-use std::net::{Shutdown, SocketAddr, TcpListener, TcpStream};
+use std::net::{Ipv4Addr, Shutdown, SocketAddr, TcpListener, TcpStream};
 use std::process::Command;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::thread;
 use std::time::Duration;
+
+use serde_json::Value;
+
+use crate::cable;
+
+/// The line of each host, in both directions.
+#[derive(Debug, Clone, Copy)]
+pub struct Line {
+    /// Bandwidth in megabits per second.
+    pub megabits: u32,
+    /// Time from one host to another.
+    pub late: Duration,
+}
+
+impl Line {
+    /// Arguments of `tc` for one direction. The burst is one of a millisecond, so that it hides no bandwidth.
+    fn shape(self) -> String {
+        let burst = (self.megabits * 125).max(16_000);
+        format!("root tbf rate {}mbit burst {burst} latency 50ms", self.megabits)
+    }
+}
+
+/// What has passed a line in one direction.
+#[derive(Debug, Clone, Copy)]
+pub struct Sent {
+    /// With all headers of each packet.
+    pub bytes: u64,
+    /// Number of packets.
+    pub packets: u64,
+}
+
+impl Sent {
+    /// Headers of a packet: Ethernet, IPv4, and TCP with timestamps.
+    const HEADERS: u64 = 14 + 20 + 32;
+
+    /// Bytes of TCP streams, without the headers of packets.
+    pub fn payload(self) -> u64 {
+        self.bytes.saturating_sub(self.packets * Self::HEADERS)
+    }
+}
 
 /// A bridge and a namespace per worker; removed when dropped.
 #[derive(Debug)]
@@ -35,7 +75,7 @@ impl Network {
         let bridge = |id: u32| ip(&format!("link add stride{id} type bridge")).map(|()| Self { id, hosts });
         let first = std::process::id() % 250;
         let made = bridge(first).or_else(|_| bridge((first + 101) % 250));
-        match made.and_then(|network| network.build().map(|()| network)) {
+        match made.and_then(|network| network.build(None).map(|()| network)) {
             Ok(network) => Some(network),
             Err(error) => {
                 fixtures::skip(&format!("network cuts need root and `ip netns`: {error}"));
@@ -44,14 +84,42 @@ impl Network {
         }
     }
 
-    fn build(&self) -> Result<(), String> {
+    /// Creates hosts with such lines.
+    ///
+    /// # Errors
+    /// If this process may not create namespaces, or the kernel has no `tbf` or no TAP devices.
+    pub fn with_lines(hosts: usize, line: Line) -> Result<Self, String> {
+        let id = std::process::id() % 250;
+        ip(&format!("link add stride{id} type bridge"))?;
+        let network = Self { id, hosts };
+        network.build(Some(line)).map(|()| network)
+    }
+
+    /// Connects host `i` to the bridge: `sv` at the bridge, `eth0` in its namespace.
+    fn connect(&self, i: usize, late: Duration) -> Result<(), String> {
+        let (id, space) = (self.id, self.space(i));
+        if late.is_zero() {
+            return ip(&format!("link add sv{id}-{i} type veth peer name eth0 netns {space}"));
+        }
+        let inner = format!("sw{id}-{i}");
+        // Every packet passes two cables.
+        cable::lay([&format!("sv{id}-{i}"), &inner], late / 2).map_err(|e| format!("a TAP device: {e}"))?;
+        ip(&format!("link set sv{id}-{i} txqueuelen 10000"))?;
+        ip(&format!("link set {inner} txqueuelen 10000 netns {space} name eth0"))
+    }
+
+    fn build(&self, line: Option<Line>) -> Result<(), String> {
         let id = self.id;
         ip(&format!("addr add 10.77.{id}.1/24 dev stride{id}"))?;
         ip(&format!("link set stride{id} up"))?;
         for i in 0..self.hosts {
             let space = self.space(i);
             ip(&format!("netns add {space}"))?;
-            ip(&format!("link add sv{id}-{i} type veth peer name eth0 netns {space}"))?;
+            self.connect(i, line.map_or(Duration::ZERO, |line| line.late))?;
+            if let Some(line) = line {
+                tool("tc", &format!("qdisc add dev sv{id}-{i} {}", line.shape()))?;
+                tool("tc", &format!("-n {space} qdisc add dev eth0 {}", line.shape()))?;
+            }
             ip(&format!("link set sv{id}-{i} master stride{id} up"))?;
             ip(&format!("-n {space} addr add 10.77.{id}.{}/24 dev eth0", i + 2))?;
             ip(&format!("-n {space} link set eth0 up"))?;
@@ -67,6 +135,24 @@ impl Network {
     /// Address of the coordinator.
     pub fn coordinator(&self) -> SocketAddr {
         SocketAddr::from(([10, 77, u8::try_from(self.id).expect("below 250"), 1], 7700))
+    }
+
+    /// Address of host `i`.
+    pub fn host(&self, i: usize) -> Ipv4Addr {
+        let [id, own] =
+            [self.id, u32::try_from(i).expect("few hosts") + 2].map(|n| u8::try_from(n).expect("below 250"));
+        Ipv4Addr::new(10, 77, id, own)
+    }
+
+    /// What host `i` has sent by its line. Needs [`with_lines`](Self::with_lines).
+    pub fn sent(&self, i: usize) -> Sent {
+        let space = self.space(i);
+        let arguments = ["-n", &space, "-s", "-j", "qdisc", "show", "dev", "eth0"];
+        let shown = Command::new("tc").args(arguments).output().expect("tc runs");
+        let shown: Value = serde_json::from_slice(&shown.stdout).expect("JSON of tc");
+        let shaped = shown.as_array().and_then(|all| all.iter().find(|one| one["kind"] == "tbf"));
+        let count = |key: &str| shaped.and_then(|one| one[key].as_u64()).expect("a shaped line");
+        Sent { bytes: count("bytes"), packets: count("packets") }
     }
 
     /// The command prefix that runs a command on host `i`.

@@ -193,7 +193,8 @@ impl ActiveAssignment {
         if let Some(unused) = state.offered.take() {
             unused.close(Some(*generation));
         }
-        let mesh = Mesh::open(config, &self.endpoint, self.event_count.clone(), self.wake.clone());
+        let before = state.newest.as_ref();
+        let mesh = Mesh::open(config, &self.endpoint, self.event_count.clone(), self.wake.clone(), before);
         state.offered = Some(mesh.clone());
         state.newest = Some(mesh);
     }
@@ -201,6 +202,11 @@ impl ActiveAssignment {
     /// Takes the connections of the newest generation, unless the stage already has them.
     pub(crate) fn take_mesh(&self) -> Option<Arc<Mesh>> {
         lock(&self.state).offered.take()
+    }
+
+    /// The connections of the newest generation.
+    pub(crate) fn newest_mesh(&self) -> Option<Arc<Mesh>> {
+        lock(&self.state).newest.clone()
     }
 
     /// Ends all connections as the death of the process would.

@@ -110,6 +110,12 @@ impl HttpContext {
         }
     }
 
+    /// The generation of the connections in use.
+    #[cfg(any(test, feature = "testing"))]
+    pub(crate) fn generation(&self) -> Option<protocol::Generation> {
+        self.mesh.as_ref().map(|mesh| mesh.config.generation)
+    }
+
     /// Waits until all recorded metrics and log lines are stored.
     pub(crate) fn flush(&self) -> Result<(), ContextError> {
         self.telemetry.flush().map_err(given_up)
@@ -142,16 +148,14 @@ impl HttpContext {
         self.blobs.receipts.for_manifest(manifest)
     }
 
-    /// Says goodbye to the peers and closes the connections. The goodbye names the next generation, if there is one.
+    /// Says goodbye to the peers. Connections to members of the next generation, if there is one, continue there.
     fn part(&mut self) {
         if let Some(mesh) = self.mesh.take() {
-            let next = match &self.held.assignment().role {
-                protocol::message::Role::Member { generation, .. } if *generation > mesh.config.generation => {
-                    Some(*generation)
-                }
-                _ => None,
-            };
-            mesh.close(next);
+            let newest = self.held.newest_mesh();
+            match newest.filter(|newest| newest.config.generation > mesh.config.generation) {
+                Some(next) => mesh.hand_over(&next),
+                None => mesh.close(None),
+            }
         }
     }
 

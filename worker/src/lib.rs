@@ -34,6 +34,8 @@ mod stage_limits;
 mod stage_log;
 mod stage_thread;
 mod telemetry_buffer;
+#[cfg(any(test, feature = "testing"))]
+pub mod testing;
 #[cfg(test)]
 mod tests;
 

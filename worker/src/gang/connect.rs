@@ -7,11 +7,13 @@ use std::sync::{Arc, Mutex, Weak};
 use std::thread;
 use std::time::{Duration, Instant};
 
+use protocol::Generation;
 use protocol::message::LossCause;
 use tokio::sync::Notify;
 
 use super::endpoint::{Endpoint, Gang};
-use super::frame::{self, FrameError, MAX_PAYLOAD};
+use super::frame::{self, FrameError, Kind, MAX_PAYLOAD};
+use super::handover::{Follow, Reading};
 use super::handshake::{self, HandshakeError, Session};
 use super::link::{BLINK, Heard, Link, Pulse, Writer};
 use super::member::{MeshConfig, Timing, spawn};
@@ -22,12 +24,14 @@ use super::seal::Seal;
 use crate::event_count::{EventCount, lock};
 
 impl Mesh {
-    /// Creates the mesh and connects in the background.
+    /// Creates the mesh and connects in the background. The connections of the generation `before` to members of both
+    /// continue.
     pub(crate) fn open(
         config: MeshConfig,
         endpoint: &Arc<Endpoint>,
         event_count: Arc<EventCount>,
         wake: Arc<Notify>,
+        before: Option<&Arc<Self>>,
     ) -> Arc<Self> {
         let peers = Mutex::new(config.members.iter().map(|_| Peer::new()).collect());
         let timing = endpoint.timing;
@@ -36,19 +40,39 @@ impl Mesh {
         let pace = Pace::new(config.members.len(), timing.slow);
         let memory = config.members.iter().map(|_| Mutex::default()).collect();
         let uses_no_memory = AtomicBool::new(false);
-        let mesh = Self { config, timing, peers, event_count, wake, waits_for, pace, memory, uses_no_memory, closed };
+        let successor = Arc::default();
+        let mesh = Self {
+            config,
+            timing,
+            peers,
+            event_count,
+            wake,
+            waits_for,
+            pace,
+            memory,
+            uses_no_memory,
+            closed,
+            successor,
+        };
         let mesh = Arc::new(mesh);
         if mesh.size() > 1 {
             let gang: Arc<dyn Gang> = mesh.clone();
             endpoint.announce(&mesh.config, Arc::downgrade(&gang));
-            for rank in 0..mesh.config.rank {
-                let mesh = mesh.clone();
-                spawn("gang-dial", move || mesh.dial(rank));
+            if let Some(before) = before {
+                mesh.follow(before);
             }
+            let inherits: Vec<bool> = lock(&mesh.peers).iter().map(|peer| peer.inherits).collect();
+            (0..mesh.config.rank).filter(|rank| !inherits[*rank]).for_each(|rank| mesh.start_dial(rank));
             let weak = Arc::downgrade(&mesh);
             spawn("gang-alive", move || keep_alive(&weak, timing));
         }
         mesh
+    }
+
+    /// Dials a rank in the background.
+    pub(super) fn start_dial(self: &Arc<Self>, rank: usize) {
+        let mesh = self.clone();
+        spawn("gang-dial", move || mesh.dial(rank));
     }
 
     fn dial(self: Arc<Self>, rank: usize) {
@@ -90,7 +114,7 @@ impl Mesh {
 
     /// Adds a connection whose other side has authenticated as `rank`.
     fn attach(self: &Arc<Self>, rank: usize, stream: TcpStream, session: Session) {
-        let Session { sends, receives } = session;
+        let Session { opening, sends, receives } = session;
         let is_local = !sends.is_encrypted();
         let pulse = lock(&self.peers)[rank].pulse.clone();
         let both = stream.try_clone().and_then(|reader| {
@@ -104,48 +128,63 @@ impl Mesh {
                     socket,
                     writer: Mutex::new(Writer { stream, seal: sends, pulse: pulse.clone(), signed: Instant::now() }),
                     is_local,
+                    opening,
                 },
             ))
         });
         let (reader, link) = match both {
-            Ok(both) => both,
+            Ok((reader, link)) => (reader, Arc::new(link)),
             Err(error) => return self.lose(rank, LossCause::Unreachable, error.to_string()),
         };
         {
             let mut peers = lock(&self.peers);
-            if self.is_closed() || !matches!(peers[rank].standing, Standing::Unmet(_)) {
+            let peer = &mut peers[rank];
+            // A peer that dials does not continue its connection of the generation before.
+            let may_attach = matches!(peer.standing, Standing::Unmet(_)) || peer.is_unproven;
+            if self.is_closed() || !may_attach {
                 return;
             }
-            let peer = &mut peers[rank];
-            peer.link = Some(Arc::new(link));
+            if let Some(old) = peer.link.replace(link.clone()) {
+                let _ = old.socket.shutdown(Shutdown::Both);
+            }
+            peer.is_unproven = false;
             peer.pulse.beat();
             peer.standing = Standing::Up;
+            peer.inherits = false;
         }
         self.event_count.notify();
-        let mesh = Arc::downgrade(self);
-        spawn("gang-read", move || read(&mesh, rank, &reader, receives, pulse));
+        let reading = Reading::new(self, rank, &link);
+        spawn("gang-read", move || read(reading, &reader, receives, pulse));
     }
 }
 
-/// Reads frames from a link. Threads that outlive their mesh's owner hold it weakly.
-fn read(mesh: &Weak<Mesh>, rank: usize, stream: &TcpStream, mut seal: Seal, pulse: Pulse) {
+/// Reads frames from a link, of one generation after the other.
+fn read(mut reading: Reading, stream: &TcpStream, mut seal: Seal, pulse: Pulse) {
     let mut buffered = io::BufReader::with_capacity(64 << 10, Heard { stream, pulse });
     loop {
-        let frame = frame::read_sealed(&mut buffered, MAX_PAYLOAD, &mut seal);
-        let Some(mesh) = mesh.upgrade() else {
-            // Our side is closed. Keep reading until the peer closes too. Otherwise the kernel resets the connection
-            // and the peer may lose our last frames.
-            let _ = io::copy(&mut buffered, &mut io::sink());
-            return;
-        };
-        match frame {
-            Ok(frame) => mesh.receive(rank, frame),
-            Err(error) => {
-                let parted = matches!(lock(&mesh.peers)[rank].standing, Standing::Left | Standing::Moved);
-                if !parted {
-                    mesh.lose(rank, LossCause::Unreachable, error.to_string());
+        match frame::read_sealed(&mut buffered, MAX_PAYLOAD, &mut seal) {
+            Ok(frame) => {
+                let next = (frame.kind == Kind::Bye && frame.step > 0).then_some(Generation(frame.step));
+                reading.receive(frame);
+                match next.map(|next| reading.follow(next)) {
+                    None => {}
+                    Some(Follow::Here(renewed)) => seal = renewed,
+                    Some(Follow::Nowhere) => {
+                        // The peer has parted. Keep reading until it closes. Otherwise the kernel resets the connection
+                        // and the peer may lose our last frames.
+                        let _ = io::copy(&mut buffered, &mut io::sink());
+                        return reading.end("the connection was closed");
+                    }
+                    Some(Follow::Skipped) => {
+                        let _ = stream.shutdown(Shutdown::Both);
+                        return reading.end("this member was not in the generation of the peer");
+                    }
                 }
-                if !matches!(error, FrameError::Closed) {
+            }
+            Err(error) => {
+                let is_closed = matches!(error, FrameError::Closed);
+                reading.end(&error.to_string());
+                if !is_closed {
                     // The other side must not continue to send.
                     let _ = stream.shutdown(Shutdown::Both);
                 }

@@ -94,7 +94,7 @@ pub(crate) fn exchange(mesh: &Mesh, contribution: &Contribution<'_>, interrupt: 
     let length = received.length.ok_or_else(|| Halt::Fault(format!("{barrier}: no member has a slice")))?;
 
     // Sum our chunk up to the root of the tree.
-    let chunk = tree::share(length, own, size);
+    let chunk = tree::chunk(length, own, size);
     let mut known: Vec<(Node, &[f32])> =
         contribution.parts.iter().map(|(slice, part)| (slice.clone(), &part[chunk.clone()])).collect();
     known.extend(received.sums.iter().map(|(node, sum)| (node.clone(), sum.as_slice())));
@@ -166,7 +166,7 @@ fn receive_parts(
         if at != length {
             return Err(disagree(peer, format!("has a buffer of {at} numbers; expected {length}")));
         }
-        let chunk = tree::share(length, own, size);
+        let chunk = tree::chunk(length, own, size);
         for (n, node) in nodes.into_iter().enumerate() {
             let (at, numbers) = receive_part(mesh, barrier, peer, n, &chunk, interrupt)?;
             came = at.unwrap_or(came);
@@ -195,7 +195,7 @@ fn receive_part(
         let place = (frame.a, frame.b) == (number(n), number(p));
         if place && p == 0 && frame.kind == Kind::SharedPart {
             numbers = vec![0.0; chunk.len()];
-            if !mesh.memory(peer).read(n * chunk.len(), &mut numbers) {
+            if !mesh.memory(peer).read_parts(n * chunk.len(), &mut numbers) {
                 return Err(unexpected());
             }
             break;
@@ -216,19 +216,13 @@ fn gather(
     interrupt: Interrupt<'_>,
 ) -> Result<(), Halt> {
     let step = contribution.step;
-    let slices = contribution.slices;
     let own = mesh.config.rank;
     let size = mesh.size();
     let length = sum.len();
-    // In a member's memory for a peer, the parts of its nodes come first.
-    let begin = |from: usize, to: usize| {
-        tree::cover(slices, &tree::share(slices, from, size)).len() * tree::share(length, to, size).len()
-    };
-    let chunk = tree::share(length, own, size);
+    let chunk = tree::chunk(length, own, size);
     for peer in mesh.others() {
         if let Some(memory) = mesh.memory(peer).outgoing().filter(|_| !chunk.is_empty()) {
-            let at = begin(own, peer);
-            memory.numbers(at..at + chunk.len()).copy_from_slice(&sum[chunk.clone()]);
+            memory.sum(chunk.len()).copy_from_slice(&sum[chunk.clone()]);
             mesh.send(peer, barrier, Head::new(Kind::SharedSum, step, 0, 0), &[], interrupt)?;
             continue;
         }
@@ -238,13 +232,13 @@ fn gather(
         }
     }
     for peer in mesh.others() {
-        let chunk = tree::share(length, peer, size);
+        let chunk = tree::chunk(length, peer, size);
         for (p, range) in pieces(&chunk).enumerate() {
             let frame = mesh.next(peer, barrier, interrupt)?;
             let unexpected = || disagree(mesh, barrier, peer, &format!("sends an unexpected sum at piece {p}"));
             let place = frame.b == number(p) && frame.step == step;
             if place && p == 0 && frame.kind == Kind::SharedSum {
-                if !mesh.memory(peer).read(begin(peer, own), &mut sum[chunk.clone()]) {
+                if !mesh.memory(peer).read_sum(&mut sum[chunk.clone()]) {
                     return Err(unexpected());
                 }
                 break;
@@ -268,12 +262,12 @@ fn send_parts(
 ) -> Result<(), Halt> {
     let step = contribution.step;
     let length = contribution.parts.first().map_or(0, |(_, part)| part.len());
-    let chunk = tree::share(length, peer, mesh.size());
-    let own = tree::share(length, mesh.config.rank, mesh.size());
+    let chunk = tree::chunk(length, peer, mesh.size());
+    let own = tree::chunk(length, mesh.config.rank, mesh.size());
     let local = mesh.may_share_memory(peer, barrier, interrupt)?;
     let mut memory = mesh.memory(peer);
-    let numbers = Some(nodes.len() * chunk.len() + own.len()).filter(|numbers| local && *numbers > 0);
-    let announced = numbers.and_then(|numbers| memory.announce(step, numbers));
+    let (parts, sums) = (nodes.len() * chunk.len(), own.len());
+    let announced = if local && parts + sums > 0 { memory.announce(step, parts, sums) } else { None };
     let greeting = Greeting { length: length as u64, durable: contribution.durable, announced };
     let flags = [(contribution.drain, DRAIN), (contribution.saved, SAVED), (memory.has_incoming(), MAPPED)];
     let flags = flags.iter().filter(|(is_set, _)| *is_set).fold(0, |all, (_, flag)| all | flag);
@@ -288,7 +282,7 @@ fn send_parts(
     let mut piece = vec![0.0f32; PIECE.min(chunk.len())];
     for (n, node) in nodes.iter().enumerate() {
         if let Some(memory) = memory.outgoing().filter(|_| !chunk.is_empty()) {
-            sum(node, chunk.clone(), memory.numbers(n * chunk.len()..(n + 1) * chunk.len()));
+            sum(node, chunk.clone(), memory.parts(n * chunk.len()..(n + 1) * chunk.len()));
             let head = Head::new(Kind::SharedPart, step, number(n), 0);
             mesh.send(peer, barrier, head, &[], interrupt)?;
             continue;

@@ -4,7 +4,7 @@
 //!
 //! | at | bytes | content |
 //! |---|---|---|
-//! | 0 | 4 | magic `STR5`: its last byte is the version of these frames and of their contents |
+//! | 0 | 4 | magic `STR6`: its last byte is the version of these frames and of their contents |
 //! | 4 | 1 | kind |
 //! | 5 | 3 | zero |
 //! | 8 | 8 | `step`: the training step, or another number by kind |
@@ -22,7 +22,7 @@ use std::io::{self, Read, Write};
 
 use super::seal::{Seal, TAG};
 
-const MAGIC: [u8; 4] = *b"STR5";
+const MAGIC: [u8; 4] = *b"STR6";
 /// Bytes of the header that the tag covers.
 const SIGNED: usize = 28;
 const HEADER: usize = SIGNED + TAG;
@@ -159,7 +159,7 @@ pub(crate) enum FrameError {
     Closed,
     #[error("the connection failed: {0}")]
     Io(#[source] io::Error),
-    #[error("not a frame of this build: it starts with `{}`; expected `STR5`; use the same build for all workers", .0.escape_ascii())]
+    #[error("not a frame of this build: it starts with `{}`; expected `STR6`; use the same build for all workers", .0.escape_ascii())]
     Magic([u8; 4]),
     #[error("a frame has the unknown kind {0}; use the same build for all workers")]
     Kind(u8),

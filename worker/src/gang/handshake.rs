@@ -89,7 +89,7 @@ fn nonce() -> Result<[u8; 16], HandshakeError> {
 }
 
 /// Fields of the dialled side's answer, beside the dialer's.
-#[derive(Clone, Copy)]
+#[derive(Debug, Clone, Copy)]
 struct Answer {
     encrypts: bool,
     nonce: [u8; 16],
@@ -120,6 +120,7 @@ fn check(secret: &str, word: &str, dial: &Dial, answer: &Answer, proof: &[u8; 32
 /// Seals of the frames after a handshake.
 #[derive(Debug)]
 pub(crate) struct Session {
+    pub(super) opening: Opening,
     /// Seal of the frames that this side sends.
     pub(crate) sends: Seal,
     /// Seal of the frames that this side receives.
@@ -131,7 +132,26 @@ fn session(secret: &str, dial: &Dial, answer: &Answer, dialed: bool) -> Session 
     let dialer = seal(proof(secret, "frames of the dialer", dial, answer));
     let dialled = seal(proof(secret, "frames of the one dialled", dial, answer));
     let (sends, receives) = if dialed { (dialer, dialled) } else { (dialled, dialer) };
-    Session { sends, receives }
+    Session { opening: Opening { dial: dial.clone(), answer: *answer, dialed }, sends, receives }
+}
+
+/// What both sides of a connection said at its beginning.
+#[derive(Debug, Clone)]
+pub(super) struct Opening {
+    dial: Dial,
+    answer: Answer,
+    /// True on the side that dialled.
+    dialed: bool,
+}
+
+impl Opening {
+    /// The session of a later generation over the same connection. Its keys come from that generation's secret and the
+    /// nonces of this connection, so only a member of that generation has them.
+    pub(super) fn renewed(&self, secret: &str, generation: Generation, own: usize, peer: usize) -> Session {
+        let (from, to) = if self.dialed { (own, peer) } else { (peer, own) };
+        let dial = Dial { generation, from, to, ..self.dial.clone() };
+        session(secret, &dial, &self.answer, self.dialed)
+    }
 }
 
 /// A connection with one deadline for all reads and writes.
@@ -293,6 +313,24 @@ mod tests {
         assert!(!agree(&mut dialer.sends.clone(), &mut dialer.receives), "a frame is not sent back to who made it");
         let (_, again) = meet("same", "same");
         assert!(!agree(&mut dialer.sends, &mut again.expect("proved").receives), "nor over another connection");
+    }
+
+    /// A member that was removed has heard the nonces of a connection between two others.
+    #[test]
+    fn the_keys_of_a_later_generation_need_its_secret() {
+        let (dialer, dialled) = meet("old", "old");
+        let (dialer, dialled) = (dialer.expect("welcome").opening, dialled.expect("proved").opening);
+        // Ranks may have changed sides.
+        let mut sends = dialer.renewed("new", Generation(4), 0, 1).sends;
+        let mut receives = dialled.renewed("new", Generation(4), 1, 0).receives;
+        assert!(agree(&mut sends.clone(), &mut receives.clone()));
+        let removed = |secret: &str, generation, own, peer| {
+            let mut forged = dialer.renewed(secret, Generation(generation), own, peer).sends;
+            agree(&mut forged, &mut receives.clone())
+        };
+        assert!(!removed("old", 4, 0, 1) && !removed("new", 3, 0, 1) && !removed("new", 4, 1, 0));
+        assert!(!agree(&mut sends, &mut dialer.renewed("new", Generation(4), 0, 1).receives), "not sent back");
+        assert!(!agree(&mut dialled.renewed("new", Generation(4), 1, 0).sends, &mut receives));
     }
 
     #[test]

@@ -4,12 +4,15 @@
 //! The link is given up after a long time without a byte in either direction, so a slow link survives.
 
 use std::io::{self, Read, Write};
-use std::net::TcpStream;
+use std::net::{Shutdown, TcpStream};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
-use super::frame::{self, Head};
+use protocol::Generation;
+
+use super::frame::{self, Head, Kind};
+use super::handshake::Opening;
 use super::seal::Seal;
 use crate::event_count::lock;
 
@@ -24,6 +27,7 @@ pub(super) struct Link {
     pub(super) writer: Mutex<Writer>,
     /// True if the connection stays on this machine.
     pub(super) is_local: bool,
+    pub(super) opening: Opening,
 }
 
 /// The socket with the seal of its outgoing frames.
@@ -51,6 +55,17 @@ impl Link {
         let mut writer = lock(&self.writer);
         writer.sign(sign, patience, abort)?;
         writer.send(head, payload, patience, abort)
+    }
+}
+
+impl Link {
+    /// Says goodbye and closes the outgoing direction. The goodbye names the next generation, if there is one, and is
+    /// optional: a peer that does not receive it sees the connection close.
+    pub(super) fn part(&self, next: Option<Generation>) {
+        if let Ok(mut writer) = self.writer.try_lock() {
+            let _ = writer.say_goodbye(next);
+            let _ = writer.stream.shutdown(Shutdown::Write);
+        }
     }
 }
 
@@ -103,6 +118,12 @@ impl Read for Heard<'_> {
 }
 
 impl Writer {
+    /// Writes a goodbye, unless that would block.
+    pub(super) fn say_goodbye(&mut self, next: Option<Generation>) -> io::Result<()> {
+        let head = Head::new(Kind::Bye, next.map_or(0, |generation| generation.0), 0, 0);
+        self.send(head, &[], Duration::ZERO, &|| true)
+    }
+
     /// Writes a keep-alive if it is due.
     pub(super) fn sign(&mut self, sign: &Sign, patience: Duration, abort: &dyn Fn() -> bool) -> io::Result<()> {
         if self.signed.elapsed() < sign.every {

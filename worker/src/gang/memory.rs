@@ -7,7 +7,9 @@
 //! announced in the same way.
 //!
 //! A peer does not read while the owner writes. It sends its sum after it has copied the parts, and it begins the next step
-//! after it has copied the sum. A peer that reads at another time gets wrong numbers, and no more.
+//! after it has copied the sum. The owner may be a step ahead by then and write the next parts. So parts and sums have
+//! places of their own, however long the buffers of both steps are. A peer that reads at another time gets wrong
+//! numbers, and no more.
 //!
 //! Not its job: which numbers are sent when (`exchange`).
 //!
@@ -34,28 +36,32 @@ pub(super) struct Announcement {
     process: u32,
     descriptor: u32,
     bytes: u64,
+    /// Number of floats for parts, which come before those for sums.
+    parts: u64,
     mark: [u8; MARK],
 }
 
 impl Announcement {
     /// Length on the wire.
-    pub(super) const BYTES: usize = 16 + MARK;
+    pub(super) const BYTES: usize = 24 + MARK;
 
     pub(super) fn to_bytes(self) -> [u8; Self::BYTES] {
         let mut bytes = [0; Self::BYTES];
         bytes[..4].copy_from_slice(&self.process.to_le_bytes());
         bytes[4..8].copy_from_slice(&self.descriptor.to_le_bytes());
         bytes[8..16].copy_from_slice(&self.bytes.to_le_bytes());
-        bytes[16..].copy_from_slice(&self.mark);
+        bytes[16..24].copy_from_slice(&self.parts.to_le_bytes());
+        bytes[24..].copy_from_slice(&self.mark);
         bytes
     }
 
     pub(super) fn read(bytes: &[u8]) -> Option<Self> {
-        let (numbers, mark) = bytes.split_at_checked(16)?;
+        let (numbers, mark) = bytes.split_at_checked(24)?;
         let process = u32::from_le_bytes(numbers[..4].try_into().ok()?);
         let descriptor = u32::from_le_bytes(numbers[4..8].try_into().ok()?);
-        let bytes = u64::from_le_bytes(numbers[8..].try_into().ok()?);
-        Some(Self { process, descriptor, bytes, mark: mark.try_into().ok()? })
+        let bytes = u64::from_le_bytes(numbers[8..16].try_into().ok()?);
+        let parts = u64::from_le_bytes(numbers[16..].try_into().ok()?);
+        Some(Self { process, descriptor, bytes, parts, mark: mark.try_into().ok()? })
     }
 }
 
@@ -69,9 +75,10 @@ pub(super) struct Outgoing {
 }
 
 impl Outgoing {
-    /// Makes memory for `numbers` floats.
-    pub(super) fn new(numbers: usize) -> io::Result<Self> {
-        let bytes = numbers.checked_mul(4).and_then(|bytes| bytes.checked_add(NUMBERS));
+    /// Makes memory for so many floats of parts and of sums.
+    pub(super) fn new(parts: usize, sums: usize) -> io::Result<Self> {
+        let numbers = parts.checked_add(sums);
+        let bytes = numbers.and_then(|numbers| numbers.checked_mul(4)?.checked_add(NUMBERS));
         let bytes = bytes.filter(|bytes| *bytes <= MOST_BYTES).ok_or(io::ErrorKind::FileTooLarge)?;
         let file = sealed_memory(bytes as u64)?;
         // SAFETY: the size is sealed, and the other process maps it for reading only.
@@ -80,7 +87,8 @@ impl Outgoing {
         getrandom::fill(&mut mark).map_err(io::Error::other)?;
         map[..MARK].copy_from_slice(&mark);
         let descriptor = u32::try_from(file.as_raw_fd()).map_err(io::Error::other)?;
-        let announcement = Announcement { process: std::process::id(), descriptor, bytes: bytes as u64, mark };
+        let (process, bytes, parts) = (std::process::id(), bytes as u64, parts as u64);
+        let announcement = Announcement { process, descriptor, bytes, parts, mark };
         Ok(Self { map, announcement, _file: file })
     }
 
@@ -88,28 +96,46 @@ impl Outgoing {
         self.announcement
     }
 
-    /// Number of floats that fit.
-    fn capacity(&self) -> usize {
-        (self.map.len() - NUMBERS) / 4
+    /// The numbers for parts and those for sums.
+    fn areas(&mut self) -> (&mut [f32], &mut [f32]) {
+        let parts = usize::try_from(self.announcement.parts).expect("it is in memory");
+        bytemuck::cast_slice_mut(&mut self.map[NUMBERS..]).split_at_mut(parts)
     }
 
-    /// The numbers at these places.
+    fn fits(&mut self, parts: usize, sums: usize) -> bool {
+        let areas = self.areas();
+        areas.0.len() >= parts && areas.1.len() >= sums
+    }
+
+    /// The numbers of parts at these places.
     ///
     /// # Panics
     /// If a place lies outside; the caller chose the size.
-    pub(super) fn numbers(&mut self, places: Range<usize>) -> &mut [f32] {
-        &mut bytemuck::cast_slice_mut(&mut self.map[NUMBERS..])[places]
+    pub(super) fn parts(&mut self, places: Range<usize>) -> &mut [f32] {
+        &mut self.areas().0[places]
+    }
+
+    /// The first `length` numbers of the sum.
+    ///
+    /// # Panics
+    /// If it is longer than the caller chose.
+    pub(super) fn sum(&mut self, length: usize) -> &mut [f32] {
+        &mut self.areas().1[..length]
     }
 }
 
 /// Memory that a peer writes and this member reads.
 #[derive(Debug)]
-pub(super) struct Incoming(Mmap);
+pub(super) struct Incoming {
+    map: Mmap,
+    /// Number of floats for parts.
+    parts: usize,
+}
 
 impl Incoming {
     /// Opens a peer's memory. Fails if this process does not see it.
     pub(super) fn open(announced: &Announcement) -> io::Result<Self> {
-        let Announcement { process, descriptor, bytes, mark } = announced;
+        let Announcement { process, descriptor, bytes, parts, mark } = announced;
         let path = format!("/proc/{process}/fd/{descriptor}");
         let other = || io::Error::from(io::ErrorKind::InvalidData);
         // Opening another kind of file could wait or act.
@@ -124,19 +150,28 @@ impl Incoming {
         if map.len() as u64 != *bytes || map[..MARK] != *mark {
             return Err(other());
         }
-        Ok(Self(map))
+        Ok(Self { map, parts: usize::try_from(*parts).map_err(|_| other())? })
     }
 
-    /// Copies the numbers from place `at` on. Returns false if the memory is shorter.
-    pub(super) fn read(&self, at: usize, out: &mut [f32]) -> bool {
-        let numbers = (self.0.len() - NUMBERS) / 4;
+    /// Copies the numbers of parts from place `at` on. Returns false if the memory is shorter.
+    pub(super) fn read_parts(&self, at: usize, out: &mut [f32]) -> bool {
+        self.read(at, out)
+    }
+
+    /// Copies the sum. Returns false if the memory is shorter.
+    pub(super) fn read_sum(&self, out: &mut [f32]) -> bool {
+        self.read(self.parts, out)
+    }
+
+    fn read(&self, at: usize, out: &mut [f32]) -> bool {
+        let numbers = (self.map.len() - NUMBERS) / 4;
         if at.checked_add(out.len()).is_none_or(|end| end > numbers) {
             return false;
         }
         // SAFETY: the range lies inside, the numbers are aligned, and no reference to them is made that a wrong write
         // of the peer could invalidate. Any bits are a float.
         unsafe {
-            let from = self.0.as_ptr().add(NUMBERS).cast::<f32>().add(at);
+            let from = self.map.as_ptr().add(NUMBERS).cast::<f32>().add(at);
             std::ptr::copy_nonoverlapping(from, out.as_mut_ptr(), out.len());
         }
         true
@@ -155,16 +190,16 @@ pub(super) struct Between {
 }
 
 impl Between {
-    /// Makes memory for `numbers` floats, unless they fit in the announced memory. A stage whose next phase trains a
-    /// larger network thus gets larger memory. After a failure no memory is made again.
-    pub(super) fn announce(&mut self, step: u64, numbers: usize) -> Option<Announcement> {
-        let fits = self.outgoing.as_ref().map(|outgoing| outgoing.capacity() >= numbers);
+    /// Makes memory for so many floats of parts and of sums, unless they fit in the announced memory. A stage whose next
+    /// phase trains a larger network thus gets larger memory. After a failure no memory is made again.
+    pub(super) fn announce(&mut self, step: u64, parts: usize, sums: usize) -> Option<Announcement> {
+        let fits = self.outgoing.as_mut().map(|outgoing| outgoing.fits(parts, sums));
         if fits.unwrap_or(self.announced.is_some()) {
             return None;
         }
         self.announced = Some(step);
         self.is_mapped = false;
-        self.outgoing = Outgoing::new(numbers)
+        self.outgoing = Outgoing::new(parts, sums)
             .inspect_err(|error| tracing::debug!("no memory for a peer; its connection is used: {error}"))
             .ok();
         self.outgoing.as_ref().map(Outgoing::announcement)
@@ -194,9 +229,14 @@ impl Between {
         self.outgoing.as_mut().filter(|_| self.is_mapped)
     }
 
-    /// Copies the peer's numbers from place `at` on. Returns false if there is no such memory.
-    pub(super) fn read(&self, at: usize, out: &mut [f32]) -> bool {
-        self.incoming.as_ref().is_some_and(|incoming| incoming.read(at, out))
+    /// Copies the peer's parts from place `at` on. Returns false if there is no such memory.
+    pub(super) fn read_parts(&self, at: usize, out: &mut [f32]) -> bool {
+        self.incoming.as_ref().is_some_and(|incoming| incoming.read_parts(at, out))
+    }
+
+    /// Copies the peer's sum. Returns false if there is no such memory.
+    pub(super) fn read_sum(&self, out: &mut [f32]) -> bool {
+        self.incoming.as_ref().is_some_and(|incoming| incoming.read_sum(out))
     }
 }
 
@@ -235,23 +275,26 @@ mod tests {
 
     #[test]
     fn numbers_pass_and_nothing_outside_is_read() {
-        let mut own = Outgoing::new(1000).expect("memory");
-        own.numbers(990..1000).copy_from_slice(&[0.5; 10]);
+        let mut own = Outgoing::new(990, 10).expect("memory");
+        own.sum(10).copy_from_slice(&[0.5; 10]);
+        own.parts(0..990).fill(2.0);
         let theirs = Incoming::open(&own.announcement()).expect("the same process");
         let mut out = [0.0; 10];
-        assert!(theirs.read(990, &mut out));
-        assert_eq!(out, [0.5; 10]);
-        assert!(!theirs.read(991, &mut out) && !theirs.read(usize::MAX, &mut out));
+        assert!(theirs.read_sum(&mut out));
+        assert_eq!(out, [0.5; 10], "parts do not touch the sum");
+        assert!(!theirs.read_sum(&mut [0.0; 11]) && !theirs.read_parts(991, &mut out));
+        assert!(!theirs.read_parts(usize::MAX, &mut out));
         drop(own);
-        assert!(theirs.read(990, &mut out), "it stays as long as somebody maps it");
+        assert!(theirs.read_parts(980, &mut out), "it stays as long as somebody maps it");
+        assert_eq!(out, [2.0; 10]);
     }
 
     #[test]
     fn what_is_not_the_announced_memory_is_refused() {
-        let own = Outgoing::new(1000).expect("memory");
+        let own = Outgoing::new(900, 100).expect("memory");
         let right = own.announcement();
         assert_eq!(Announcement::read(&right.to_bytes()), Some(right));
-        let other = Outgoing::new(1000).expect("memory");
+        let other = Outgoing::new(900, 100).expect("memory");
         let wrong = [
             Announcement { mark: [0; MARK], ..right },
             Announcement { bytes: right.bytes - 4, ..right },
@@ -268,7 +311,7 @@ mod tests {
         file.as_file().set_len(bytes).expect("set");
         let descriptor = u32::try_from(file.as_file().as_raw_fd()).expect("a descriptor");
         assert!(Incoming::open(&Announcement { descriptor, mark: [0; MARK], ..right }).is_err());
-        assert!(Outgoing::new(usize::MAX).is_err() && Outgoing::new(MOST_BYTES).is_err());
+        assert!(Outgoing::new(usize::MAX, 1).is_err() && Outgoing::new(MOST_BYTES / 2, MOST_BYTES / 2).is_err());
         assert_eq!(Announcement::read(&right.to_bytes()[1..]), None);
     }
 }

@@ -18,6 +18,7 @@ use protocol::{Generation, WorkerId};
 use tokio::sync::Notify;
 
 use super::frame::{Frame, Head, Kind, MAX_PAYLOAD};
+use super::handover::Successor;
 use super::link::{BLINK, Sign};
 use super::member::{MeshConfig, Phase, Timing};
 use super::memory::Between;
@@ -60,6 +61,8 @@ pub(crate) struct Mesh {
     /// True if gradients pass over connections alone, also on one machine.
     pub(super) uses_no_memory: AtomicBool,
     pub(super) closed: AtomicBool,
+    /// The generation after this one, for the threads that read its connections.
+    pub(super) successor: Arc<Successor>,
 }
 
 impl Mesh {
@@ -152,14 +155,7 @@ impl Mesh {
             return;
         }
         let links: Vec<_> = lock(&self.peers).iter_mut().filter_map(|peer| peer.link.take()).collect();
-        for link in links {
-            if let Ok(mut writer) = link.writer.try_lock() {
-                let head = Head::new(Kind::Bye, next.map_or(0, |g| g.0), 0, 0);
-                // A goodbye is optional: a peer that does not receive it sees the connection close.
-                let _ = writer.send(head, &[], Duration::ZERO, &|| true);
-                let _ = writer.stream.shutdown(Shutdown::Write);
-            }
-        }
+        links.iter().for_each(|link| link.part(next));
     }
 
     pub(super) fn is_closed(&self) -> bool {
@@ -215,6 +211,7 @@ impl Mesh {
         tracing::warn!(%task, %generation, peer = %self.name(rank), "lost a gang member: {reason}");
         self.wake.notify_one();
         self.event_count.notify();
+        self.miss_in_successor(rank);
     }
 
     /// Waits while the queue holds its limit of a state's frames. The rest stays with its sender, who sends nothing
@@ -244,6 +241,7 @@ impl Mesh {
         }
         {
             let peer = &mut lock(&self.peers)[rank];
+            peer.is_unproven = false;
             match frame.kind {
                 Kind::KeepAlive => {
                     peer.phase = Phase::read(frame.a);

@@ -4,6 +4,7 @@ mod connect;
 pub(crate) mod endpoint;
 pub(crate) mod exchange;
 mod frame;
+mod handover;
 pub(crate) mod handshake;
 mod link;
 pub(crate) mod member;

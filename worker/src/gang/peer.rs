@@ -33,6 +33,10 @@ pub(super) struct Peer {
     pub(super) pulse: Pulse,
     pub(super) standing: Standing,
     pub(super) phase: Phase,
+    /// True while the connection of the generation before is expected to continue here.
+    pub(super) inherits: bool,
+    /// True while the link is one of the generation before over which the peer has not sent anything in this one.
+    pub(super) is_unproven: bool,
 }
 
 impl Peer {
@@ -44,6 +48,8 @@ impl Peer {
             pulse: Pulse::new(),
             standing: Standing::Unmet(None),
             phase: Phase::Working,
+            inherits: false,
+            is_unproven: false,
         }
     }
 

@@ -1,6 +1,7 @@
 //! Gangs of threads over loopback, with a minimal coordinator that handles losses as the real one does.
 
 mod eavesdropper;
+mod handover;
 mod relay;
 mod silence;
 mod states;
@@ -12,11 +13,9 @@ use std::sync::{Arc, Mutex};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use burn::tensor::Device;
 use proptest::prelude::*;
-use protocol::message::{Assignment, Grant, LossCause, LostPeer, Member, Role, StageTask};
-use protocol::stage::{CheckpointPolicy, StageSettings, TrainVae};
-use protocol::{Attempt, Fence, Generation, Incarnation, RunId, Seed, StageName, TaskId, WorkerId};
+use protocol::message::{LossCause, LostPeer, Member};
+use protocol::{Generation, Incarnation, TaskId, WorkerId};
 use stages::context::{Adopted, ContextError, Exchange, GangContext, Rendezvous};
 use tokio::runtime::Runtime;
 
@@ -27,10 +26,9 @@ use super::mesh::{Halt, Mesh};
 use super::tree;
 use super::{exchange, rendezvous};
 use crate::active_assignment::ActiveAssignment;
-use crate::cache::{Bounds, Cache};
-use crate::client::Client;
 use crate::context::HttpContext;
 use crate::event_count::{EventCount, lock};
+use crate::testing::{self, assignment, task};
 
 /// Short limits, so that silent peers are found within a test.
 const QUICK: Timing = Timing {
@@ -41,31 +39,6 @@ const QUICK: Timing = Timing {
     slow: Duration::from_secs(60),
     refused: Duration::from_millis(500),
 };
-
-fn task() -> TaskId {
-    TaskId::from("run/vae")
-}
-
-pub(crate) fn assignment(worker: &WorkerId, generation: u64, members: &[Member], secret: &str) -> Assignment {
-    let grant = Grant {
-        task: task(),
-        attempt: Attempt(1),
-        fence: Fence(generation),
-        worker: worker.clone(),
-        incarnation: Incarnation(1),
-    };
-    let stage = StageTask {
-        run: RunId::from("run"),
-        name: StageName::from("vae"),
-        settings: StageSettings::TrainVae(TrainVae::default()),
-        inputs: BTreeMap::new(),
-        seed: Seed(1),
-        checkpoint: CheckpointPolicy::default(),
-    };
-    let role =
-        Role::Member { generation: Generation(generation), members: members.to_vec(), secret: secret.to_owned() };
-    Assignment { grant, secret: "secret".to_owned(), stage, role, resume: None, drain: false }
-}
 
 /// One worker with its address, and its assignment once it is a member.
 #[derive(Debug)]
@@ -102,23 +75,25 @@ impl Gang {
     /// Starts a generation with these seats and ends the assignments of other members.
     fn regroup(&self, seats: &[usize], drain: bool) {
         let generation = self.generation.fetch_add(1, Ordering::SeqCst) + 1;
+        for i in 0..self.seats.len() {
+            if seats.contains(&i) {
+                self.order(i, generation, seats, drain);
+            } else if let Some(held) = lock(&self.seats[i].held).take() {
+                held.end("dropped from the gang");
+            }
+        }
+    }
+
+    /// Tells one seat of a generation.
+    fn order(&self, i: usize, generation: u64, seats: &[usize], drain: bool) {
         let members: Vec<Member> = seats.iter().map(|&i| self.seats[i].member.clone()).collect();
-        for (i, seat) in self.seats.iter().enumerate() {
-            let mut held = lock(&seat.held);
-            if !seats.contains(&i) {
-                if let Some(held) = held.take() {
-                    held.end("dropped from the gang");
-                }
-                continue;
-            }
-            let mut desired = assignment(&seat.member.worker, generation, &members, &format!("secret {generation}"));
-            desired.drain = drain;
-            match &*held {
-                Some(held) => held.update(desired),
-                None => {
-                    *held = Some(ActiveAssignment::new(desired, seat.endpoint.clone(), Arc::default(), Arc::default()));
-                }
-            }
+        let seat = &self.seats[i];
+        let mut desired = assignment(&seat.member.worker, generation, &members, &format!("secret {generation}"));
+        desired.drain = drain;
+        let mut held = lock(&seat.held);
+        match &*held {
+            Some(held) => held.update(desired),
+            None => *held = Some(ActiveAssignment::new(desired, seat.endpoint.clone(), Arc::default(), Arc::default())),
         }
     }
 
@@ -127,11 +102,7 @@ impl Gang {
     }
 
     fn context(&self, seat: usize) -> HttpContext {
-        let held = self.held(seat).expect("a member");
-        // No server listens there; these tests record and upload nothing.
-        let client = Client::new(crate::tests::server_at("http://127.0.0.1:9"), self.runtime.handle().clone());
-        let cache = Arc::new(Cache::new(None, None, Bounds::default()).expect("memory"));
-        HttpContext::new(held, client, cache, Arc::default(), Device::default())
+        testing::context(self.held(seat).expect("a member"), self.runtime.handle().clone())
     }
 
     /// Acts as the coordinator: drops members that another one cannot reach, and takes back suspects that are alive.
@@ -429,7 +400,7 @@ fn mesh(gang: &Gang, seats: &[usize], own: usize, secret: &str) -> (Arc<Mesh>, A
         busy: Busy::default(),
     };
     let event_count: Arc<EventCount> = Arc::default();
-    (Mesh::open(config, &gang.seats[seats[own]].endpoint, event_count.clone(), Arc::default()), event_count)
+    (Mesh::open(config, &gang.seats[seats[own]].endpoint, event_count.clone(), Arc::default(), None), event_count)
 }
 
 fn unreachable(worker: &str) -> LostPeer {

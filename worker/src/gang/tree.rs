@@ -42,9 +42,30 @@ pub(crate) fn cover(slices: usize, range: &Range<usize>) -> Vec<Node> {
     out
 }
 
-/// The slices of rank `rank` of `members`: contiguous, balanced, in order of rank.
+/// The slices of rank `rank` of `members`: contiguous, in order of rank, and no more than an even cut gives to one.
+///
+/// A member sends a partial sum for each node of its share. So the borders lie, within these limits, where large nodes
+/// begin: three members have 6, 4 and 6 of 16 slices, which are six nodes; 5, 5 and 6 are seven.
 pub(crate) fn share(slices: usize, rank: usize, members: usize) -> Range<usize> {
-    slices * rank / members..slices * (rank + 1) / members
+    let most = slices.div_ceil(members);
+    let least = usize::from(slices >= members);
+    let mut own = 0..0;
+    for at in 1..=rank + 1 {
+        let after = members - at;
+        let fits = |end: &usize| {
+            (own.end + least..=own.end + most).contains(end) && (after * least..=after * most).contains(&(slices - end))
+        };
+        let even = slices * at / members;
+        let ends = even..=(slices * at).div_ceil(members);
+        let end = ends.filter(fits).max_by_key(|end| end.trailing_zeros());
+        own = own.end..end.expect("an even cut fits");
+    }
+    own
+}
+
+/// The part of a buffer of `length` numbers that rank `rank` of `members` sums.
+pub(crate) fn chunk(length: usize, rank: usize, members: usize) -> Range<usize> {
+    length * rank / members..length * (rank + 1) / members
 }
 
 /// Sums `known` into `out` along the tree. `known` holds disjoint nodes in order that cover `node`, each with as many
@@ -109,6 +130,15 @@ mod tests {
         assert!(cover(5, &(5..5)).is_empty());
     }
 
+    #[test]
+    fn borders_lie_where_large_nodes_begin() {
+        let lengths =
+            |slices, members| -> Vec<usize> { (0..members).map(|r| share(slices, r, members).len()).collect() };
+        assert_eq!(lengths(16, 3), [6, 4, 6]);
+        assert_eq!(lengths(8, 5), [2, 2, 1, 1, 2]);
+        assert_eq!(lengths(16, 16), [1; 16]);
+    }
+
     proptest! {
         #[test]
         fn any_partition_gives_the_same_bits(
@@ -138,9 +168,24 @@ mod tests {
         }
 
         #[test]
-        fn shares_cover_without_overlap(slices in 0usize..50, members in 1usize..9) {
-            let all: Vec<usize> = (0..members).flat_map(|r| share(slices, r, members)).collect();
-            prop_assert_eq!(all, (0..slices).collect::<Vec<_>>());
+        fn shares_and_chunks_cover_without_overlap(slices in 0usize..70, members in 1usize..20) {
+            for cut in [share, chunk] {
+                let all: Vec<usize> = (0..members).flat_map(|r| cut(slices, r, members)).collect();
+                prop_assert_eq!(all, (0..slices).collect::<Vec<_>>());
+            }
+        }
+
+        #[test]
+        fn shares_are_as_small_as_even_ones_and_of_no_more_nodes(slices in 1usize..70, members in 1usize..20) {
+            let nodes = |cut: fn(usize, usize, usize) -> Range<usize>| -> Vec<usize> {
+                (0..members).map(|r| cover(slices, &cut(slices, r, members)).len()).collect()
+            };
+            let (ours, even) = (nodes(share), nodes(chunk));
+            prop_assert!(ours.iter().sum::<usize>() <= even.iter().sum(), "{:?} for {:?}", ours, even);
+            prop_assert!(ours.iter().max() <= even.iter().max(), "{:?} for {:?}", ours, even);
+            let largest = (0..members).map(|r| share(slices, r, members).len()).max();
+            prop_assert_eq!(largest, Some(slices.div_ceil(members)));
+            prop_assert!(slices < members || (0..members).all(|r| !share(slices, r, members).is_empty()));
         }
     }
 }
