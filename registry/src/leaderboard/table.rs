@@ -114,7 +114,7 @@ fn mean(of: &str, copies: &[Row]) -> Row {
 /// The 97.5 % quantile of Student's distribution; above ten degrees of freedom by the first terms of its expansion.
 fn quantile(degrees: usize) -> f64 {
     const TABLE: [f64; 10] = [12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228];
-    let normal = 1.96;
+    let normal = 1.96_f64;
     match TABLE.get(degrees.saturating_sub(1)) {
         Some(value) => *value,
         None => normal + (normal.powi(3) + normal) / (4.0 * degrees as f64),
