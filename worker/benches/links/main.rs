@@ -11,6 +11,7 @@
 //! Words after `--` choose parts (`exchange`, `regroups`, `cluster`), and settings narrow them:
 //! `-- exchange lines=gigabit,late,slow members=2,4 parameters=250000 python=PATH json=FILE`. A Python with PyTorch adds gloo's
 //! all-reduce of as many numbers, with up to four members.
+#![expect(clippy::print_stdout, reason = "a bench prints what it measured")]
 
 mod cluster;
 mod exchange;

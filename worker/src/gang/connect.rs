@@ -136,6 +136,7 @@ impl Mesh {
             Ok((reader, link)) => (reader, Arc::new(link)),
             Err(error) => return self.lose(rank, LossCause::Unreachable, error.to_string()),
         };
+        let first;
         {
             let mut peers = lock(&self.peers);
             let peer = &mut peers[rank];
@@ -148,9 +149,16 @@ impl Mesh {
                 let _ = old.socket.shutdown(Shutdown::Both);
             }
             peer.is_unproven = false;
+            // The peer repeats its first frame too.
+            peer.inbox.clear();
+            first = peer.first;
             peer.pulse.beat();
             peer.standing = Standing::Up;
             peer.inherits = false;
+        }
+        if let Some(first) = first {
+            // An error becomes visible to the reader.
+            let _ = link.send(first, &[], &self.sign(), self.timing.patience, &|| self.is_closed());
         }
         self.event_count.notify();
         let reading = Reading::new(self, rank, &link);

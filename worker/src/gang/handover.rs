@@ -8,10 +8,12 @@
 //!
 //! The stage hands a connection over when it leaves the old generation. Until then the old one sends keep-alives. A reader
 //! whose peer is ahead waits for its own orders. If the orders of one member skip a generation of the other, or if a
-//! connection ends in between, the higher rank dials anew.
+//! connection ends in between, the higher rank dials anew. Over a connection on which the peer has not yet sent anything,
+//! a member has sent its first frame at most, because it waits for that of the peer. The new connection begins with it.
 
+use std::cmp::Ordering;
 use std::net::Shutdown;
-use std::sync::atomic::Ordering;
+use std::sync::atomic::Ordering::SeqCst;
 use std::sync::{Arc, OnceLock, Weak};
 use std::time::Duration;
 
@@ -29,13 +31,24 @@ use crate::event_count::{EventCount, lock};
 /// Longest time between two looks at the orders.
 const LOOK: Duration = Duration::from_millis(250);
 
-/// The mesh of the next generation, once its orders have come.
+/// The next generation of a mesh, once its orders have come.
 #[derive(Debug, Default)]
-pub(super) struct Successor(OnceLock<Weak<Mesh>>);
+pub(super) struct Successor(OnceLock<Next>);
+
+#[derive(Debug)]
+struct Next {
+    generation: Generation,
+    mesh: Weak<Mesh>,
+    /// Outlives the mesh, so that the generations after it are found.
+    successor: Arc<Successor>,
+}
 
 impl Successor {
-    fn get(&self) -> Option<Arc<Mesh>> {
-        self.0.get()?.upgrade()
+    /// The meshes of all later generations that are still open.
+    fn all(&self) -> Vec<Arc<Mesh>> {
+        std::iter::successors(self.0.get(), |next| next.successor.0.get())
+            .filter_map(|next| next.mesh.upgrade())
+            .collect()
     }
 }
 
@@ -57,7 +70,9 @@ impl Mesh {
                 }
             }
         }
-        let _ = before.successor.0.set(Arc::downgrade(self));
+        let generation = self.config.generation;
+        let next = Next { generation, mesh: Arc::downgrade(self), successor: self.successor.clone() };
+        let _ = before.successor.0.set(next);
     }
 
     fn rank_of(&self, member: &Member) -> Option<usize> {
@@ -67,7 +82,7 @@ impl Mesh {
 
     /// Leaves this generation for `next`. Connections to members of both continue there; the others are closed.
     pub(crate) fn hand_over(&self, next: &Arc<Self>) {
-        if self.closed.swap(true, Ordering::SeqCst) {
+        if self.closed.swap(true, SeqCst) {
             return;
         }
         let links: Vec<_> = lock(&self.peers).iter_mut().map(|peer| peer.link.take()).collect();
@@ -122,12 +137,32 @@ impl Mesh {
         }
     }
 
+    /// Returns true if the frame that could not be sent over `link` is sent again over another connection: the link was
+    /// replaced, or is given up before its peer came to this generation.
+    pub(super) fn sends_again(&self, rank: usize, link: &Arc<Link>) -> bool {
+        let peer = &mut lock(&self.peers)[rank];
+        match &peer.link {
+            Some(own) if !Arc::ptr_eq(own, link) => true,
+            Some(_) if peer.is_unproven && peer.standing == Standing::Up => {
+                // Its reader notices the end, and then the higher rank dials.
+                let _ = link.socket.shutdown(Shutdown::Both);
+                peer.link = None;
+                peer.standing = Standing::Unmet(None);
+                peer.is_unproven = false;
+                peer.inherits = true;
+                true
+            }
+            Some(_) => false,
+            None => matches!(peer.standing, Standing::Unmet(_)),
+        }
+    }
+
     /// Tells the next generation that the connection to `rank` does not continue.
     pub(super) fn miss_in_successor(&self, rank: usize) {
-        if let Some(next) = self.successor.get()
-            && let Some(to) = next.rank_of(&self.config.members[rank])
-        {
-            next.miss(to);
+        for next in self.successor.all() {
+            if let Some(to) = next.rank_of(&self.config.members[rank]) {
+                next.miss(to);
+            }
         }
     }
 
@@ -193,14 +228,13 @@ impl Reading {
     /// Passes a frame to its generation. Its activity is news for the next one too.
     pub(super) fn receive(&mut self, frame: Frame) {
         self.is_new = false;
-        if frame.kind == Kind::KeepAlive
-            && let Some(next) = self.successor.get()
-            && let Some(rank) = next.rank_of(&self.member)
-        {
-            next.receive(rank, frame.clone());
+        for next in self.successor.all().iter().filter(|_| frame.kind == Kind::KeepAlive) {
+            if let Some(rank) = next.rank_of(&self.member) {
+                next.set_phase(rank, &frame);
+            }
         }
         if let Some(mesh) = self.mesh.upgrade() {
-            mesh.receive(self.rank, frame);
+            mesh.receive(self.rank, frame, &self.link);
         }
     }
 
@@ -210,10 +244,13 @@ impl Reading {
         let next = loop {
             let ticket = self.event_count.ticket();
             let is_over = mesh.upgrade().is_none_or(|mesh| mesh.is_closed());
-            match successor.get() {
-                Some(next) if next.config.generation == wanted => break next,
-                Some(next) if next.config.generation > wanted => return Follow::Skipped,
-                Some(next) => (mesh, successor) = (Arc::downgrade(&next), next.successor.clone()),
+            match successor.0.get().map(|next| (next.generation.cmp(&wanted), next)) {
+                Some((Ordering::Less, next)) => (mesh, successor) = (next.mesh.clone(), next.successor.clone()),
+                Some((Ordering::Equal, next)) => match next.mesh.upgrade() {
+                    Some(next) => break next,
+                    None => return Follow::Skipped,
+                },
+                Some((Ordering::Greater, _)) => return Follow::Skipped,
                 None if is_over => return Follow::Nowhere,
                 None => self.event_count.wait(ticket, LOOK),
             }
@@ -227,12 +264,10 @@ impl Reading {
 
     /// Reports the end of the connection to each generation that uses it.
     pub(super) fn end(&self, reason: &str) {
-        let mut next = self.successor.get();
-        while let Some(mesh) = next {
-            if let Some(rank) = mesh.rank_of(&self.member) {
-                mesh.disinherit(rank, &self.link, reason);
+        for next in self.successor.all() {
+            if let Some(rank) = next.rank_of(&self.member) {
+                next.disinherit(rank, &self.link, reason);
             }
-            next = mesh.successor.get();
         }
         let Some(mesh) = self.mesh.upgrade() else { return };
         let has_it = mesh.has(self.rank, &self.link);

@@ -10,7 +10,7 @@
 
 use std::net::Shutdown;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard};
+use std::sync::{Arc, Mutex, MutexGuard, Weak};
 use std::time::{Duration, Instant};
 
 use protocol::message::{LossCause, LostPeer};
@@ -19,7 +19,7 @@ use tokio::sync::Notify;
 
 use super::frame::{Frame, Head, Kind, MAX_PAYLOAD};
 use super::handover::Successor;
-use super::link::{BLINK, Sign};
+use super::link::{BLINK, Link, Sign};
 use super::member::{MeshConfig, Phase, Timing};
 use super::memory::Between;
 use super::pace::Pace;
@@ -231,8 +231,13 @@ impl Mesh {
         }
     }
 
+    /// Notes a peer's activity of a keep-alive.
+    pub(super) fn set_phase(&self, rank: usize, keep_alive: &Frame) {
+        lock(&self.peers)[rank].phase = Phase::read(keep_alive.a);
+    }
+
     /// Handles a received frame; frames of the exchange are queued.
-    pub(super) fn receive(&self, rank: usize, frame: Frame) {
+    pub(super) fn receive(&self, rank: usize, frame: Frame, link: &Weak<Link>) {
         if frame.kind == Kind::State {
             self.await_room(rank);
         }
@@ -241,6 +246,10 @@ impl Mesh {
         }
         {
             let peer = &mut lock(&self.peers)[rank];
+            if peer.link.as_ref().is_some_and(|own| !std::ptr::eq(Arc::as_ptr(own), link.as_ptr())) {
+                // Of a connection that another one has replaced.
+                return;
+            }
             peer.is_unproven = false;
             match frame.kind {
                 Kind::KeepAlive => {
@@ -279,14 +288,22 @@ impl Mesh {
         payload: &[u8],
         interrupt: &dyn Fn() -> Option<Halt>,
     ) -> Result<(), Halt> {
-        let link = self.wait(rank, barrier, interrupt, |peer| peer.link.clone())?;
-        link.send(head, payload, &self.sign(), self.timing.patience, &|| interrupt().is_some()).map_err(|error| {
-            if let Some(halt) = interrupt() {
-                return halt;
-            }
-            self.lose(rank, LossCause::Unreachable, format!("{barrier}: sending failed: {error}"));
-            Halt::Peer
-        })
+        let link = self.wait(rank, barrier, interrupt, |peer| {
+            let link = peer.link.clone()?;
+            // Nothing else is sent before the peer has come to this generation.
+            peer.first = peer.first.or((head.kind == Kind::Applied).then_some(head));
+            Some(link)
+        })?;
+        let sent = link.send(head, payload, &self.sign(), self.timing.patience, &|| interrupt().is_some());
+        let Err(error) = sent else { return Ok(()) };
+        if let Some(halt) = interrupt() {
+            return Err(halt);
+        }
+        if head.kind == Kind::Applied && self.sends_again(rank, &link) {
+            return Ok(());
+        }
+        self.lose(rank, LossCause::Unreachable, format!("{barrier}: sending failed: {error}"));
+        Err(Halt::Peer)
     }
 
     /// Returns the next frame from `rank`. Frames that arrived before a connection ended are still returned.

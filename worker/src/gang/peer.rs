@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 
 use protocol::message::LossCause;
 
-use super::frame::Frame;
+use super::frame::{Frame, Head};
 use super::link::{Link, Pulse};
 use super::member::{Phase, Timing};
 
@@ -37,6 +37,8 @@ pub(super) struct Peer {
     pub(super) inherits: bool,
     /// True while the link is one of the generation before over which the peer has not sent anything in this one.
     pub(super) is_unproven: bool,
+    /// The frame that was sent first in this generation. A connection that replaces an inherited one begins with it.
+    pub(super) first: Option<Head>,
 }
 
 impl Peer {
@@ -50,6 +52,7 @@ impl Peer {
             phase: Phase::Working,
             inherits: false,
             is_unproven: false,
+            first: None,
         }
     }
 

@@ -64,28 +64,34 @@ fn members_of_two_generations_keep_their_connection_and_others_do_not() {
     no_losses(&gang, &[0, 1, 2]);
 }
 
-/// A member that polls late may never learn of a generation in which the other one waits for it.
+/// A member that polls late may never learn of a generation in which the other one waits for it. The other one learns of
+/// the next generation after it, or before it and so continues a connection that the late one does not.
 #[test]
 fn a_member_whose_orders_skip_a_generation_meets_by_a_new_connection() {
-    for late in [0, 1] {
+    for (late, is_first) in [(0, true), (1, true), (0, false), (1, false)] {
         let gang = Gang::new(2, QUICK);
         gang.regroup(&[0, 1], false);
         let mut contexts: Vec<HttpContext> = (0..2).map(|i| gang.context(i)).collect();
         meet(&mut contexts, &[0, 1]);
         let before = ends(&gang, 0, 1);
         let early = 1 - late;
-        gang.order(early, 2, &[0, 1], false);
+        let waits = || gang.held(early).expect("a member").doing().waits_for.is_some();
         let begun = Instant::now();
+        gang.order(early, 2, &[0, 1], false);
         thread::scope(|scope| {
-            for context in &mut contexts {
-                scope.spawn(|| assert!(matches!(context.rendezvous(Some(3), &[]), Ok(Rendezvous::Keep))));
+            let (first, second) = contexts.split_at_mut(1);
+            let (early_stage, late_stage) =
+                if early == 0 { (&mut first[0], &mut second[0]) } else { (&mut second[0], &mut first[0]) };
+            let meets = |context: &mut HttpContext| {
+                assert!(matches!(context.rendezvous(Some(3), &[]), Ok(Rendezvous::Keep)));
+            };
+            scope.spawn(move || meets(early_stage));
+            wait_until("it waits in the generation that the other skips", waits);
+            for seat in if is_first { [late, early] } else { [early, late] } {
+                gang.order(seat, 3, &[0, 1], false);
+                thread::sleep(Duration::from_millis(100));
             }
-            wait_until("it waits in the generation that the other skips", || {
-                gang.held(early).expect("a member").doing().waits_for.is_some()
-            });
-            gang.order(late, 3, &[0, 1], false);
-            thread::sleep(Duration::from_millis(50));
-            gang.order(early, 3, &[0, 1], false);
+            scope.spawn(move || meets(late_stage));
         });
         assert!(begun.elapsed() < QUICK.patience, "met after {:.1?}", begun.elapsed());
         assert_ne!(ends(&gang, 0, 1), before);
