@@ -30,7 +30,7 @@ impl Line {
     }
 }
 
-/// What has passed a line in one direction.
+/// Traffic over a line in one direction.
 #[derive(Debug, Clone, Copy)]
 pub struct Sent {
     /// With all headers of each packet.
@@ -144,7 +144,7 @@ impl Network {
         Ipv4Addr::new(10, 77, id, own)
     }
 
-    /// What host `i` has sent by its line. Needs [`with_lines`](Self::with_lines).
+    /// The traffic that host `i` has sent by its line. Needs [`with_lines`](Self::with_lines).
     pub fn sent(&self, i: usize) -> Sent {
         let space = self.space(i);
         let arguments = ["-n", &space, "-s", "-j", "qdisc", "show", "dev", "eth0"];

@@ -11,7 +11,7 @@ use std::time::Duration;
 
 use burn::tensor::Device;
 use protocol::message::{Assignment, Grant, LossCause, Member, Role, StageTask};
-use protocol::stage::{CheckpointPolicy, StageSettings, TrainVae};
+use protocol::stage::{CheckpointPolicy, StageSettings};
 use protocol::{Attempt, Fence, Generation, Incarnation, RunId, Seed, StageName, TaskId, WorkerId};
 use stages::context::GangContext;
 use tokio::runtime::{Handle, Runtime};
@@ -41,7 +41,8 @@ pub(crate) fn assignment(worker: &WorkerId, generation: u64, members: &[Member],
     let stage = StageTask {
         run: RunId::from("run"),
         name: StageName::from("vae"),
-        settings: StageSettings::TrainVae(TrainVae::default()),
+        // The caller is the stage and needs no settings of a kind.
+        settings: StageSettings::all().swap_remove(0),
         inputs: BTreeMap::new(),
         seed: Seed(1),
         checkpoint: CheckpointPolicy::default(),

@@ -1,5 +1,6 @@
-//! Gangs on lines of a chosen bandwidth and latency: the time of a step beside the formula of the book, the bytes that
-//! members send, the bits of the sums, and the pause when a member joins, leaves or dies.
+//! Gangs on lines of a chosen bandwidth and latency. The bench prints the time of a step beside the formula of the book,
+//! and the bytes that members send. It compares the bits of the sums, and times the pause when a member joins, leaves or
+//! dies.
 //!
 //! `cargo bench -p worker --bench links`, as root. Each member is a process in a network namespace of its own. Lines are
 //! shaped by `tbf` in both directions. A cable in user space delays them (`cluster_tests::cable`), below TCP, because a

@@ -1,11 +1,9 @@
-//! A member's process: orders come as lines by its standard input, and what happened goes out as lines.
+//! A member's process. Orders come as lines by its standard input, and answers go out as lines.
 //!
-//! | line in | |
-//! |---|---|
-//! | `gang GENERATION NAME=ADDRESS...` | the members of the next generation |
-//! | `run N` | make N exchanges; then `done MICROSECONDS,... DIGEST` of the last sum |
-//! | `go` | exchange for ever, with a line `step MICROSECONDS GENERATION` for each, since 1970 |
-//! | `end` | leave the gang |
+//! - `gang GENERATION NAME=ADDRESS...` names the members of the next generation.
+//! - `run N` asks for N exchanges. The answer is `done MICROSECONDS,... DIGEST` of the last sum.
+//! - `go` asks for exchanges without end. Each one gives a line `step MICROSECONDS GENERATION`, since 1970.
+//! - `end` takes the orders back.
 
 use std::collections::BTreeMap;
 use std::io::{BufRead as _, Write as _};

@@ -1,8 +1,8 @@
 //! Connections that outlive a generation.
 //!
 //! Two members of a generation that are both members of the next one keep their connection. So a regroup costs no
-//! handshake, and TCP keeps the rate that it has learned. Each direction changes by itself: the goodbye of a generation is
-//! the last frame under its key, and the next frame is under the key of the generation that the goodbye names. That key
+//! handshake, and TCP keeps the rate that it has learned. Each direction changes by itself. The goodbye of a generation is
+//! the last frame under its key. The next frame is under the key of the generation that the goodbye names. That key
 //! comes from the new generation's secret ([`Opening::renewed`](super::handshake::Opening::renewed)). A member that was
 //! removed does not have it.
 //!
@@ -14,7 +14,7 @@
 use std::cmp::Ordering;
 use std::net::Shutdown;
 use std::sync::atomic::Ordering::SeqCst;
-use std::sync::{Arc, OnceLock, Weak};
+use std::sync::{Arc, Weak};
 use std::time::Duration;
 
 use protocol::Generation;
@@ -26,31 +26,11 @@ use super::member::MeshConfig;
 use super::mesh::Mesh;
 use super::peer::Standing;
 use super::seal::Seal;
+use super::successor::{Next, Successor};
 use crate::event_count::{EventCount, lock};
 
 /// Longest time between two looks at the orders.
 const LOOK: Duration = Duration::from_millis(250);
-
-/// The next generation of a mesh, once its orders have come.
-#[derive(Debug, Default)]
-pub(super) struct Successor(OnceLock<Next>);
-
-#[derive(Debug)]
-struct Next {
-    generation: Generation,
-    mesh: Weak<Mesh>,
-    /// Outlives the mesh, so that the generations after it are found.
-    successor: Arc<Successor>,
-}
-
-impl Successor {
-    /// The meshes of all later generations that are still open.
-    fn all(&self) -> Vec<Arc<Mesh>> {
-        std::iter::successors(self.0.get(), |next| next.successor.0.get())
-            .filter_map(|next| next.mesh.upgrade())
-            .collect()
-    }
-}
 
 impl Mesh {
     /// Makes this the generation after `before`, whose connections to members of both are expected to continue here.
@@ -71,8 +51,7 @@ impl Mesh {
             }
         }
         let generation = self.config.generation;
-        let next = Next { generation, mesh: Arc::downgrade(self), successor: self.successor.clone() };
-        let _ = before.successor.0.set(next);
+        before.successor.set(Next { generation, mesh: Arc::downgrade(self), successor: self.successor.clone() });
     }
 
     fn rank_of(&self, member: &Member) -> Option<usize> {
@@ -191,7 +170,7 @@ impl Mesh {
 pub(super) struct Reading {
     /// Threads that outlive their mesh's owner hold it weakly.
     mesh: Weak<Mesh>,
-    successor: Arc<Successor>,
+    successor: Arc<Successor<Mesh>>,
     event_count: Arc<EventCount>,
     rank: usize,
     member: Member,
@@ -244,7 +223,7 @@ impl Reading {
         let next = loop {
             let ticket = self.event_count.ticket();
             let is_over = mesh.upgrade().is_none_or(|mesh| mesh.is_closed());
-            match successor.0.get().map(|next| (next.generation.cmp(&wanted), next)) {
+            match successor.get().map(|next| (next.generation.cmp(&wanted), next)) {
                 Some((Ordering::Less, next)) => (mesh, successor) = (next.mesh.clone(), next.successor.clone()),
                 Some((Ordering::Equal, next)) => match next.mesh.upgrade() {
                     Some(next) => break next,

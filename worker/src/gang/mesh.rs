@@ -18,12 +18,12 @@ use protocol::{Generation, WorkerId};
 use tokio::sync::Notify;
 
 use super::frame::{Frame, Head, Kind, MAX_PAYLOAD};
-use super::handover::Successor;
 use super::link::{BLINK, Link, Sign};
 use super::member::{MeshConfig, Phase, Timing};
 use super::memory::Between;
 use super::pace::Pace;
 use super::peer::{Patience, Peer, Standing, Verdict};
+use super::successor::Successor;
 use crate::event_count::{EventCount, lock};
 
 /// Limit of queued frames of a state, for a member that reads slower than they arrive: 16 MiB.
@@ -62,7 +62,7 @@ pub(crate) struct Mesh {
     pub(super) uses_no_memory: AtomicBool,
     pub(super) closed: AtomicBool,
     /// The generation after this one, for the threads that read its connections.
-    pub(super) successor: Arc<Successor>,
+    pub(super) successor: Arc<Successor<Self>>,
 }
 
 impl Mesh {

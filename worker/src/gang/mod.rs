@@ -14,6 +14,7 @@ mod pace;
 mod peer;
 pub(crate) mod rendezvous;
 mod seal;
+mod successor;
 pub(crate) mod tree;
 
 #[cfg(test)]
