@@ -241,6 +241,8 @@ class StageView(Answer):
 
     attempt: int
     """Number of the current attempt."""
+    copy_of: str | None = None
+    """The stage of the pipeline's file that it is a copy of, if the file wants several by `seeds` or folds."""
     instruction_set: str | None = None
     """Instruction set of the workers that computed it, or compute it now; not part of any key."""
     key: str | None = None
