@@ -6,6 +6,8 @@
 //! Compared values are measured alternately within one run and by medians, so that other load on the machine affects
 //! both equally.
 
+mod common;
+
 use std::io::{BufRead as _, BufReader, Read as _, Write as _};
 use std::net::TcpStream;
 use std::path::Path;
