@@ -115,7 +115,7 @@ pub fn real_skating(truth: &[f32], mean: &[f32], std: &[f32], skeleton: &Skeleto
     skates(recover_joints_wide(&natural(truth, mean, std), skeleton), skeleton)
 }
 
-/// Share of the jerks of the original clip, rows `[L, D]` of normalised features, that are below [`STILL`]. There sJPE
+/// Share of the jerks of the original clip, rows `[L, D]` of normalised features, that are below one m/s^3. There sJPE
 /// counts any shaking almost whole, however small it is.
 pub fn real_still(truth: &[f32], mean: &[f32], std: &[f32], skeleton: &Skeleton) -> Option<f64> {
     let jerks = jerks(&recover_joints_wide(&natural(truth, mean, std), skeleton), skeleton);
