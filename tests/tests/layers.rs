@@ -200,6 +200,8 @@ const ALSO_IN: [(&str, &[&str]); 6] = [
         ],
     ),
     ("ImportModel", &["pipeline/src/reference.rs"]),
+    // One such stage means a stage for each fold, and its splits are those of another dataset.
+    ("DataFold", &["pipeline/src/check.rs", "pipeline/src/copies.rs", "local/cost.rs"]),
     // `POST /v1/draws` is a run of it.
     ("DrawMotions", &["shell/draws.rs"]),
 ];

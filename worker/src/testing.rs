@@ -112,7 +112,7 @@ impl Seat {
         Some(Context(context(held, self.runtime.handle().clone())))
     }
 
-    /// Waits for a report of lost members for at most `at_most`. Returns the names of those that are not reached.
+    /// Waits for a report of lost members for at most `at_most`. Returns the names of the unreachable ones.
     pub fn lost(&self, at_most: Duration) -> Vec<String> {
         self.runtime.block_on(async {
             // A report without a new loss and the end of the time are the same to the caller.

@@ -17,10 +17,10 @@ use protocol::stage::DataFormat;
 use serde::{Deserialize, Serialize};
 
 pub use entries::Unusable;
-pub use folds::{Fold, FoldError};
+pub use folds::{DivideError, Divided, Fold, FoldError};
 pub(crate) use open::MANY_PROBLEMS;
 pub use open::{OpenError, OpenReport, Problem, ProblemKind, Skip, SkipReason, is_clip_id};
-pub use pack::{DivideError, Divided, INDEX, PackError};
+pub use pack::{INDEX, PackError};
 pub use statistics::statistics;
 
 use crate::Floats;

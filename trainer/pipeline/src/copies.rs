@@ -170,7 +170,7 @@ fn counts(stages: &[PipelineStage], written: &Counts, pins: &Pins) -> Result<Cou
     Ok(counts)
 }
 
-/// The settings of a stage that stands for all folds.
+/// The settings of a stage that means all folds.
 fn every_fold(settings: &StageSettings) -> Option<&DataFold> {
     settings.get::<DataFold>().filter(|fold| fold.fold == 0)
 }
@@ -228,7 +228,7 @@ fn collected(register: &Register, counts: &Counts) -> Result<Register, Problem> 
     Ok(Register { from: register.from.iter().flat_map(every).collect(), ..register.clone() })
 }
 
-/// Makes the references of a stage name copies: those that it pins, and otherwise those with its own number.
+/// Makes the references of a stage name copies: the pinned ones, and otherwise the copies with its own number.
 fn refer(stage: &mut PipelineStage, number: Option<usize>, counts: &Counts, pins: &Pins) {
     each_reference(stage, |of, field, name| {
         let pinned = pins.get(&(of.clone(), field)).copied();

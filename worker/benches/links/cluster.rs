@@ -80,7 +80,7 @@ fn rows(trainer: &str, line: &'static str, of: Line, members: usize) -> Result<[
         let before: Vec<usize> = stay.iter().map(|who| meetings(&cluster, *who, members)).collect();
         cluster.join_by(&name(*last), &network.inside(*last), &[]);
         await_meeting(&cluster, stay, members, &before)?;
-        // Long enough for steps, and for what the coordinator does after a meeting.
+        // Long enough for steps and for the coordinator's work after a meeting.
         std::thread::sleep(Duration::from_secs(2));
         let before: Vec<usize> = stay.iter().map(|who| meetings(&cluster, *who, stay.len())).collect();
         let begun = Instant::now();

@@ -5,8 +5,8 @@ use std::collections::BTreeMap;
 use protocol::Seed;
 use protocol::stage::DataFormat;
 
-use super::pack::Index;
-use super::{Entry, Split};
+use super::pack::{INDEX, Index, PackError};
+use super::{Dataset, Entry, Split};
 use crate::random::Stream;
 
 /// A dataset that cannot be divided so often.
@@ -30,9 +30,45 @@ pub struct Fold<'a> {
     pub fold: usize,
 }
 
+/// The index of a dataset with other splits.
+#[derive(Debug)]
+pub struct Divided {
+    /// Content of [`INDEX`].
+    pub index: Vec<u8>,
+    /// Number of entries of train, validation and test.
+    pub counts: [usize; 3],
+}
+
+/// A dataset that cannot be divided into folds.
+#[derive(Debug, thiserror::Error)]
+pub enum DivideError {
+    #[error(transparent)]
+    Pack(#[from] PackError),
+    #[error(transparent)]
+    Fold(#[from] FoldError),
+}
+
+impl Dataset {
+    /// Divides the dataset with this index into folds, without a clip.
+    ///
+    /// # Errors
+    /// If the index does not read, has an entry of a clip that it does not list, or has too few recordings.
+    pub fn divided(index: &[u8], fold: &Fold<'_>) -> Result<Divided, DivideError> {
+        let bad = |what: String| PackError::Content { file: INDEX.into(), what };
+        let mut index: Index = serde_json::from_slice(index).map_err(|e| bad(e.to_string()))?;
+        if let Some(entry) = index.entries.iter().find(|entry| entry.clip >= index.clips.len()) {
+            return Err(bad(format!("entry {} is of clip {}, which is not listed", entry.id, entry.clip)).into());
+        }
+        index.divide(fold)?;
+        let counts = Split::ALL.map(|split| index.entries.iter().filter(|entry| entry.split == split).count());
+        let index = serde_json::to_vec(&index).map_err(|e| bad(e.to_string()))?;
+        Ok(Divided { index, counts })
+    }
+}
+
 impl Index {
     /// Moves the entries of a fold to the validation split and all others of train and validation to the train split.
-    pub(super) fn divide(&mut self, fold: &Fold<'_>) -> Result<(), FoldError> {
+    fn divide(&mut self, fold: &Fold<'_>) -> Result<(), FoldError> {
         let mut sizes: BTreeMap<String, usize> = BTreeMap::new();
         let is_divided = |entry: &&Entry| entry.split != Split::Test;
         for entry in self.entries.iter().filter(is_divided) {

@@ -13,7 +13,7 @@ use protocol::stage::DataFormat;
 use safetensors::tensor::{Dtype, SafeTensors, View};
 use serde::{Deserialize, Serialize};
 
-use super::{Clip, Dataset, Entry, Fold, FoldError};
+use super::{Clip, Dataset, Entry};
 use crate::Floats;
 use crate::skeleton::Skeleton;
 use crate::text::Caption;
@@ -71,24 +71,6 @@ pub(super) struct ClipRow {
     pub(super) id: String,
     pub(super) frames: usize,
     pub(super) shard: usize,
-}
-
-/// The index of a dataset with other splits.
-#[derive(Debug)]
-pub struct Divided {
-    /// Content of [`INDEX`].
-    pub index: Vec<u8>,
-    /// Number of entries of train, validation and test.
-    pub counts: [usize; 3],
-}
-
-/// A dataset that cannot be divided into folds.
-#[derive(Debug, thiserror::Error)]
-pub enum DivideError {
-    #[error(transparent)]
-    Pack(#[from] PackError),
-    #[error(transparent)]
-    Fold(#[from] FoldError),
 }
 
 struct Rows<'a> {
@@ -175,22 +157,6 @@ impl Dataset {
             Ok(())
         })?;
         Ok(files)
-    }
-
-    /// Divides the dataset with this index into folds, without a clip.
-    ///
-    /// # Errors
-    /// If the index does not read, has an entry of a clip that it does not list, or has too few recordings.
-    pub fn divided(index: &[u8], fold: &Fold<'_>) -> Result<Divided, DivideError> {
-        let bad = |what: String| PackError::Content { file: INDEX.into(), what };
-        let mut index: Index = serde_json::from_slice(index).map_err(|e| bad(e.to_string()))?;
-        if let Some(entry) = index.entries.iter().find(|entry| entry.clip >= index.clips.len()) {
-            return Err(bad(format!("entry {} is of clip {}, which is not listed", entry.id, entry.clip)).into());
-        }
-        index.divide(fold)?;
-        let counts = super::Split::ALL.map(|split| index.entries.iter().filter(|entry| entry.split == split).count());
-        let index = serde_json::to_vec(&index).map_err(|e| bad(e.to_string()))?;
-        Ok(Divided { index, counts })
     }
 
     /// Reads only the captions, without fetching a clip.
