@@ -170,7 +170,7 @@ fn no_folders_import_each_other_in_a_loop() {
 
 /// Settings types that are also data for other code: datasets, encoders by their folders, parts of an import. Each with
 /// the places that read them.
-const ALSO_IN: [(&str, &[&str]); 6] = [
+const ALSO_IN: [(&str, &[&str]); 7] = [
     (
         "DataSynthetic",
         &[
