@@ -74,13 +74,13 @@ pub fn evaluations(title: &str, all: &[Evaluation]) -> Option<Leaderboard> {
         shown.then(|| Row { source: label.clone(), label, published: false, measures })
     };
     let mut rows = Vec::new();
-    let mut told: BTreeSet<&str> = BTreeSet::new();
+    let mut shown: BTreeSet<&str> = BTreeSet::new();
     for evaluation in all {
         let Some(of) = &evaluation.copy_of else {
             rows.extend(row(evaluation));
             continue;
         };
-        if !told.insert(of) {
+        if !shown.insert(of) {
             continue;
         }
         let copies: Vec<Row> = all.iter().filter(|other| other.copy_of.as_ref() == Some(of)).filter_map(row).collect();

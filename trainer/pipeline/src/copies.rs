@@ -33,9 +33,13 @@ pub(crate) type Pins = BTreeMap<(StageName, String), usize>;
 /// A problem of a stage.
 type Refused = (StageName, Problem);
 
-/// Replaces references to one copy by references to the stage, and returns the numbers. `names` are all stages.
-pub(crate) fn pin(stages: &mut [PipelineStage], names: &BTreeSet<StageName>) -> Pins {
+/// Replaces references to one copy by references to the stage, and returns the numbers. `names` are all stages, `written`
+/// has the numbers that stages are given. Without a copied stage it changes nothing.
+pub(crate) fn pin(stages: &mut [PipelineStage], names: &BTreeSet<StageName>, written: &Counts) -> Pins {
     let mut pins = Pins::new();
+    if written.is_empty() && stages.iter().all(|stage| every_fold(&stage.settings).is_none()) {
+        return pins;
+    }
     for stage in stages {
         each_reference(stage, |of, field, name| {
             let (base, best) = name.split_once('@').map_or((&**name, None), |(base, best)| (base, Some(best)));

@@ -133,7 +133,7 @@ stages:
 }
 
 #[test]
-fn mistakes_are_told_at_their_place() {
+fn mistakes_are_reported_at_their_place() {
     // The text replaced, the replacement, the place, a part of the message.
     let cases = [
         ("seeds: 3", "seeds: 0", "4:33", "`seeds` of stage `vae` is the number `0`; expected a whole number, 1 to 100"),
@@ -193,6 +193,10 @@ stages:
         );
     }
     read.check().unwrap();
+    // A stage may read the copy of one fold.
+    let first =
+        pipeline(&format!("{text}  error: {{kind: evaluate.reconstruction, vae: vae_1, dataset: dataset_1}}\n"));
+    assert_eq!(first.named(&StageName::new("error")).count(), 1);
     // One fold alone is one stage.
     let one = pipeline(&text.replace("folds: 3", "folds: 3, fold: 2"));
     assert_eq!(names(&one), ["recordings", "dataset", "evaluator", "vae"]);

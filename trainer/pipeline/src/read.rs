@@ -152,7 +152,7 @@ impl Reader {
         let head = self.head(&root);
         let Found { written, mut stages, seeds } = self.stages(&root);
         let names = written.iter().map(|written| written.name.clone()).collect();
-        let pins = if seeds.is_empty() { copies::Pins::new() } else { copies::pin(&mut stages, &names) };
+        let pins = copies::pin(&mut stages, &names, &seeds);
         let stages = self.connect(&root, &written, stages);
         let stages = self.copy(&written, stages, &seeds, &pins);
         let head = head?;

@@ -1,10 +1,11 @@
 //! `data.features` on a folder of our own recordings.
 
+use std::collections::BTreeSet;
 use std::fs;
 
 use motion::dataset::Split;
 use protocol::Seed;
-use protocol::stage::{DataFeatures, DataFormat, Splits, StageSettings, UpAxis};
+use protocol::stage::{DataFeatures, DataFold, DataFormat, Splits, StageSettings, UpAxis};
 use stage_lab::Bench;
 use stages::artifacts;
 use stages::context::StageError;
@@ -47,6 +48,46 @@ fn a_folder_becomes_the_same_dataset_however_it_is_cut() {
     assert!(text("contact-sheet.png").starts_with(b"\x89PNG"));
     let std = motion::npy::parse(std::path::Path::new("std"), &text("evaluator-std.npy"), false).unwrap();
     assert!((std.data[0] * 25.0 / dataset.std[0] - 1.0).abs() < 1e-6 && std.data[4] == dataset.std[4]);
+}
+
+#[test]
+fn folds_hold_out_each_recording_once_and_share_the_clips() {
+    let folder = tempfile::tempdir().unwrap();
+    mocap::sample::write_bvh_folder(folder.path(), 10, Seed(3)).unwrap();
+    let mut bench = bench();
+    let whole = bench.run("recordings", &StageSettings::DataFeatures(settings(folder.path())), &[]);
+    let whole = whole.unwrap_or_else(|e| panic!("{e}")).output();
+    let blobs = bench.blobs();
+    let of = |bench: &Bench, digest, split: Split| {
+        let dataset = artifacts::dataset(&*blobs, &bench.manifest(digest).unwrap()).unwrap();
+        let entries = dataset.entries.iter().filter(|entry| entry.split == split);
+        entries.map(|entry| entry.id.clone()).collect::<BTreeSet<_>>()
+    };
+    let test = of(&bench, whole, Split::Test);
+    let mut held: Vec<String> = Vec::new();
+    for fold in 1..=4 {
+        let settings = StageSettings::DataFold(DataFold { folds: 4, fold, ..DataFold::default() });
+        let divided = bench.run(&format!("dataset_{fold}"), &settings, &[("dataset", whole)]);
+        let divided = divided.unwrap_or_else(|e| panic!("{e}"));
+        let (val, train) = (of(&bench, divided.output(), Split::Val), of(&bench, divided.output(), Split::Train));
+        assert_eq!(divided.metrics()["val"], val.len() as f64);
+        assert!(val.is_disjoint(&train) && val.len() + train.len() == 20 - test.len());
+        assert_eq!(of(&bench, divided.output(), Split::Test), test);
+        // A clip and its mirrored twin.
+        assert!(val.iter().all(|id| val.contains(id.trim_start_matches('M'))), "{val:?}");
+        held.extend(val);
+        let (before, after) = (bench.manifest(whole).unwrap(), bench.manifest(divided.output()).unwrap());
+        let changed: Vec<&String> =
+            before.files.keys().filter(|name| before.files[*name] != after.files[*name]).collect();
+        assert_eq!(changed, ["dataset.json"]);
+    }
+    held.sort_unstable();
+    assert_eq!(held.len(), 20 - test.len());
+    held.dedup();
+    assert_eq!(held.len(), 20 - test.len());
+    let many = StageSettings::DataFold(DataFold { folds: 20, fold: 1, ..DataFold::default() });
+    let refused = bench.run("dataset", &many, &[("dataset", whole)]).unwrap_err();
+    assert!(refused.to_string().contains("expected at least one for each of 20 folds"), "{refused}");
 }
 
 #[test]

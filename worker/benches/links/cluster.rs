@@ -33,9 +33,9 @@ pub(crate) struct Row {
     line: &'static str,
     /// `leaves` or `dies`.
     change: &'static str,
-    /// Members before.
+    /// Number of members before the change.
     members: usize,
-    /// From the signal until the last of the others has met the next generation.
+    /// Times from the signal until all others have met in the next generation.
     pauses_ms: Vec<f64>,
     load: String,
 }
@@ -44,7 +44,7 @@ fn name(who: usize) -> String {
     format!("w{who}")
 }
 
-/// How often a worker has met a gang of `members`.
+/// Number of meetings of a worker with a gang of `members`.
 fn meetings(cluster: &Cluster, who: usize, members: usize) -> usize {
     let size = format!("members={members} ");
     cluster.said(&name(who)).lines().filter(|line| line.contains("met the gang") && line.contains(&size)).count()

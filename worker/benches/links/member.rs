@@ -17,7 +17,7 @@ use worker::testing::{Context, Seat};
 
 use crate::Result;
 
-/// Writes a line at once; nobody may be left to read it.
+/// Writes a line at once. An error means that the reader has ended.
 fn say(line: &str) {
     let mut out = std::io::stdout().lock();
     let _ = writeln!(out, "{line}").and_then(|()| out.flush());

@@ -114,7 +114,7 @@ impl<'a> Processes<'a> {
         Ok(self.receiver.recv_timeout(PATIENCE).map_err(|_| "no member says anything")?)
     }
 
-    /// Waits until all of `members` have said a line that begins with `word`. Returns them in their order.
+    /// Waits until all of `members` have written a line that starts with `word`. Returns them in their order.
     pub(crate) fn await_from(&self, word: &str, members: &[usize]) -> Result<Vec<Said>> {
         let mut heard: Vec<Said> = Vec::new();
         let until = Instant::now() + PATIENCE;

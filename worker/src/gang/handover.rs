@@ -9,7 +9,7 @@
 //! The stage hands a connection over when it leaves the old generation. Until then the old one sends keep-alives. A reader
 //! whose peer is ahead waits for its own orders. If the orders of one member skip a generation of the other, or if a
 //! connection ends in between, the higher rank dials anew. Over a connection on which the peer has not yet sent anything,
-//! a member has sent its first frame at most, because it waits for that of the peer. The new connection begins with it.
+//! a member has sent its first frame at most, because it waits for that of the peer. The new connection starts with this frame.
 
 use std::cmp::Ordering;
 use std::net::Shutdown;
@@ -116,8 +116,8 @@ impl Mesh {
         }
     }
 
-    /// Returns true if the frame that could not be sent over `link` is sent again over another connection: the link was
-    /// replaced, or is given up before its peer came to this generation.
+    /// Returns true if a frame that `link` did not take is sent again over another connection. That is so if the link was
+    /// replaced, or if its peer has not come to this generation yet.
     pub(super) fn sends_again(&self, rank: usize, link: &Arc<Link>) -> bool {
         let peer = &mut lock(&self.peers)[rank];
         match &peer.link {

@@ -1,12 +1,11 @@
 //! Folds of a dataset for cross-validation, which differ in their lists alone.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use protocol::Seed;
-use protocol::stage::DataFormat;
 
 use super::pack::{INDEX, Index, PackError};
-use super::{Dataset, Entry, Split};
+use super::{Dataset, Split};
 use crate::random::Stream;
 
 /// A dataset that cannot be divided so often.
@@ -70,16 +69,15 @@ impl Index {
     /// Moves the entries of a fold to the validation split and all others of train and validation to the train split.
     fn divide(&mut self, fold: &Fold<'_>) -> Result<(), FoldError> {
         let mut sizes: BTreeMap<String, usize> = BTreeMap::new();
-        let is_divided = |entry: &&Entry| entry.split != Split::Test;
-        for entry in self.entries.iter().filter(is_divided) {
-            *sizes.entry(source(&self.clips[entry.clip].id, fold.sources, self.format).to_owned()).or_default() += 1;
+        for entry in self.entries.iter().filter(|entry| entry.split != Split::Test) {
+            *sizes.entry(source(&self.clips[entry.clip].id, fold.sources).to_owned()).or_default() += 1;
         }
         if sizes.len() < fold.folds {
             return Err(FoldError { groups: sizes.len(), folds: fold.folds });
         }
         let held = held_out(&sizes, fold);
         for entry in self.entries.iter_mut().filter(|entry| entry.split != Split::Test) {
-            let is_held = held.contains(&source(&self.clips[entry.clip].id, fold.sources, self.format).to_owned());
+            let is_held = held.contains(source(&self.clips[entry.clip].id, fold.sources));
             entry.split = if is_held { Split::Val } else { Split::Train };
         }
         self.entries.sort_by_key(|entry| entry.split);
@@ -89,7 +87,7 @@ impl Index {
 
 /// The recordings of a fold. Recordings in a random order fill the folds one after the other, each up to its share of the
 /// entries, but with one recording at least.
-fn held_out(sizes: &BTreeMap<String, usize>, fold: &Fold<'_>) -> Vec<String> {
+fn held_out(sizes: &BTreeMap<String, usize>, fold: &Fold<'_>) -> BTreeSet<String> {
     let draw = |source: &str| Stream::new(fold.seed, &format!("data/fold/{source}"), 0, 0).bits();
     let mut order: Vec<(u64, &String, usize)> =
         sizes.iter().map(|(source, size)| (draw(source), source, *size)).collect();
@@ -98,7 +96,7 @@ fn held_out(sizes: &BTreeMap<String, usize>, fold: &Fold<'_>) -> Vec<String> {
     let mut current = 1;
     let mut before = 0;
     let mut begun = false;
-    let mut held = Vec::new();
+    let mut held = BTreeSet::new();
     for (i, (_, source, size)) in order.iter().enumerate() {
         // A fold is full at its share, or if every recording left is needed for the folds behind it.
         let full = before * fold.folds >= total * current || order.len() - i <= fold.folds - current;
@@ -108,27 +106,23 @@ fn held_out(sizes: &BTreeMap<String, usize>, fold: &Fold<'_>) -> Vec<String> {
         begun = true;
         before += size;
         if current == fold.fold {
-            held.push((*source).clone());
+            held.insert((*source).clone());
         }
     }
     held
 }
 
-/// The recording of a clip.
-fn source<'a>(id: &'a str, sources: &'a BTreeMap<String, String>, format: DataFormat) -> &'a str {
-    match sources.get(id) {
-        Some(source) => source,
-        // The published sets name the mirrored twin of `000021` `M000021`.
-        None if matches!(format, DataFormat::Humanml3d | DataFormat::Kit) => id.strip_prefix('M').unwrap_or(id),
-        None => id,
-    }
+/// The recording of a clip. The published sets and ours name the mirrored twin of `000021` `M000021`.
+fn source<'a>(id: &'a str, sources: &'a BTreeMap<String, String>) -> &'a str {
+    sources.get(id).map_or_else(|| id.strip_prefix('M').unwrap_or(id), String::as_str)
 }
 
 #[cfg(test)]
 mod tests {
-    use std::collections::BTreeSet;
+    use protocol::stage::DataFormat;
 
     use super::*;
+    use crate::dataset::Entry;
     use crate::dataset::pack::ClipRow;
 
     /// Ten recordings of two parts and their twins; the last two are for the test.
