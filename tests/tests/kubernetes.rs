@@ -15,22 +15,32 @@ fn skip(why: &str) {
     fixtures::skip(why);
 }
 
+/// Runs a command. The error has all that it printed: `venv` prints what failed to its standard output.
+fn succeeds(command: &mut Command) -> Result<(), String> {
+    let done = command.output().map_err(|e| e.to_string())?;
+    let said = || {
+        format!("{}, {}{}", done.status, String::from_utf8_lossy(&done.stdout), String::from_utf8_lossy(&done.stderr))
+    };
+    if done.status.success() { Ok(()) } else { Err(said()) }
+}
+
 /// A program made available by pip in an environment of the target folder.
 fn validator() -> Option<PathBuf> {
     let target = std::env::var_os("CARGO_TARGET_DIR").map_or_else(|| Bench::repository().join("target"), PathBuf::from);
     let environment = target.join("kubernetes-python");
     let program = environment.join("bin/kubernetes-validate");
     if !program.exists() {
-        let make = ["-m", "venv"].map(Path::new);
-        if !Command::new("python3").args(make).arg(&environment).output().is_ok_and(|made| made.status.success()) {
-            skip("python3 has no venv");
-            return None;
-        }
-        let pip = environment.join("bin/python");
-        let install = ["-m", "pip", "install", "--quiet", "--disable-pip-version-check", VALIDATOR];
-        if !Command::new(pip).args(install).output().is_ok_and(|done| done.status.success()) {
-            skip("pip cannot install kubernetes-validate");
-            return None;
+        let mut make = Command::new("python3");
+        make.args(["-m", "venv"]).arg(&environment);
+        let mut install = Command::new(environment.join("bin/python"));
+        install.args(["-m", "pip", "install", "--quiet", "--disable-pip-version-check", VALIDATOR]);
+        for (mut command, missing) in
+            [(make, "python3 has no venv"), (install, "pip cannot install kubernetes-validate")]
+        {
+            if let Err(why) = succeeds(&mut command) {
+                skip(&format!("{missing}: {why}"));
+                return None;
+            }
         }
     }
     Some(program)
