@@ -6,8 +6,8 @@ use std::path::Path;
 use std::process::Command;
 
 use cluster_tests::Bench;
-use cluster_tests::tables::{Source, render};
 use serde_json::{Value, json};
+use tables::{Source, render};
 
 const TRAINER: &str = env!("CARGO_BIN_EXE_trainer");
 
@@ -26,6 +26,7 @@ stages:
   told: {kind: evaluate.control, joints: [pelvis], percent: [100, 25], frames: [5], sampler: {steps: 1, guidance: 2}, repeats: 2, split: test, all_if_small: true, shards: 1}
   recon: {kind: evaluate.reconstruction, vae: vae_1, shards: 1}
   fid: {kind: evaluate.latent_fid, model: lcm, teacher: mld, split: all, sampler: {steps: 1, guidance: 2}, repeats: 2, components: 4, shards: 1}
+  shown: {kind: evaluate.recognition, model: lcm, split: all, motions: 4, sampler: {steps: 1, guidance: 2}, activities: [{name: both hands, words: [hand, hands, arm, arms]}, {name: rest, words: [a, the, person, someone]}]}
   real: {kind: evaluate.t2m, real: true, pools: [8], repeats: 2, split: test, shards: 1}
   t2m_vae_1: {kind: evaluate.t2m, vae: vae_1, pools: [8], repeats: 2, split: test, shards: 1}
   t2m_vae_2: {kind: evaluate.t2m, vae: vae_2, pools: [8], repeats: 2, split: test, shards: 1}
@@ -82,19 +83,26 @@ fn metrics<'a>(run: &'a Value, stage: &str) -> &'a Value {
     &stages.iter().find(|one| one["name"] == stage).unwrap_or_else(|| panic!("no stage `{stage}`"))["metrics"]
 }
 
+/// Names of the shares of an evaluation of activities.
+fn activities(settings: &Value) -> Vec<String> {
+    let all = settings["activities"].as_array().expect("activities").iter();
+    all.map(|activity| format!("accuracy/{}", activity["name"].as_str().expect("a name"))).collect()
+}
+
 /// Checks that a template quotes only stages of the pipeline beside it, and only metrics that their evaluations report.
 fn a_shipped_template_can_be_filled(bench: &Bench, toy: &Value, path: &Path) {
     let pipeline = path.with_extension("yaml").display().to_string();
     let pipeline = bench.run(&["config", "show", &pipeline, "-o", "json"]).expect_code(0).json();
-    let with = |stage: &str, more: &[&str]| -> BTreeMap<String, f64> {
+    let with = |stage: &str, more: &[String]| -> BTreeMap<String, f64> {
         let names = metrics(toy, stage).as_object().expect("metrics").keys().cloned();
-        names.chain(more.iter().map(|name| (*name).to_owned())).map(|name| (name, 0.5)).collect()
+        names.chain(more.iter().cloned()).map(|name| (name, 0.5)).collect()
     };
     let stages = pipeline["stages"].as_array().expect("stages").iter().map(|stage| {
         let own = if stage["settings"].is_object() { &stage["settings"] } else { stage };
         let metrics = match own["kind"].as_str().expect("a kind") {
             "evaluate.reconstruction" => with("recon", &[]),
             "evaluate.latent_fid" => with("fid", &[]),
+            "evaluate.recognition" => with("shown", &activities(own)),
             "evaluate.control" => with("told", &[]),
             "evaluate.t2m" if own["real"] == true => with("real", &[]),
             "evaluate.t2m" if own["vae"] != "" => with("t2m_vae_1", &[]),

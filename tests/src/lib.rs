@@ -15,7 +15,6 @@ pub mod network;
 pub mod postgres;
 pub mod slurm;
 pub mod supply;
-pub mod tables;
 
 use std::collections::BTreeMap;
 use std::fs::{self, File};

@@ -101,22 +101,8 @@ fn mean(of: &str, copies: &[Row]) -> Row {
         if values.len() < copies.len() {
             continue;
         }
-        let count = values.len() as f64;
-        let value = values.iter().sum::<f64>() / count;
-        let variance = values.iter().map(|one| (one - value).powi(2)).sum::<f64>() / (count - 1.0);
-        let half = quantile(values.len() - 1) * (variance / count).sqrt();
-        measures.insert(key.clone(), Measure { value, half: Some(half) });
+        measures.extend(Measure::of_trainings(&values).map(|mean| (key.clone(), mean)));
     }
     let label = format!("{of}, mean of {}", copies.len());
     Row { source: label.clone(), label, published: false, measures }
-}
-
-/// The 97.5 % quantile of Student's distribution; above ten degrees of freedom by the first terms of its expansion.
-fn quantile(degrees: usize) -> f64 {
-    const TABLE: [f64; 10] = [12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228];
-    let normal = 1.96_f64;
-    match TABLE.get(degrees.saturating_sub(1)) {
-        Some(value) => *value,
-        None => normal + (normal.powi(3) + normal) / (4.0 * degrees as f64),
-    }
 }

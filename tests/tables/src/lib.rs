@@ -6,11 +6,16 @@
 //! | `{{STAGE METRIC}}` | the value, with `±` half of its 95 % interval, or its standard deviation over sampling seeds, if the run has one |
 //! | `{{NAME_* METRIC}}` | mean ± standard deviation (n - 1) over the stages `NAME_1`, `NAME_2`, ...: trainings from other random draws |
 //! | `{{A METRIC / B METRIC}}` | the ratio; with `*` in both, of those with one number, then mean ± standard deviation |
+//! | `{{A METRIC - B METRIC}}` | the difference, as the ratio |
+//! | `{{mean ...}}` | any of these with `*`: `±` is half of the 95 % interval of the mean, by Student's distribution |
+//! | `{{verdict A METRIC - B METRIC}}` | `lower` or `higher` if that interval of the difference excludes 0, else `no difference shown` |
 //! | `{{bare ...}}` | any of these without `±` |
 //! | `{{... :N}}` | with N decimals, 3 otherwise |
 //! | `{{set STAGE PATH}}` | a setting |
+//! | `{{... METRIC}}` | a space in the metric's name is written `_` |
 //! | `{{core minutes}}` | the total time of all stages, one after the other |
 
+use registry::leaderboard::Measure;
 use serde_json::Value;
 
 /// Default number of decimals.
@@ -29,6 +34,14 @@ pub struct Source {
 struct Number {
     value: f64,
     spread: Option<f64>,
+    /// The mean of several trainings.
+    mean: Option<Measure>,
+}
+
+impl Number {
+    fn once(value: f64, spread: Option<f64>) -> Self {
+        Self { value, spread, mean: None }
+    }
 }
 
 /// Fills the places of a template.
@@ -61,21 +74,38 @@ fn fill(place: &str, source: &Source) -> Result<String, String> {
         }
         None => DECIMALS,
     };
-    let bare = words.first() == Some(&"bare");
-    if bare {
-        words.remove(0);
-    }
+    let form = match words.first() {
+        Some(first @ (&"bare" | &"mean" | &"verdict")) => Some(*first),
+        _ => None,
+    };
+    words.drain(..usize::from(form.is_some()));
     let number = match words[..] {
         ["set", stage, path] => return setting(source, stage, path),
-        ["core", "minutes"] => Number { value: core_minutes(source), spread: None },
+        ["core", "minutes"] => Number::once(core_minutes(source), None),
         [stage, metric] => value(source, stage, metric)?,
-        [a, of_a, "/", b, of_b] => ratio(source, (a, of_a), (b, of_b))?,
+        [a, of_a, "/", b, of_b] => paired(source, (a, of_a), (b, of_b), |a, b| a / b)?,
+        [a, of_a, "-", b, of_b] => paired(source, (a, of_a), (b, of_b), |a, b| a - b)?,
         _ => return Err("expected such as `STAGE METRIC`".into()),
     };
-    let Number { value, spread } = number;
+    let half = number.mean.and_then(|mean| mean.half);
+    let spread = match form {
+        None => number.spread,
+        Some("bare") => None,
+        Some(_) => Some(half.ok_or("only several trainings have a mean; name them with `*`")?),
+    };
+    if form == Some("verdict") {
+        return match (words.get(2), spread) {
+            (Some(&"-"), Some(half)) if number.value.abs() > half => {
+                Ok(if number.value < 0.0 { "lower" } else { "higher" }.to_owned())
+            }
+            (Some(&"-"), _) => Ok("no difference shown".to_owned()),
+            _ => Err("a verdict is of a difference".into()),
+        };
+    }
+    let value = number.value;
     Ok(match spread {
-        Some(spread) if !bare => format!("{value:.decimals$} ± {spread:.decimals$}"),
-        _ => format!("{value:.decimals$}"),
+        Some(spread) => format!("{value:.decimals$} ± {spread:.decimals$}"),
+        None => format!("{value:.decimals$}"),
     })
 }
 
@@ -112,7 +142,11 @@ fn stages<'a>(source: &'a Source, name: &str) -> Result<Vec<(String, &'a Value)>
 }
 
 fn one(metrics: &Value, name: &str, metric: &str) -> Result<f64, String> {
-    metrics[metric].as_f64().ok_or_else(|| {
+    let spaced = |metrics: &Value| {
+        let all = metrics.as_object()?;
+        all.iter().find(|(own, _)| own.contains(' ') && own.replace(' ', "_") == metric)?.1.as_f64()
+    };
+    metrics[metric].as_f64().or_else(|| spaced(metrics)).ok_or_else(|| {
         let have: Vec<&String> = metrics.as_object().into_iter().flat_map(|map| map.keys()).collect();
         format!("`{name}` has no `{metric}`; it has {have:?}")
     })
@@ -128,18 +162,24 @@ fn value(source: &Source, name: &str, metric: &str) -> Result<Number, String> {
     let value = one(metrics, name, metric)?;
     let interval = metrics[format!("{metric}.upper")].as_f64().map(|upper| upper - value);
     let spread = interval.or_else(|| metrics[format!("{metric}_sd")].as_f64());
-    Ok(Number { value, spread })
+    Ok(Number::once(value, spread))
 }
 
-fn ratio(source: &Source, (a, of_a): (&str, &str), (b, of_b): (&str, &str)) -> Result<Number, String> {
+/// Combines values of trainings with one number.
+fn paired(
+    source: &Source,
+    (a, of_a): (&str, &str),
+    (b, of_b): (&str, &str),
+    combine: impl Fn(f64, f64) -> f64,
+) -> Result<Number, String> {
     let (over, under) = (stages(source, a)?, stages(source, b)?);
     let pair = |(number, metrics): &(String, &Value)| -> Result<f64, String> {
         let other = under.iter().find(|(of, _)| of == number || under.len() == 1);
         let (_, other) = other.ok_or_else(|| format!("`{b}` has no number {number}"))?;
-        Ok(one(metrics, a, of_a)? / one(other, b, of_b)?)
+        Ok(combine(one(metrics, a, of_a)?, one(other, b, of_b)?))
     };
-    let ratios = over.iter().map(pair).collect::<Result<Vec<_>, _>>()?;
-    Ok(of_seeds(&ratios))
+    let values = over.iter().map(pair).collect::<Result<Vec<_>, _>>()?;
+    Ok(of_seeds(&values))
 }
 
 /// Mean and standard deviation; a single value has no deviation.
@@ -147,7 +187,8 @@ fn of_seeds(values: &[f64]) -> Number {
     let n = values.len() as f64;
     let mean = values.iter().sum::<f64>() / n;
     let squares: f64 = values.iter().map(|value| (value - mean).powi(2)).sum();
-    Number { value: mean, spread: (values.len() > 1).then(|| (squares / (n - 1.0)).sqrt()) }
+    let spread = (values.len() > 1).then(|| (squares / (n - 1.0)).sqrt());
+    Number { value: mean, spread, mean: Measure::of_trainings(values) }
 }
 
 #[cfg(test)]
@@ -162,7 +203,9 @@ mod tests {
             {"name": "a_2", "wall_s": 60.0, "metrics": {"fid": 3.0, "x": 1.0, "x_sd": 0.25}},
             {"name": "b_1", "wall_s": 30.0, "metrics": {"fid": 2.0}},
             {"name": "b_2", "wall_s": 0.0, "metrics": {"fid": 3.0}},
-            {"name": "other", "metrics": {"fid": 9.0}},
+            {"name": "other", "metrics": {"fid": 9.0, "share/left hand": 0.75}},
+            {"name": "far_1", "metrics": {"fid": 9.0}},
+            {"name": "far_2", "metrics": {"fid": 11.25}},
         ]});
         let pipeline = json!({"stages": [{"name": "a_1", "settings": {"steps": 12, "batch": {"global": 8}}}]});
         Source { run, pipeline }
@@ -176,12 +219,20 @@ mod tests {
         assert_eq!(filled("| {{a_* fid :2}} |").unwrap(), "| 2.00 ± 1.41 |");
         assert_eq!(filled("{{bare a_* fid / b_* fid :2}}").unwrap(), "0.75");
         assert_eq!(filled("{{a_1 fid / other fid}}").unwrap(), "0.111");
+        assert_eq!(filled("{{other share/left_hand :2}}").unwrap(), "0.75");
+        // Two differences with a standard deviation of .177; 12.706 for one degree of freedom.
+        assert_eq!(filled("{{mean far_* fid - a_* fid :2}}").unwrap(), "8.12 ± 1.59");
+        assert_eq!(filled("{{verdict far_* fid - a_* fid}}").unwrap(), "higher");
+        assert_eq!(filled("{{verdict a_* fid - far_* fid}}").unwrap(), "lower");
+        assert_eq!(filled("{{verdict a_* fid - b_* fid}}").unwrap(), "no difference shown");
         assert_eq!(filled("{{set a_1 steps}} of {{set a_1 batch.global}}").unwrap(), "12 of 8");
         assert_eq!(filled("{{core minutes :1}}").unwrap(), "2.5");
         for (place, part) in [
             ("one\n{{c fid}}", "line 2: `{{c fid}}`: `{{c fid}}`: no stage `c`"),
             ("{{a_1 fdi}}", "`a_1` has no `fdi`"),
             ("{{a_1}}", "STAGE METRIC"),
+            ("{{mean a_1 fid}}", "several trainings"),
+            ("{{verdict a_* fid / b_* fid}}", "of a difference"),
             ("{{a_1 fid", "no end"),
             ("{{set a_1 stepps}}", "no setting `stepps`"),
             ("{{a_1 fid :x}}", "no number of decimals"),

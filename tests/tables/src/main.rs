@@ -3,7 +3,7 @@
 
 use std::process::ExitCode;
 
-use cluster_tests::tables::{Source, render};
+use tables::{Source, render};
 
 fn main() -> ExitCode {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
