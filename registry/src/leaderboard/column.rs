@@ -31,7 +31,7 @@ const fn column(key: &'static str, head: &'static str, better: Better) -> Column
 }
 
 /// Columns in the order of text-to-motion papers, then reconstruction and control, then metrics without an evaluator.
-pub(super) const COLUMNS: [Column; 28] = [
+pub(super) const COLUMNS: [Column; 31] = [
     column("aits", "AITS (s)", Better::Lower),
     column("r_precision_top1", "R@1", Better::Higher),
     column("r_precision_top2", "R@2", Better::Higher),
@@ -48,6 +48,9 @@ pub(super) const COLUMNS: [Column; 28] = [
     column("sjpe_noise", "sJPE noise", Better::Lower),
     column("sjpe_static", "sJPE static", Better::Lower),
     column("skating_ratio", "Skating", Better::Lower),
+    column("jerk", "Jerk m/s^3", Better::NearReal),
+    column("penetration_mm", "Penetration mm", Better::Lower),
+    column("bone_change_mm", "Bones mm", Better::Lower),
     column("trajectory_error", "Traj. err.", Better::Lower),
     column("location_error", "Loc. err.", Better::Lower),
     column("average_error_m", "Avg. err. (m)", Better::Lower),

@@ -37,7 +37,7 @@ pub use control::{ControlHints, ControlSetting};
 pub use data::DataFormat;
 pub use diffusion::{Diffusion, NoiseSchedule, Prediction};
 pub use distillation::{Distance, Distillation};
-pub use evaluation::{Mode, Split};
+pub use evaluation::{Mode, PHYSICS, Split};
 pub use flow::FlowSolver;
 pub use frequency::{Band, FrequencyLosses, LowFrequency, Norm, Over, Semantic};
 pub use identity::{Backend, StageIdentity};

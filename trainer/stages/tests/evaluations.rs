@@ -468,7 +468,7 @@ fn real_clips_are_recognised_and_those_of_an_untrained_model_are_not() {
     assert_eq!(metrics["real_accuracy"], 1.0, "{metrics:?}");
     assert!(metrics["reconstructed_accuracy"] < 1.0, "an untrained VAE keeps not every activity: {metrics:?}");
     assert!(metrics["accuracy"] <= 0.5, "an untrained model draws one and the same: {metrics:?}");
-    assert!(metrics.contains_key("accuracy/run") && metrics["real_skating"] < 0.2, "{metrics:?}");
+    assert!(metrics.contains_key("accuracy/run") && metrics["real_skating_ratio"] < 0.2, "{metrics:?}");
     let manifest = bench.manifest(ran.output()).expect("stored");
     let sheet = artifacts::file(&*bench.blobs(), &manifest, "contact-sheet.png").expect("a sheet");
     assert!(sheet.starts_with(b"\x89PNG"));
@@ -494,7 +494,7 @@ fn sentences_are_drawn_in_the_viewers_form_and_by_the_seed_alone() {
     };
     let inputs = [("model", model)];
     let ran = bench.run("drawn", &settings.clone().into(), &inputs).expect("the stage runs");
-    assert!((0.0..=1.0).contains(&ran.metrics()["skating"]), "{:?}", ran.metrics());
+    assert!((0.0..=1.0).contains(&ran.metrics()["skating_ratio"]), "{:?}", ran.metrics());
     let manifest = bench.manifest(ran.output()).expect("stored");
     let motions = artifacts::file(&*bench.blobs(), &manifest, "motions.json").expect("motions");
     let motions: serde_json::Value = serde_json::from_slice(&motions).expect("JSON");

@@ -170,6 +170,9 @@ fn t2m_is_the_same_however_the_motions_are_cut() {
         "diversity",
         "multimodality",
         "skating_ratio",
+        "jerk",
+        "penetration_mm",
+        "bone_change_mm",
     ] {
         let (lower, mean, upper) =
             (metrics[&format!("{name}.lower")], metrics[name], metrics[&format!("{name}.upper")]);

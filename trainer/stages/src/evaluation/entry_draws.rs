@@ -8,10 +8,9 @@ use std::collections::BTreeMap;
 use std::ops::Range;
 
 use motion::dataset::{Dataset, crop};
-use motion::features::recover_joints;
 use motion::random::permutation;
 use motion::{Skeleton, Stream};
-use protocol::stage::Split;
+use protocol::stage::{PHYSICS, Split};
 use protocol::{ArtifactKind, Digest, Seed};
 use serde_json::{Value, json};
 
@@ -19,8 +18,9 @@ use super::report::{Repeats, joined, no_entries, publish_illustrated};
 use crate::artifacts::{self, word};
 use crate::context::{AttemptContext, Outcome, StageError};
 use crate::metrics::frechet::Gaussian;
+use crate::metrics::physics::physics_of_features;
 use crate::metrics::retrieval::in_groups;
-use crate::metrics::{skating, spread};
+use crate::metrics::spread;
 use crate::parts::evaluator::TrainedEvaluator;
 
 /// Number of motions computed together.
@@ -227,11 +227,18 @@ impl EntryDraws {
     }
 }
 
-/// Share of a motion's steps in which a foot skates.
-pub(crate) fn skates(features: &[f32], skeleton: &Skeleton) -> f32 {
-    let joints = recover_joints(features, skeleton);
-    let metres: Vec<f64> = joints.iter().map(|v| f64::from(*v) * skeleton.metres_per_unit).collect();
-    skating::ratio(&metres, skeleton.joints, skating::feet(skeleton.format), skeleton.fps) as f32
+/// [`physics`](crate::metrics::physics) of a motion's features.
+pub(crate) fn physics(features: &[f32], skeleton: &Skeleton) -> [f32; PHYSICS.len()] {
+    physics_of_features(features, skeleton).map(|value| value as f32)
+}
+
+/// Means over motions of what [`physics`] gives, by name.
+pub(crate) fn mean_physics(rows: &[f64]) -> impl Iterator<Item = (String, f64)> + '_ {
+    let motions = rows.len() / PHYSICS.len();
+    PHYSICS.iter().enumerate().map(move |(i, name)| {
+        let sum: f64 = rows.iter().skip(i).step_by(PHYSICS.len()).sum();
+        ((*name).to_owned(), sum / motions as f64)
+    })
 }
 
 /// Reorders the rows of `values` by `rows`.

@@ -7,6 +7,7 @@ pub mod jerk;
 pub mod joints;
 pub mod junction;
 pub mod latent_fid;
+pub mod physics;
 pub mod procrustes;
 pub mod recognition;
 pub mod reconstruction;

@@ -4,17 +4,19 @@
 //! at the origin. PA-MPJPE is the same after each frame's best similarity. The error of accelerations, in world
 //! coordinates, is a mean over all frames but two of each clip. The feature error is the sum over clips of the
 //! Frobenius norm of the normalised difference, divided by the number of frames; it is not a mean per frame. Smooth L1
-//! is a mean over all values of all clips; the VAE's loss instead weighs clips equally. sJPE with its parts and the
-//! skating ratio are means over clips. A clip of fewer than 4 frames has no jerk and is left out.
+//! is a mean over all values of all clips; the VAE's loss instead weighs clips equally. sJPE with its parts and
+//! the physics are means over clips. A clip of fewer than 4 frames has no jerk and is left out.
 
 use std::collections::BTreeMap;
 
 use motion::Skeleton;
 use motion::features::{recover_joints, recover_joints_wide};
+use protocol::stage::PHYSICS;
 use serde::{Deserialize, Serialize};
 
 use super::jerk::{JerkError, jerk, joints_of};
-use super::{joints, procrustes, skating};
+use super::physics::physics;
+use super::{joints, procrustes};
 
 /// Jerk of a joint at rest in m/s^3, that of waves of some hundredths of a millimetre at 20 frames a second.
 const STILL: f64 = 1.0;
@@ -40,8 +42,8 @@ pub struct ClipErrors {
     pub smooth_l1: f64,
     /// Parts of sJPE; `None` for fewer than 4 frames.
     pub jerk: Option<ClipJerk>,
-    /// Share of the steps in which a foot of the guess skates.
-    pub skating: f64,
+    /// [`physics`] of the guess.
+    pub physics: [f64; PHYSICS.len()],
 }
 
 /// Parts of sJPE of one clip.
@@ -74,7 +76,7 @@ impl ClipErrors {
             feature_distance: joints::feature_distance(truth, guess),
             smooth_l1: joints::smooth_l1(truth, guess),
             jerk: clip_jerk(&a_wide, &b_wide, skeleton),
-            skating: skates(b_wide, skeleton),
+            physics: physics(&in_metres(b_wide, skeleton), skeleton),
         }
     }
 }
@@ -105,14 +107,9 @@ fn clip_jerk(truth: &[f64], guess: &[f64], skeleton: &Skeleton) -> Option<ClipJe
     Some(ClipJerk { noise: error.noise, statics: error.statics })
 }
 
-/// The skating ratio of global joints in the unit of the data.
-fn skates(joints: Vec<f64>, skeleton: &Skeleton) -> f64 {
-    skating::ratio(&in_metres(joints, skeleton), skeleton.joints, skating::feet(skeleton.format), skeleton.fps)
-}
-
-/// The skating ratio of the original clip, rows `[L, D]` of normalised features.
-pub fn real_skating(truth: &[f32], mean: &[f32], std: &[f32], skeleton: &Skeleton) -> f64 {
-    skates(recover_joints_wide(&natural(truth, mean, std), skeleton), skeleton)
+/// [`physics`] of the original clip, rows `[L, D]` of normalised features.
+pub fn real_physics(truth: &[f32], mean: &[f32], std: &[f32], skeleton: &Skeleton) -> [f64; PHYSICS.len()] {
+    physics(&in_metres(recover_joints_wide(&natural(truth, mean, std), skeleton), skeleton), skeleton)
 }
 
 /// Share of the jerks of the original clip, rows `[L, D]` of normalised features, that are below one m/s^3. There sJPE
@@ -137,8 +134,10 @@ pub fn summary(clips: &[ClipErrors], skeleton: &Skeleton, prefix: &str) -> BTree
         ("mpjpe_global_mm", per_frame(|c| c.global) * millimetres),
         ("feature_error", per_frame(|c| c.feature_distance)),
         ("feature_smooth_l1", per_frame(|c| c.smooth_l1 * c.frames as f64)),
-        ("skating_ratio", sum(|c| c.skating) / clips.len() as f64),
     ];
+    for (i, name) in PHYSICS.into_iter().enumerate() {
+        metrics.push((name, clips.iter().map(|c| c.physics[i]).sum::<f64>() / clips.len() as f64));
+    }
     if inner > 0 {
         metrics.push(("acceleration_mm", sum(|c| c.acceleration) / inner as f64 * millimetres));
     }
@@ -232,9 +231,9 @@ mod tests {
                 row[skeleton.layout().positions].fill(0.0);
             }
             let errors = ClipErrors::between(&rest, &dragged, &mean, &std, skeleton);
-            assert_eq!(errors.skating, 1.0, "{format:?}");
-            assert_eq!(real_skating(&dragged, &mean, &std, skeleton), 1.0, "{format:?}");
-            assert_eq!(real_skating(&rest, &mean, &std, skeleton), 0.0, "{format:?}");
+            assert_eq!(errors.physics[0], 1.0, "{format:?}");
+            assert_eq!(real_physics(&dragged, &mean, &std, skeleton)[0], 1.0, "{format:?}");
+            assert_eq!(real_physics(&rest, &mean, &std, skeleton)[0], 0.0, "{format:?}");
         }
     }
 }

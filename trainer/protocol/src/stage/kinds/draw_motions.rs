@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::stage::{Output, Problems, Ref, Shape, StageSpec};
+use crate::stage::{Output, PHYSICS, Problems, Ref, Shape, StageSpec};
 use crate::{ArtifactKind, Seed};
 
 /// Largest number of motions of one stage.
@@ -16,8 +16,8 @@ const SENTENCE: usize = 1_000;
 const POSITIONS: usize = 1_200;
 
 /// `draw.motions`: motions for sentences, in the form of the viewer of a server's page, and as `.npy`, `.bvh`, `.glb` and
-/// `.html`. Two models draw with the same noise if their seeds are the same. The metric `skating` is the share of steps
-/// in which a foot slides; `jerk` is the mean jerk of feet and wrists in m/s^3.
+/// `.html`. Two models draw with the same noise if their seeds are the same. The metrics are the physical measures of the
+/// motions.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct DrawMotions {
@@ -62,6 +62,8 @@ impl Default for DrawMotions {
 
 impl StageSpec for DrawMotions {
     const KIND: &'static str = "draw.motions";
+    // Version 2 adds penetration and bones.
+    const VERSION: u32 = 2;
     const SHAPE: Shape = Shape::Plain;
     const OUTPUT: Output = Output { name: "report", kind: ArtifactKind::Report };
 
@@ -90,6 +92,6 @@ impl StageSpec for DrawMotions {
     }
 
     fn metrics(&self) -> Option<BTreeSet<String>> {
-        Some(["jerk", "skating"].map(str::to_owned).into())
+        Some(PHYSICS.map(str::to_owned).into())
     }
 }

@@ -7,7 +7,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::ArtifactKind;
-use crate::stage::{Neighbours, Output, Problems, Ref, Sampler, Shape, Split, StageSpec};
+use crate::stage::{Neighbours, Output, PHYSICS, Problems, Ref, Sampler, Shape, Split, StageSpec};
 
 /// An activity that the classifier recognises.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -24,8 +24,8 @@ pub struct Activity {
 /// `evaluate.recognition`: trains a classifier of activities on real clips of the train split. It measures the share of
 /// generated motions that are classified as their caption's activity (`accuracy`, and `accuracy/NAME`). It also measures
 /// that of real clips of `split` (`real_accuracy`), and of these clips as the model's VAE or tokenizer reconstructs them
-/// (`reconstructed_accuracy`). `skating` and `real_skating` are the shares of skating steps. The report has a contact
-/// sheet.
+/// (`reconstructed_accuracy`). It has the physical measures of the motions, and as `real_...` those of the clips. The
+/// report has a contact sheet.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct EvaluateRecognition {
@@ -80,7 +80,7 @@ impl Default for EvaluateRecognition {
 impl StageSpec for EvaluateRecognition {
     const KIND: &'static str = "evaluate.recognition";
     // Version 4 classifies smoothed paths and positions, and reconstructions too.
-    const VERSION: u32 = 4;
+    const VERSION: u32 = 5;
     const SHAPE: Shape = Shape::Plain;
     const OUTPUT: Output = Output { name: "report", kind: ArtifactKind::Report };
 
@@ -131,9 +131,13 @@ impl StageSpec for EvaluateRecognition {
     }
 
     fn metrics(&self) -> Option<BTreeSet<String>> {
-        let all = ["accuracy", "real_accuracy", "reconstructed_accuracy", "skating", "real_skating"]
-            .map(str::to_owned)
-            .into_iter();
-        Some(all.chain(self.activities.iter().map(|activity| format!("accuracy/{}", activity.name))).collect())
+        let shares = ["accuracy", "real_accuracy", "reconstructed_accuracy"].map(str::to_owned).into_iter();
+        let physics = PHYSICS.iter().flat_map(|name| [(*name).to_owned(), format!("real_{name}")]);
+        Some(
+            shares
+                .chain(physics)
+                .chain(self.activities.iter().map(|activity| format!("accuracy/{}", activity.name)))
+                .collect(),
+        )
     }
 }

@@ -53,8 +53,8 @@ impl Default for EvaluateReconstruction {
 impl StageSpec for EvaluateReconstruction {
     const KIND: &'static str = "evaluate.reconstruction";
     // Version 2 adds PA-MPJPE, accelerations, sJPE, skating. Version 3 adds the length of a unit.
-    // Version 5 adds the share of still frames.
-    const VERSION: u32 = 5;
+    // Version 5 adds the share of still frames. Version 6 adds jerk, penetration and bones.
+    const VERSION: u32 = 6;
     const SHAPE: Shape = Shape::Map;
     const OUTPUT: Output = Output { name: "report", kind: ArtifactKind::Report };
 

@@ -6,7 +6,7 @@ use std::collections::BTreeSet;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::stage::{Family, Neighbours, Output, Problems, Ref, Sampler, Shape, Split, StageSpec};
+use crate::stage::{Family, Neighbours, Output, PHYSICS, Problems, Ref, Sampler, Shape, Split, StageSpec};
 use crate::{ArtifactKind, limits};
 
 /// Variety of the motions of one caption. Published: 100 captions, 30 motions each, 10 pairs.
@@ -138,7 +138,7 @@ impl StageSpec for EvaluateT2m {
     const KIND: &'static str = "evaluate.t2m";
     // Version 2 reports the measured model and its sampler. Version 3 adds pools, `drop_last`, drawn lengths,
     // reconstructions.
-    const VERSION: u32 = 4;
+    const VERSION: u32 = 5;
     const SHAPE: Shape = Shape::Map;
     const OUTPUT: Output = Output { name: "report", kind: ArtifactKind::Report };
 
@@ -255,7 +255,7 @@ impl StageSpec for EvaluateT2m {
     }
 
     fn metrics(&self) -> Option<BTreeSet<String>> {
-        let mut names: Vec<String> = ["fid", "diversity", "skating_ratio"].map(str::to_owned).into();
+        let mut names: Vec<String> = ["fid", "diversity"].into_iter().chain(PHYSICS).map(str::to_owned).collect();
         for (i, pool) in self.pools.iter().enumerate() {
             let suffix = if i == 0 { String::new() } else { format!("_pool{pool}") };
             let retrieval = ["r_precision_top1", "r_precision_top2", "r_precision_top3", "mm_dist"];

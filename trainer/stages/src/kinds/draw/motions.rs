@@ -19,9 +19,10 @@ use serde_json::json;
 
 use crate::artifacts;
 use crate::context::{AttemptContext, Outcome, StageError};
+use crate::evaluation::entry_draws::mean_physics;
 use crate::generate::{Generated, Generator};
 use crate::kinds::shape::Plain;
-use crate::metrics::{jerk, skating};
+use crate::metrics::physics::physics;
 use crate::parts::control::ControlOptions;
 use crate::parts::hint::Hint;
 
@@ -29,15 +30,6 @@ use crate::parts::hint::Hint;
 const MOTIONS_FILE: &str = "motions.json";
 /// File of all motions as a page.
 const PAGE_FILE: &str = "motions.html";
-
-/// Measures of one motion.
-#[derive(Debug, Clone, Copy)]
-struct Measures {
-    /// Share of steps in which a foot slides.
-    skating: f64,
-    /// Mean jerk of feet and wrists in m/s^3.
-    jerk: f64,
-}
 
 impl Plain for DrawMotions {
     fn run(&self, cx: &mut dyn AttemptContext) -> Result<Outcome, StageError> {
@@ -142,18 +134,6 @@ fn metres(motion: &Generated, skeleton: &Skeleton) -> Vec<f64> {
     motion.joints.iter().map(|value| f64::from(*value) * skeleton.metres_per_unit).collect()
 }
 
-impl Measures {
-    fn of(motion: &Generated, skeleton: &Skeleton) -> Self {
-        let joints = metres(motion, skeleton);
-        let Skeleton { fps, format, joints: count, .. } = *skeleton;
-        let jerks = jerk::jerk(&joints, count, jerk::joints_of(format), fps);
-        Self {
-            skating: skating::ratio(&joints, count, skating::feet(format), fps),
-            jerk: jerks.iter().sum::<f64>() / jerks.len().max(1) as f64,
-        }
-    }
-}
-
 /// A motion with its sentence and seed.
 struct Drawn<'a> {
     sentence: &'a str,
@@ -172,12 +152,8 @@ fn publish(
     sampler: &Sampler,
     (drawn, waypoints): (&[Drawn<'_>], &[Waypoint]),
 ) -> Result<Outcome, StageError> {
-    let all: Vec<Measures> = drawn.iter().map(|drawn| Measures::of(&drawn.motion, skeleton)).collect();
-    let mean = |of: fn(&Measures) -> f64| all.iter().map(of).sum::<f64>() / all.len().max(1) as f64;
-    let metrics = BTreeMap::from([
-        ("skating".to_owned(), mean(|measures| measures.skating)),
-        ("jerk".to_owned(), mean(|measures| measures.jerk)),
-    ]);
+    let all: Vec<_> = drawn.iter().map(|drawn| physics(&metres(&drawn.motion, skeleton), skeleton)).collect();
+    let metrics: BTreeMap<String, f64> = mean_physics(all.as_flattened()).collect();
     let body = Body::of(skeleton);
     let mut panels = Vec::with_capacity(drawn.len());
     for Drawn { sentence, seed, motion } in drawn {
@@ -187,7 +163,7 @@ fn publish(
     }
     let mut motions = packed(&panels).map_err(refused)?;
     motions["captions"] = panels.iter().map(|panel| json!(panel.caption)).collect();
-    for (number, Measures { skating, jerk }) in all.iter().enumerate() {
+    for (number, [skating, jerk, ..]) in all.iter().enumerate() {
         motions["motions"][number]["measures"] = json!({"skating": skating, "jerk": jerk});
     }
     let sections = vec![Section { title: String::new(), panels }];

@@ -2,8 +2,10 @@
 //! (tables 3 and 4).
 //!
 //! Captions, crops and noise are those of `evaluate.t2m`. In every case (joints and density) the model gets positions of
-//! every crop, and its motion is compared with them: trajectory, location and average error, each a mean over motions. The motion is also measured by FID, R-precision, MM-Dist, Diversity and the skating ratio. Without its
-//! control part the same model, with the same noise, is measured against the same positions as `uncontrolled_...`.
+//! every crop, and its motion is compared with them: trajectory, location and average error, each a mean over motions. The
+//! motion is also measured by FID, R-precision, MM-Dist, Diversity and the measures of [`crate::metrics::physics`].
+//! Without its control part the same model, with the same noise, is measured against the same positions as
+//! `uncontrolled_...`.
 //!
 //! Departs: upstream measures 1,024 random entries in its spatial setting; here it is the whole split, as in its
 //! temporal setting. A motion without targets has no error.
@@ -12,13 +14,13 @@ use std::collections::BTreeMap;
 
 use motion::Stream;
 use protocol::Digest;
-use protocol::stage::{DataFormat, EvaluateControl};
+use protocol::stage::{DataFormat, EvaluateControl, PHYSICS};
 use serde::{Deserialize, Serialize};
 use serde_json::json;
 
 use crate::artifacts::Tensors;
 use crate::context::{AttemptContext, Outcome, StageError};
-use crate::evaluation::entry_draws::{Draw, EntryDraws, Ranking, skates};
+use crate::evaluation::entry_draws::{Draw, EntryDraws, Ranking, mean_physics, physics};
 use crate::evaluation::measured;
 use crate::evaluation::report::over_repeats;
 use crate::generate::generator::{self, Batch, ControlRequest, MotionGenerator, Texts};
@@ -138,8 +140,8 @@ struct Values {
     real: Vec<f32>,
     /// Embeddings by unit; within a unit by variant, without the control part first.
     made: Vec<f32>,
-    /// Skating ratios in the same order.
-    skating: Vec<f32>,
+    /// Physics of the motions in the same order.
+    physics: Vec<f32>,
     /// [`ERRORS`] by unit and case, of each motion without the control part, then with it; NaN for a motion without
     /// targets.
     errors: Vec<f32>,
@@ -148,7 +150,7 @@ struct Values {
 impl Values {
     fn measure(&mut self, plan: &Plan<'_>, motions: &[Vec<f32>]) {
         let skeleton = plan.of.dataset.skeleton();
-        self.skating.extend(motions.iter().map(|motion| skates(motion, skeleton)));
+        self.physics.extend(motions.iter().flat_map(|motion| physics(motion, skeleton)));
         self.made.extend(plan.of.trained.motions(motions));
     }
 
@@ -207,7 +209,7 @@ impl Map for EvaluateControl {
             .with_rows("text", width, values.text)
             .with_rows("real", width, values.real)
             .with_rows("made", width, values.made)
-            .with("skating", [values.skating.len()], values.skating)
+            .with_rows("physics", PHYSICS.len(), values.physics)
             .with_rows("errors", ERRORS.len(), values.errors);
         shards::publish(cx, &Units { units }, VALUES_FILE, &tensors, BTreeMap::new())
     }
@@ -237,7 +239,7 @@ struct Gathered {
     real: Vec<f64>,
     /// Embeddings by variant, without the control part first.
     made: Vec<Vec<f64>>,
-    skating: Vec<Vec<f64>>,
+    physics: Vec<Vec<f64>>,
     /// Errors by case, without the control part and with it.
     errors: Vec<[Vec<f64>; 2]>,
 }
@@ -252,7 +254,7 @@ fn gather(cx: &dyn AttemptContext, plan: &Plan<'_>, digests: &[Digest]) -> Resul
         let text = take("text", 2)?;
         let real = take("real", 2)?;
         let made = take("made", 2)?;
-        let skating = take("skating", 1)?;
+        let physics = take("physics", 2)?;
         let errors = take("errors", 2)?;
         let mut row = 0;
         for unit in units {
@@ -264,7 +266,7 @@ fn gather(cx: &dyn AttemptContext, plan: &Plan<'_>, digests: &[Digest]) -> Resul
                 text: cut(&text, row, width),
                 real: cut(&real, row, width),
                 made: (0..ways).map(|w| cut(&made, way(w), width)).collect(),
-                skating: (0..ways).map(|w| cut(&skating, way(w), 1)).collect(),
+                physics: (0..ways).map(|w| cut(&physics, way(w), PHYSICS.len())).collect(),
                 errors: (0..plan.cases.len())
                     .map(|case| [0, 1].map(|with| cut(&errors, compared(case, with), ERRORS.len())))
                     .collect(),
@@ -276,7 +278,7 @@ fn gather(cx: &dyn AttemptContext, plan: &Plan<'_>, digests: &[Digest]) -> Resul
     shards::expect_units(parts.keys().copied(), plan.units())?;
     let empty = Gathered {
         made: vec![Vec::new(); ways],
-        skating: vec![Vec::new(); ways],
+        physics: vec![Vec::new(); ways],
         errors: vec![Default::default(); plan.cases.len()],
         ..Gathered::default()
     };
@@ -287,7 +289,7 @@ fn gather(cx: &dyn AttemptContext, plan: &Plan<'_>, digests: &[Digest]) -> Resul
         whole.real.extend(part.real);
         let both = |to: &mut Vec<Vec<f64>>, from: Vec<Vec<f64>>| to.iter_mut().zip(from).for_each(|(t, f)| t.extend(f));
         both(&mut whole.made, part.made);
-        both(&mut whole.skating, part.skating);
+        both(&mut whole.physics, part.physics);
         for (to, from) in whole.errors.iter_mut().zip(part.errors) {
             to.iter_mut().zip(from).for_each(|(t, f)| t.extend(f));
         }
@@ -298,11 +300,10 @@ fn gather(cx: &dyn AttemptContext, plan: &Plan<'_>, digests: &[Digest]) -> Resul
 /// The metrics of one repeat: of each case, and means over the cases.
 fn measure(plan: &Plan<'_>, all: &[Gathered], repeat: usize) -> BTreeMap<String, f64> {
     let all = &all[repeat];
-    let n = plan.of.entries.len() as f64;
     let ranking = Ranking { pools: &[POOL], kept: plan.of.entries.len(), shuffled: false };
     let space = |way: usize| -> BTreeMap<String, f64> {
         let mut metrics = plan.of.in_space(repeat, (&all.text, &all.made[way], &all.real), &ranking);
-        metrics.insert("skating_ratio".to_owned(), all.skating[way].iter().sum::<f64>() / n);
+        metrics.extend(mean_physics(&all.physics[way]));
         metrics
     };
     let errors = |case: usize, with: usize| -> Vec<(&'static str, f64)> {

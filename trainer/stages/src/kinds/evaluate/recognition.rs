@@ -25,7 +25,7 @@ use serde_json::json;
 
 use crate::artifacts::word;
 use crate::context::{AttemptContext, Outcome, StageError};
-use crate::evaluation::entry_draws::skates;
+use crate::evaluation::entry_draws::{mean_physics, physics};
 use crate::evaluation::measured::measured;
 use crate::evaluation::report::{finite, no_entries, publish_illustrated};
 use crate::generate::generator::{self, Batch};
@@ -206,13 +206,13 @@ impl Plain for EvaluateRecognition {
     }
 }
 
-/// Real clips of the split: their number and that of correct predictions by activity, and the skating of all.
+/// Real clips of the split: their number and that of correct predictions by activity, and the physics of each.
 struct Real {
     clips: Vec<usize>,
     right: Vec<usize>,
     /// Correct predictions for the reconstructions.
     reconstructed_right: Vec<usize>,
-    skating: f64,
+    physics: Vec<f64>,
 }
 
 impl Real {
@@ -225,7 +225,7 @@ impl Real {
     ) -> Self {
         let mut right = vec![0; looked_at.len()];
         let mut reconstructed_right = right.clone();
-        let mut skating = 0.0;
+        let mut physical = Vec::new();
         for (activity, entries) in looked_at.iter().enumerate() {
             for e in entries {
                 let rows = dataset.features(&dataset.entries[*e]);
@@ -233,11 +233,11 @@ impl Real {
                     |rows: &[f32]| usize::from(classifier.classify(&describe(rows, dataset.skeleton())) == activity);
                 right[activity] += shows(rows);
                 reconstructed_right[activity] += shows(&reconstruct(*e, rows));
-                skating += f64::from(skates(rows, dataset.skeleton()));
+                physical.extend(physics(rows, dataset.skeleton()).map(f64::from));
             }
         }
         let clips: Vec<usize> = looked_at.iter().map(Vec::len).collect();
-        Self { skating: skating / clips.iter().sum::<usize>() as f64, clips, right, reconstructed_right }
+        Self { physics: physical, clips, right, reconstructed_right }
     }
 }
 
@@ -246,14 +246,14 @@ impl Recognition<'_> {
         let right = |drawn: &&Drawn| drawn.taken == drawn.asked.activity;
         let share = |part: usize, of: usize| part as f64 / of as f64;
         let of_real = |right: &[usize]| share(right.iter().sum(), real.clips.iter().sum());
-        let skating = drawn.iter().map(|d| f64::from(skates(&d.rows, skeleton))).sum::<f64>() / drawn.len() as f64;
+        let made: Vec<f64> = drawn.iter().flat_map(|d| physics(&d.rows, skeleton)).map(f64::from).collect();
         let mut metrics = BTreeMap::from([
             ("accuracy".to_owned(), share(drawn.iter().filter(right).count(), drawn.len())),
             ("real_accuracy".to_owned(), of_real(&real.right)),
             ("reconstructed_accuracy".to_owned(), of_real(&real.reconstructed_right)),
-            ("skating".to_owned(), skating),
-            ("real_skating".to_owned(), real.skating),
         ]);
+        metrics.extend(mean_physics(&made));
+        metrics.extend(mean_physics(&real.physics).map(|(name, value)| (format!("real_{name}"), value)));
         for (i, activity) in self.0.activities.iter().enumerate() {
             let of_it = || drawn.iter().filter(move |d| d.asked.activity == i);
             if of_it().next().is_some() {

@@ -13,19 +13,20 @@
 use std::collections::BTreeMap;
 
 use motion::{Skeleton, Stream};
-use protocol::stage::{DataFormat, EvaluateReconstruction, Split};
+use protocol::stage::{DataFormat, EvaluateReconstruction, PHYSICS, Split};
 use protocol::{ArtifactKind, Digest};
 use serde::{Deserialize, Serialize};
 use serde_json::json;
 
 use crate::artifacts::{self, Draft, Tensors, to_meta};
 use crate::context::{AttemptContext, ContextError, Outcome, StageError};
+use crate::evaluation::entry_draws::mean_physics;
 use crate::evaluation::reconstructor::Reconstructor;
 use crate::evaluation::report::{REPORT_FILE, no_entries};
 use crate::kinds::shape::Map;
 use crate::metrics::frechet::{Gaussian, to_f64};
 use crate::metrics::joints::time_mean;
-use crate::metrics::reconstruction::{ClipErrors, real_skating, real_still, summary};
+use crate::metrics::reconstruction::{ClipErrors, real_physics, real_still, summary};
 use crate::parts::evaluator::TrainedEvaluator;
 use crate::shards::shard_range;
 
@@ -42,8 +43,8 @@ struct Row {
     /// Errors of the posterior's mean; `None` for a tokenizer.
     mu: Option<ClipErrors>,
     clip_mean: ClipErrors,
-    /// Skating ratio of the original clip.
-    real_skating: f64,
+    /// Physics of the original clip.
+    real_physics: [f64; PHYSICS.len()],
     /// Share of its jerks in which feet and wrists are still; `None` for fewer than 4 frames.
     real_still: Option<f64>,
 }
@@ -176,7 +177,7 @@ impl Map for EvaluateReconstruction {
                 sample: errors(&sample),
                 mu: mu.map(|mu| errors(&mu)),
                 clip_mean: errors(&time_mean(&truth, width)),
-                real_skating: real_skating(&truth, mean, std, skeleton),
+                real_physics: real_physics(&truth, mean, std, skeleton),
                 real_still: real_still(&truth, mean, std, skeleton),
             });
             cx.progress(rows.len() as u64, total, "clips", &[]);
@@ -221,8 +222,8 @@ impl Map for EvaluateReconstruction {
         }
         metrics.extend(usage(&codes));
         metrics.extend(summary(&column(|r| r.clip_mean), skeleton, "clip_mean_"));
-        let skating = rows.iter().map(|row| row.real_skating).sum::<f64>() / rows.len() as f64;
-        metrics.insert("real_skating_ratio".into(), skating);
+        let real: Vec<f64> = rows.iter().flat_map(|row| row.real_physics).collect();
+        metrics.extend(mean_physics(&real).map(|(name, value)| (format!("real_{name}"), value)));
         let still: Vec<f64> = rows.iter().filter_map(|row| row.real_still).collect();
         if !still.is_empty() {
             metrics.insert("real_still_ratio".into(), still.iter().sum::<f64>() / still.len() as f64);

@@ -3,7 +3,7 @@
 //!
 //! A repeat draws a caption and a crop for every entry of the split, and generates a motion for the caption, of the
 //! crop's length or of a length estimator's. The metrics are R-precision in pools and MM-Dist against the captions, FID
-//! against the crops, Diversity, MultiModality over more motions for some captions, and the skating ratio. `real`
+//! against the crops, Diversity, MultiModality over more motions for some captions, and the measures of [`crate::metrics::physics`]. `real`
 //! measures the crops themselves, and FID against a second draw of captions and crops. It adds `fid_halves`, one half
 //! of the clips against the other: the distance of two sets of other clips, at half the count. A `vae` or a `tokenizer`
 //! measures its reconstructions of the crops, and FID against these.
@@ -22,7 +22,7 @@ mod plan;
 use std::collections::BTreeMap;
 
 use protocol::Digest;
-use protocol::stage::{EvaluateT2m, Split};
+use protocol::stage::{EvaluateT2m, PHYSICS, Split};
 use serde_json::json;
 
 use self::maker::{Maker, Source, reconstruct};
@@ -30,7 +30,7 @@ use self::measure::{gather, measure};
 use self::plan::{EMBEDDINGS_FILE, Part, Plan, Unit};
 use crate::artifacts::Tensors;
 use crate::context::{AttemptContext, Outcome, StageError};
-use crate::evaluation::entry_draws::{BLOCK, Draw, skates};
+use crate::evaluation::entry_draws::{BLOCK, Draw, physics};
 use crate::evaluation::report::over_repeats;
 use crate::kinds::shape::Map;
 use crate::metrics::spread;
@@ -53,14 +53,14 @@ fn samples_of_one(plan: &Plan<'_>, maker: &Maker<'_>, unit: Unit) -> Result<Vec<
     Ok(embeddings)
 }
 
-/// Embeddings of a shard's captions and motions, and the skating of its motions.
+/// Embeddings of a shard's captions and motions, and the physics of its motions.
 #[derive(Default)]
 struct Measured {
     text: Vec<f32>,
     made: Vec<f32>,
     /// The motions that FID compares with.
     real: Vec<f32>,
-    skating: Vec<f32>,
+    physics: Vec<f32>,
     /// Samples for [`Part::Many`].
     many: Vec<f32>,
 }
@@ -95,7 +95,7 @@ impl Measured {
                 crops
             }
         };
-        self.skating.extend(motions.iter().map(|motion| skates(motion, plan.of.dataset.skeleton())));
+        self.physics.extend(motions.iter().flat_map(|motion| physics(motion, plan.of.dataset.skeleton())));
         self.made.extend(plan.of.trained.motions(&motions));
         Ok(())
     }
@@ -106,7 +106,7 @@ impl Measured {
             .with_rows("made", width, self.made)
             .with_rows("real", width, self.real)
             .with_rows("many", width, self.many)
-            .with("skating", [self.skating.len()], self.skating)
+            .with_rows("physics", PHYSICS.len(), self.physics)
     }
 }
 

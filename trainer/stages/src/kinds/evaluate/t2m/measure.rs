@@ -3,10 +3,11 @@
 use std::collections::BTreeMap;
 
 use protocol::Digest;
+use protocol::stage::PHYSICS;
 
 use super::plan::{EMBEDDINGS_FILE, Part, Plan, Unit};
 use crate::context::{AttemptContext, StageError};
-use crate::evaluation::entry_draws::{Ranking, reorder};
+use crate::evaluation::entry_draws::{Ranking, mean_physics, reorder};
 use crate::metrics::frechet::{Gaussian, to_f64};
 use crate::metrics::spread;
 use crate::shards::{self, Units};
@@ -18,7 +19,7 @@ pub(super) struct Gathered {
     made: BTreeMap<Unit, Vec<f64>>,
     real: BTreeMap<Unit, Vec<f64>>,
     many: BTreeMap<Unit, Vec<f64>>,
-    skating: BTreeMap<Unit, Vec<f64>>,
+    physics: BTreeMap<Unit, Vec<f64>>,
 }
 
 pub(super) fn gather(cx: &dyn AttemptContext, plan: &Plan<'_>, digests: &[Digest]) -> Result<Gathered, StageError> {
@@ -32,18 +33,18 @@ pub(super) fn gather(cx: &dyn AttemptContext, plan: &Plan<'_>, digests: &[Digest
         let made = take("made", 2)?;
         let real = take("real", 2)?;
         let many = take("many", 2)?;
-        let skating = take("skating", 1)?;
+        let physics = take("physics", 2)?;
         let mut row = 0;
         let mut extra = 0;
         for unit in units {
             match unit.part {
                 Part::Entries => {
                     let rows = row..row + plan.of.block(unit.block).len();
-                    let cut = |values: &[f64]| values[rows.start * width..rows.end * width].to_vec();
-                    all.text.insert(unit, cut(&text));
-                    all.made.insert(unit, cut(&made));
-                    all.real.insert(unit, cut(&real));
-                    all.skating.insert(unit, skating[rows.clone()].to_vec());
+                    let cut = |values: &[f64], width: usize| values[rows.start * width..rows.end * width].to_vec();
+                    all.text.insert(unit, cut(&text, width));
+                    all.made.insert(unit, cut(&made, width));
+                    all.real.insert(unit, cut(&real, width));
+                    all.physics.insert(unit, cut(&physics, PHYSICS.len()));
                     row = rows.end;
                 }
                 Part::Many => {
@@ -67,12 +68,11 @@ pub(super) fn measure(plan: &Plan<'_>, all: &Gathered, repeat: usize) -> BTreeMa
     let text = of(&all.text);
     let made = of(&all.made);
     let real = of(&all.real);
-    let skating = of(&all.skating);
+    let physics = of(&all.physics);
     let ranking = Ranking { pools: &plan.settings.pools, kept: plan.kept(), shuffled: plan.settings.shuffled };
     let mut metrics = plan.of.in_space(repeat, (&text, &made, &real), &ranking);
     let rows = plan.of.kept(repeat, plan.kept());
-    let skating = reorder(&skating, &rows, 1).iter().sum::<f64>() / rows.len() as f64;
-    metrics.insert("skating_ratio".to_owned(), skating);
+    metrics.extend(mean_physics(&reorder(&physics, &rows, PHYSICS.len())));
     if plan.settings.real {
         let made = reorder(&made, &rows, width);
         let order = plan.of.order("halves", repeat, rows.len());
