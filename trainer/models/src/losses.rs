@@ -114,6 +114,21 @@ impl Body {
         Self { skeleton, metres_per_unit: skeleton.metres_per_unit, mean: row(mean), std: row(std) }
     }
 
+    /// 1 where an ankle or a foot stands from a frame to the next, 0 elsewhere [B, T - 1, 3 per foot], by the contacts in
+    /// normalised features [B, T, D] of more than one frame.
+    fn standing(&self, features: &Tensor<3>) -> Tensor<3> {
+        let [batch, frames, _] = features.dims();
+        let contacts = self.skeleton.layout().contacts;
+        let of = |x: &Tensor<3>, frames: usize| {
+            let [batch, _, _] = x.dims();
+            x.clone().slice([0..batch, 0..frames, contacts.clone()])
+        };
+        let contacts = of(features, frames - 1) * of(&self.std, 1) + of(&self.mean, 1);
+        let feet = contacts.dims()[2];
+        let stands = contacts.greater_elem(0.5).float().reshape([batch, frames - 1, feet, 1]);
+        stands.repeat_dim(3, 3).reshape([batch, frames - 1, 3 * feet])
+    }
+
     /// Joints [B, T, J, 3] of normalised features [B, T, D], in the data's unit. Gradients flow through the running sums
     /// of turns and steps. The differentiable equivalent of `motion::features::recover_joints`.
     pub fn joints(&self, features: Tensor<3>) -> Tensor<4> {
@@ -209,6 +224,8 @@ pub struct VaeRecipe {
     pub velocity: Pointwise,
     /// Distance of the term on foot velocities.
     pub feet: Pointwise,
+    /// Distance of the term on the velocities of feet that stand.
+    pub contact: Pointwise,
     /// Distance of the term on the velocities of all joints.
     pub joint_velocity: Pointwise,
     /// Distance of the term on the accelerations of all joints.
@@ -218,8 +235,8 @@ pub struct VaeRecipe {
 impl From<VaeLoss> for VaeRecipe {
     /// Uses smooth L1 for all terms, as published.
     fn from(weights: VaeLoss) -> Self {
-        let [feature, joint, velocity, feet, joint_velocity, joint_acceleration] = [Pointwise::SmoothL1; 6];
-        Self { weights, feature, joint, velocity, feet, joint_velocity, joint_acceleration }
+        let [feature, joint, velocity, feet, contact, joint_velocity, joint_acceleration] = [Pointwise::SmoothL1; 7];
+        Self { weights, feature, joint, velocity, feet, contact, joint_velocity, joint_acceleration }
     }
 }
 
@@ -234,6 +251,8 @@ pub struct VaeTerms {
     pub velocity: Option<Tensor<1>>,
     /// The term on the velocities of ankles and feet.
     pub feet: Option<Tensor<1>>,
+    /// The term on the velocities of ankles and feet that stand.
+    pub contact: Option<Tensor<1>>,
     /// The term on the velocities of all joints.
     pub joint_velocity: Option<Tensor<1>>,
     /// The term on the accelerations of all joints.
@@ -249,13 +268,14 @@ impl VaeTerms {
     }
 
     /// The terms by the names under which they are recorded.
-    pub fn named(&self) -> [(&'static str, Option<Tensor<1>>); 7] {
-        let Self { feature, joint, velocity, feet, joint_velocity, joint_acceleration, kl } = self.clone();
+    pub fn named(&self) -> [(&'static str, Option<Tensor<1>>); 8] {
+        let Self { feature, joint, velocity, feet, contact, joint_velocity, joint_acceleration, kl } = self.clone();
         [
             ("feature", feature),
             ("joint", joint),
             ("velocity", velocity),
             ("feet", feet),
+            ("contact", contact),
             ("joint_velocity", joint_velocity),
             ("joint_acceleration", joint_acceleration),
             ("kl", kl),
@@ -285,28 +305,35 @@ pub fn vae(
     // Recovering the joints takes many operations, so all terms on joints share the result.
     let joints = weights.compares_joints().then(|| [body.metres(decoded.clone()), body.metres(features.clone())]);
     let compared = |x: &Tensor<4>| x.clone().reshape([batch, frames, 3 * body.skeleton.joints]);
-    let change = |weight: f64, distance: Pointwise, which: &[usize], derivative: Derivative| {
-        let [found, expected] = joints.as_ref().filter(|_| frames > derivative.order())?;
-        let lengths: Vec<usize> = lengths.iter().map(|length| length.saturating_sub(derivative.order())).collect();
-        let each = FrameWeights::masked(&lengths, frames - derivative.order(), &device);
-        let of = |x: &Tensor<4>| kernels::joint_derivative(x.clone(), which, derivative, body.skeleton.fps);
-        term(weight, &|| each.compare(distance, of(found), of(expected)))
-    };
+    let change =
+        |weight: f64, distance: Pointwise, which: &[usize], derivative: Derivative, of_those: Option<Tensor<3>>| {
+            let [found, expected] = joints.as_ref().filter(|_| frames > derivative.order())?;
+            let lengths: Vec<usize> = lengths.iter().map(|length| length.saturating_sub(derivative.order())).collect();
+            let each = FrameWeights::masked(&lengths, frames - derivative.order(), &device);
+            let of = |x: &Tensor<4>| {
+                let all = kernels::joint_derivative(x.clone(), which, derivative, body.skeleton.fps);
+                of_those.iter().fold(all, |all, mask| all * mask.clone())
+            };
+            term(weight, &|| each.compare(distance, of(found), of(expected)))
+        };
     let feet: Vec<usize> = body.skeleton.left_foot.iter().chain(&body.skeleton.right_foot).copied().collect();
     let all: Vec<usize> = (0..body.skeleton.joints).collect();
+    let standing = (weights.contact != 0.0 && frames > 1).then(|| body.standing(&features));
     VaeTerms {
         feature: term(weights.feature, &|| frame_weights.compare(recipe.feature, decoded.clone(), features.clone())),
         joint: joints.as_ref().and_then(|[found, expected]| {
             term(weights.joint, &|| frame_weights.compare(recipe.joint, compared(found), compared(expected)))
         }),
         velocity: term(weights.velocity, &|| frame_weights.compare(recipe.velocity, local(&decoded), local(&features))),
-        feet: change(weights.feet, recipe.feet, &feet, Derivative::Velocity),
-        joint_velocity: change(weights.joint_velocity, recipe.joint_velocity, &all, Derivative::Velocity),
+        feet: change(weights.feet, recipe.feet, &feet, Derivative::Velocity, None),
+        contact: change(weights.contact, recipe.contact, &feet, Derivative::Velocity, standing),
+        joint_velocity: change(weights.joint_velocity, recipe.joint_velocity, &all, Derivative::Velocity, None),
         joint_acceleration: change(
             weights.joint_acceleration,
             recipe.joint_acceleration,
             &all,
             Derivative::Acceleration,
+            None,
         ),
         kl: term(weights.kl, &|| kl(posterior)),
     }
@@ -407,6 +434,15 @@ mod tests {
         let found = terms.feet.expect("it has a weight").into_data().as_slice::<f32>().unwrap()[0];
         // One axis of three counts; smooth L1 of 2 is 1.5.
         assert!((found - 3.0 * 1.5 / 3.0).abs() < 1e-5, "{found}");
+
+        // Of the second clip's four feet, one stands in its first frame.
+        let mut lands = stands;
+        lands[5 * skeleton.features + skeleton.layout().contacts.start] = 1.0;
+        let weights = VaeLoss { feature: 0.0, joint: 0.0, contact: 3.0, kl: 0.0, ..VaeLoss::default() };
+        let terms = vae(&weights.into(), &body, rows(&glides), rows(&lands), &posterior, &[5, 3]);
+        let found = terms.contact.expect("it has a weight").into_data().as_slice::<f32>().unwrap()[0];
+        // One axis of twelve counts, in one of the clip's two steps.
+        assert!((found - 3.0 * 1.5 / 12.0 / 2.0).abs() < 1e-5, "{found}");
     }
 
     #[test]

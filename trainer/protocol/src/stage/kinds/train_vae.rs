@@ -25,6 +25,10 @@ pub struct VaeLoss {
     /// L_foot).
     #[schemars(range(min = 0.0, max = 1e6))]
     pub feet: f64,
+    /// As `feet`, only where an ankle or a foot stands in the clip, so that swinging feet do not outweigh sliding ones (our
+    /// choice; MDM's L_foot has the target zero).
+    #[schemars(range(min = 0.0, max = 1e6))]
+    pub contact: f64,
     /// Smooth L1 on the velocity of all joints, in m/s (our choice).
     #[schemars(range(min = 0.0, max = 1e6))]
     pub joint_velocity: f64,
@@ -48,6 +52,7 @@ impl Default for VaeLoss {
             joint: 1.0,
             velocity: 0.0,
             feet: 0.0,
+            contact: 0.0,
             joint_velocity: 0.0,
             joint_acceleration: 0.0,
             kl: 1e-4,
@@ -152,8 +157,9 @@ impl StageSpec for TrainVae {
     }
 
     fn recorded(&self) -> &'static [&'static str] {
-        if self.loss.joint_velocity != 0.0 || self.loss.joint_acceleration != 0.0 {
-            &["loss", "feature", "joint", "kl", "feet", "joint_velocity", "joint_acceleration"]
+        let VaeLoss { contact, joint_velocity, joint_acceleration, .. } = self.loss;
+        if [contact, joint_velocity, joint_acceleration].iter().any(|weight| *weight != 0.0) {
+            &["loss", "feature", "joint", "kl", "feet", "contact", "joint_velocity", "joint_acceleration"]
         } else if self.loss.feet != 0.0 {
             &["loss", "feature", "joint", "kl", "feet"]
         } else {
@@ -178,12 +184,13 @@ impl StageSpec for TrainVae {
 impl VaeLoss {
     /// Returns true if a term compares recovered joints or their derivatives.
     pub fn compares_joints(&self) -> bool {
-        [self.joint, self.feet, self.joint_velocity, self.joint_acceleration].iter().any(|weight| *weight != 0.0)
+        let Self { joint, feet, contact, joint_velocity, joint_acceleration, .. } = *self;
+        [joint, feet, contact, joint_velocity, joint_acceleration].iter().any(|weight| *weight != 0.0)
     }
 
     /// The loss without these terms.
     pub fn without_joints(&self) -> Self {
-        Self { joint: 0.0, feet: 0.0, joint_velocity: 0.0, joint_acceleration: 0.0, ..self.clone() }
+        Self { joint: 0.0, feet: 0.0, contact: 0.0, joint_velocity: 0.0, joint_acceleration: 0.0, ..self.clone() }
     }
 
     fn check(&self, p: &mut Problems) {
