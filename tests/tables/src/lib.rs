@@ -42,6 +42,23 @@ impl Number {
     fn once(value: f64, spread: Option<f64>) -> Self {
         Self { value, spread, mean: None }
     }
+
+    /// Half of the 95 % interval of the mean of several trainings.
+    fn half(&self) -> Result<f64, String> {
+        self.mean
+            .and_then(|mean| mean.half)
+            .ok_or_else(|| "only several trainings have a mean; name them with `*`".into())
+    }
+
+    /// The sign of a difference, if its interval excludes zero.
+    fn verdict(&self) -> Result<&'static str, String> {
+        let half = self.half()?;
+        Ok(match self.value {
+            value if value < -half => "lower",
+            value if value > half => "higher",
+            _ => "no difference shown",
+        })
+    }
 }
 
 /// Fills the places of a template.
@@ -74,10 +91,7 @@ fn fill(place: &str, source: &Source) -> Result<String, String> {
         }
         None => DECIMALS,
     };
-    let form = match words.first() {
-        Some(first @ (&"bare" | &"mean" | &"verdict")) => Some(*first),
-        _ => None,
-    };
+    let form = words.first().copied().filter(|word| ["bare", "mean"].contains(word));
     words.drain(..usize::from(form.is_some()));
     let number = match words[..] {
         ["set", stage, path] => return setting(source, stage, path),
@@ -85,23 +99,16 @@ fn fill(place: &str, source: &Source) -> Result<String, String> {
         [stage, metric] => value(source, stage, metric)?,
         [a, of_a, "/", b, of_b] => paired(source, (a, of_a), (b, of_b), |a, b| a / b)?,
         [a, of_a, "-", b, of_b] => paired(source, (a, of_a), (b, of_b), |a, b| a - b)?,
+        ["verdict", a, of_a, "-", b, of_b] => {
+            return Ok(paired(source, (a, of_a), (b, of_b), |a, b| a - b)?.verdict()?.to_owned());
+        }
         _ => return Err("expected such as `STAGE METRIC`".into()),
     };
-    let half = number.mean.and_then(|mean| mean.half);
     let spread = match form {
         None => number.spread,
-        Some("bare") => None,
-        Some(_) => Some(half.ok_or("only several trainings have a mean; name them with `*`")?),
+        Some("mean") => Some(number.half()?),
+        Some(_) => None,
     };
-    if form == Some("verdict") {
-        return match (words.get(2), spread) {
-            (Some(&"-"), Some(half)) if number.value.abs() > half => {
-                Ok(if number.value < 0.0 { "lower" } else { "higher" }.to_owned())
-            }
-            (Some(&"-"), _) => Ok("no difference shown".to_owned()),
-            _ => Err("a verdict is of a difference".into()),
-        };
-    }
     let value = number.value;
     Ok(match spread {
         Some(spread) => format!("{value:.decimals$} ± {spread:.decimals$}"),
@@ -232,7 +239,7 @@ mod tests {
             ("{{a_1 fdi}}", "`a_1` has no `fdi`"),
             ("{{a_1}}", "STAGE METRIC"),
             ("{{mean a_1 fid}}", "several trainings"),
-            ("{{verdict a_* fid / b_* fid}}", "of a difference"),
+            ("{{verdict a_1 fid - b_1 fid}}", "several trainings"),
             ("{{a_1 fid", "no end"),
             ("{{set a_1 stepps}}", "no setting `stepps`"),
             ("{{a_1 fid :x}}", "no number of decimals"),
