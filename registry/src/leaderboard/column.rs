@@ -30,8 +30,9 @@ const fn column(key: &'static str, head: &'static str, better: Better) -> Column
     Column { key, head, better }
 }
 
-/// Columns in the order of text-to-motion papers, then reconstruction and control, then metrics without an evaluator.
-pub(super) const COLUMNS: [Column; 31] = [
+/// Columns in the order of text-to-motion papers, then reconstruction and control, then metrics without an evaluator, and last the
+/// physical ones. A leaderboard without a metric ranks by the first column that its rows have.
+pub(super) const COLUMNS: [Column; 32] = [
     column("aits", "AITS (s)", Better::Lower),
     column("r_precision_top1", "R@1", Better::Higher),
     column("r_precision_top2", "R@2", Better::Higher),
@@ -47,10 +48,6 @@ pub(super) const COLUMNS: [Column; 31] = [
     column("sjpe", "sJPE", Better::Lower),
     column("sjpe_noise", "sJPE noise", Better::Lower),
     column("sjpe_static", "sJPE static", Better::Lower),
-    column("skating_ratio", "Skating", Better::Lower),
-    column("jerk", "Jerk m/s^3", Better::NearReal),
-    column("penetration_mm", "Penetration mm", Better::Lower),
-    column("bone_change_mm", "Bones mm", Better::Lower),
     column("trajectory_error", "Traj. err.", Better::Lower),
     column("location_error", "Loc. err.", Better::Lower),
     column("average_error_m", "Avg. err. (m)", Better::Lower),
@@ -63,6 +60,11 @@ pub(super) const COLUMNS: [Column; 31] = [
     column("match", "Match", Better::Lower),
     column("latent_std", "Latent std", Better::Neither),
     column("latent_r_precision_top3_test", "Latent R@3, test", Better::Higher),
+    column("accuracy", "Recognised", Better::Higher),
+    column("skating_ratio", "Skating", Better::Lower),
+    column("jerk", "Jerk m/s^3", Better::NearReal),
+    column("penetration_mm", "Penetration mm", Better::Lower),
+    column("bone_change_mm", "Bones mm", Better::Lower),
 ];
 
 /// Data formats; the papers' datasets have the same names.

@@ -15,8 +15,8 @@ pub struct Measure {
 }
 
 impl Measure {
-    /// The mean of several trainings with the 95 % interval of Student's distribution, which is there from two values on.
-    /// `None` without values.
+    /// The mean of several trainings, with the 95 % interval of Student's distribution if there are at least two. `None`
+    /// without values.
     pub fn of_trainings(values: &[f64]) -> Option<Self> {
         let count = values.len() as f64;
         let degrees = values.len().checked_sub(1)?;

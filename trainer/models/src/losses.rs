@@ -114,8 +114,8 @@ impl Body {
         Self { skeleton, metres_per_unit: skeleton.metres_per_unit, mean: row(mean), std: row(std) }
     }
 
-    /// 1 where an ankle or a foot stands from a frame to the next, 0 elsewhere [B, T - 1, 3 per foot], by the contacts in
-    /// normalised features [B, T, D] of more than one frame.
+    /// 1 where an ankle or a foot stands from a frame to the next, 0 elsewhere: [B, T - 1, 3 per foot]. The contacts in the
+    /// normalised features [B, T, D] say so; T is at least 2.
     fn standing(&self, features: &Tensor<3>) -> Tensor<3> {
         let [batch, frames, _] = features.dims();
         let contacts = self.skeleton.layout().contacts;
@@ -306,13 +306,13 @@ pub fn vae(
     let joints = weights.compares_joints().then(|| [body.metres(decoded.clone()), body.metres(features.clone())]);
     let compared = |x: &Tensor<4>| x.clone().reshape([batch, frames, 3 * body.skeleton.joints]);
     let change =
-        |weight: f64, distance: Pointwise, which: &[usize], derivative: Derivative, of_those: Option<Tensor<3>>| {
+        |weight: f64, distance: Pointwise, which: &[usize], derivative: Derivative, mask: Option<Tensor<3>>| {
             let [found, expected] = joints.as_ref().filter(|_| frames > derivative.order())?;
             let lengths: Vec<usize> = lengths.iter().map(|length| length.saturating_sub(derivative.order())).collect();
             let each = FrameWeights::masked(&lengths, frames - derivative.order(), &device);
             let of = |x: &Tensor<4>| {
                 let all = kernels::joint_derivative(x.clone(), which, derivative, body.skeleton.fps);
-                of_those.iter().fold(all, |all, mask| all * mask.clone())
+                mask.iter().fold(all, |all, mask| all * mask.clone())
             };
             term(weight, &|| each.compare(distance, of(found), of(expected)))
         };
@@ -435,7 +435,7 @@ mod tests {
         // One axis of three counts; smooth L1 of 2 is 1.5.
         assert!((found - 3.0 * 1.5 / 3.0).abs() < 1e-5, "{found}");
 
-        // Of the second clip's four feet, one stands in its first frame.
+        // One ankle of the second clip stands in the first frame.
         let mut lands = stands;
         lands[5 * skeleton.features + skeleton.layout().contacts.start] = 1.0;
         let weights = VaeLoss { feature: 0.0, joint: 0.0, contact: 3.0, kl: 0.0, ..VaeLoss::default() };

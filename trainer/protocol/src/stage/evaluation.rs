@@ -18,8 +18,8 @@ pub enum Split {
 }
 
 /// Measures of a motion that need no other motion: the share of steps in which a foot skates, the mean jerk of feet and
-/// wrists in m/s^3, the depth of the lowest joint below the floor, and how much bones change their lengths. Every
-/// evaluation of motions reports them.
+/// wrists in m/s^3, the depth of the lowest joint below the floor, and how much bones change their lengths. All
+/// evaluations of motions report them, except `evaluate.spectrum`.
 pub const PHYSICS: [&str; 4] = ["skating_ratio", "jerk", "penetration_mm", "bone_change_mm"];
 
 /// Direction of a metric.

@@ -7,10 +7,10 @@
 use std::collections::BTreeMap;
 use std::ops::Range;
 
+use motion::Stream;
 use motion::dataset::{Dataset, crop};
 use motion::random::permutation;
-use motion::{Skeleton, Stream};
-use protocol::stage::{PHYSICS, Split};
+use protocol::stage::Split;
 use protocol::{ArtifactKind, Digest, Seed};
 use serde_json::{Value, json};
 
@@ -18,7 +18,6 @@ use super::report::{Repeats, joined, no_entries, publish_illustrated};
 use crate::artifacts::{self, word};
 use crate::context::{AttemptContext, Outcome, StageError};
 use crate::metrics::frechet::Gaussian;
-use crate::metrics::physics::physics_of_features;
 use crate::metrics::retrieval::in_groups;
 use crate::metrics::spread;
 use crate::parts::evaluator::TrainedEvaluator;
@@ -225,20 +224,6 @@ impl EntryDraws {
         });
         publish_illustrated(cx, metrics, joined(common, meta), joined(common_details, details), vec![])
     }
-}
-
-/// [`physics`](crate::metrics::physics) of a motion's features.
-pub(crate) fn physics(features: &[f32], skeleton: &Skeleton) -> [f32; PHYSICS.len()] {
-    physics_of_features(features, skeleton).map(|value| value as f32)
-}
-
-/// Means over motions of what [`physics`] gives, by name.
-pub(crate) fn mean_physics(rows: &[f64]) -> impl Iterator<Item = (String, f64)> + '_ {
-    let motions = rows.len() / PHYSICS.len();
-    PHYSICS.iter().enumerate().map(move |(i, name)| {
-        let sum: f64 = rows.iter().skip(i).step_by(PHYSICS.len()).sum();
-        ((*name).to_owned(), sum / motions as f64)
-    })
 }
 
 /// Reorders the rows of `values` by `rows`.

@@ -35,11 +35,20 @@ pub fn physics_of_features(features: &[f32], skeleton: &Skeleton) -> [f64; PHYSI
     physics(&metres, skeleton)
 }
 
+/// Means over motions, by name; `rows` are the measures of one motion after the other.
+pub fn mean_physics(rows: &[f64]) -> impl Iterator<Item = (String, f64)> + '_ {
+    let motions = rows.len() / PHYSICS.len();
+    PHYSICS.iter().enumerate().map(move |(i, name)| {
+        let sum: f64 = rows.iter().skip(i).step_by(PHYSICS.len()).sum();
+        ((*name).to_owned(), sum / motions as f64)
+    })
+}
+
 fn mean(values: &[f64]) -> f64 {
     values.iter().sum::<f64>() / values.len().max(1) as f64
 }
 
-/// How far the lowest joint is below the floor, by frame.
+/// Depth of the lowest joint below the floor, by frame.
 fn depths(metres: &[f64], count: usize) -> Vec<f64> {
     let lowest = |pose: &[f64]| pose.chunks_exact(AXES).map(|joint| joint[1]).fold(f64::INFINITY, f64::min);
     metres.chunks_exact(count * AXES).map(|pose| (-lowest(pose)).max(0.0)).collect()

@@ -15,7 +15,7 @@ use protocol::stage::PHYSICS;
 use serde::{Deserialize, Serialize};
 
 use super::jerk::{JerkError, jerk, joints_of};
-use super::physics::physics;
+use super::physics::{mean_physics, physics};
 use super::{joints, procrustes};
 
 /// Jerk of a joint at rest in m/s^3, that of waves of some hundredths of a millimetre at 20 frames a second.
@@ -135,9 +135,6 @@ pub fn summary(clips: &[ClipErrors], skeleton: &Skeleton, prefix: &str) -> BTree
         ("feature_error", per_frame(|c| c.feature_distance)),
         ("feature_smooth_l1", per_frame(|c| c.smooth_l1 * c.frames as f64)),
     ];
-    for (i, name) in PHYSICS.into_iter().enumerate() {
-        metrics.push((name, clips.iter().map(|c| c.physics[i]).sum::<f64>() / clips.len() as f64));
-    }
     if inner > 0 {
         metrics.push(("acceleration_mm", sum(|c| c.acceleration) / inner as f64 * millimetres));
     }
@@ -147,7 +144,9 @@ pub fn summary(clips: &[ClipErrors], skeleton: &Skeleton, prefix: &str) -> BTree
         let (noise, statics) = (mean(|j| j.noise), mean(|j| j.statics));
         metrics.extend([("sjpe", noise + statics), ("sjpe_noise", noise), ("sjpe_static", statics)]);
     }
-    metrics.into_iter().map(|(name, value)| (format!("{prefix}{name}"), value)).collect()
+    let physics: Vec<f64> = clips.iter().flat_map(|c| c.physics).collect();
+    let all = metrics.into_iter().map(|(name, value)| (name.to_owned(), value)).chain(mean_physics(&physics));
+    all.map(|(name, value)| (format!("{prefix}{name}"), value)).collect()
 }
 
 #[cfg(test)]

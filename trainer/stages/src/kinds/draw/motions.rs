@@ -19,10 +19,9 @@ use serde_json::json;
 
 use crate::artifacts;
 use crate::context::{AttemptContext, Outcome, StageError};
-use crate::evaluation::entry_draws::mean_physics;
 use crate::generate::{Generated, Generator};
 use crate::kinds::shape::Plain;
-use crate::metrics::physics::physics;
+use crate::metrics::physics::{mean_physics, physics};
 use crate::parts::control::ControlOptions;
 use crate::parts::hint::Hint;
 

@@ -20,12 +20,13 @@ use serde_json::json;
 
 use crate::artifacts::Tensors;
 use crate::context::{AttemptContext, Outcome, StageError};
-use crate::evaluation::entry_draws::{Draw, EntryDraws, Ranking, mean_physics, physics};
+use crate::evaluation::entry_draws::{Draw, EntryDraws, Ranking};
 use crate::evaluation::measured;
 use crate::evaluation::report::over_repeats;
 use crate::generate::generator::{self, Batch, ControlRequest, MotionGenerator, Texts};
 use crate::kinds::shape::Map;
 use crate::metrics::frechet::to_f64;
+use crate::metrics::physics::{mean_physics, physics_of_features};
 use crate::parts::control::ControlOptions;
 use crate::parts::hint::{Hint, metres, share, told_frames};
 use crate::shards::{self, Units, in_turn};
@@ -150,7 +151,8 @@ struct Values {
 impl Values {
     fn measure(&mut self, plan: &Plan<'_>, motions: &[Vec<f32>]) {
         let skeleton = plan.of.dataset.skeleton();
-        self.physics.extend(motions.iter().flat_map(|motion| physics(motion, skeleton)));
+        let physics = motions.iter().flat_map(|motion| physics_of_features(motion, skeleton));
+        self.physics.extend(physics.map(|value| value as f32));
         self.made.extend(plan.of.trained.motions(motions));
     }
 

@@ -25,11 +25,11 @@ use serde_json::json;
 
 use crate::artifacts::word;
 use crate::context::{AttemptContext, Outcome, StageError};
-use crate::evaluation::entry_draws::{mean_physics, physics};
 use crate::evaluation::measured::measured;
 use crate::evaluation::report::{finite, no_entries, publish_illustrated};
 use crate::generate::generator::{self, Batch};
 use crate::kinds::shape::Plain;
+use crate::metrics::physics::{mean_physics, physics_of_features};
 use crate::metrics::recognition::{Classifier, describe};
 
 /// Largest number of training clips per activity; the training time grows with the cube of all clips.
@@ -225,7 +225,7 @@ impl Real {
     ) -> Self {
         let mut right = vec![0; looked_at.len()];
         let mut reconstructed_right = right.clone();
-        let mut physical = Vec::new();
+        let mut physics = Vec::new();
         for (activity, entries) in looked_at.iter().enumerate() {
             for e in entries {
                 let rows = dataset.features(&dataset.entries[*e]);
@@ -233,11 +233,11 @@ impl Real {
                     |rows: &[f32]| usize::from(classifier.classify(&describe(rows, dataset.skeleton())) == activity);
                 right[activity] += shows(rows);
                 reconstructed_right[activity] += shows(&reconstruct(*e, rows));
-                physical.extend(physics(rows, dataset.skeleton()).map(f64::from));
+                physics.extend(physics_of_features(rows, dataset.skeleton()));
             }
         }
         let clips: Vec<usize> = looked_at.iter().map(Vec::len).collect();
-        Self { physics: physical, clips, right, reconstructed_right }
+        Self { physics, clips, right, reconstructed_right }
     }
 }
 
@@ -246,7 +246,7 @@ impl Recognition<'_> {
         let right = |drawn: &&Drawn| drawn.taken == drawn.asked.activity;
         let share = |part: usize, of: usize| part as f64 / of as f64;
         let of_real = |right: &[usize]| share(right.iter().sum(), real.clips.iter().sum());
-        let made: Vec<f64> = drawn.iter().flat_map(|d| physics(&d.rows, skeleton)).map(f64::from).collect();
+        let made: Vec<f64> = drawn.iter().flat_map(|d| physics_of_features(&d.rows, skeleton)).collect();
         let mut metrics = BTreeMap::from([
             ("accuracy".to_owned(), share(drawn.iter().filter(right).count(), drawn.len())),
             ("real_accuracy".to_owned(), of_real(&real.right)),

@@ -20,12 +20,12 @@ use serde_json::json;
 
 use crate::artifacts::{self, Draft, Tensors, to_meta};
 use crate::context::{AttemptContext, ContextError, Outcome, StageError};
-use crate::evaluation::entry_draws::mean_physics;
 use crate::evaluation::reconstructor::Reconstructor;
 use crate::evaluation::report::{REPORT_FILE, no_entries};
 use crate::kinds::shape::Map;
 use crate::metrics::frechet::{Gaussian, to_f64};
 use crate::metrics::joints::time_mean;
+use crate::metrics::physics::mean_physics;
 use crate::metrics::reconstruction::{ClipErrors, real_physics, real_still, summary};
 use crate::parts::evaluator::TrainedEvaluator;
 use crate::shards::shard_range;

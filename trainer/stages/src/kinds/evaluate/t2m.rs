@@ -3,10 +3,10 @@
 //!
 //! A repeat draws a caption and a crop for every entry of the split, and generates a motion for the caption, of the
 //! crop's length or of a length estimator's. The metrics are R-precision in pools and MM-Dist against the captions, FID
-//! against the crops, Diversity, MultiModality over more motions for some captions, and the measures of [`crate::metrics::physics`]. `real`
-//! measures the crops themselves, and FID against a second draw of captions and crops. It adds `fid_halves`, one half
-//! of the clips against the other: the distance of two sets of other clips, at half the count. A `vae` or a `tokenizer`
-//! measures its reconstructions of the crops, and FID against these.
+//! against the crops, Diversity, MultiModality over more motions for some captions, and the measures of
+//! [`crate::metrics::physics`]. `real` measures the crops themselves, and FID against a second draw of captions and
+//! crops. It adds `fid_halves`, one half of the clips against the other: the distance of two sets of other clips, at
+//! half the count. A `vae` or a `tokenizer` measures its reconstructions of the crops, and FID against these.
 //!
 //! All draws are keyed by (seed, repeat, entry) and not by the stage's name, so that two models of a run are compared
 //! on the same captions, lengths and noise. Motions are made in blocks that depend only on the entry's number, and
@@ -30,9 +30,10 @@ use self::measure::{gather, measure};
 use self::plan::{EMBEDDINGS_FILE, Part, Plan, Unit};
 use crate::artifacts::Tensors;
 use crate::context::{AttemptContext, Outcome, StageError};
-use crate::evaluation::entry_draws::{BLOCK, Draw, physics};
+use crate::evaluation::entry_draws::{BLOCK, Draw};
 use crate::evaluation::report::over_repeats;
 use crate::kinds::shape::Map;
+use crate::metrics::physics::physics_of_features;
 use crate::metrics::spread;
 use crate::shards::{self, Units, in_turn};
 use crate::stand_in::CLIPS;
@@ -95,7 +96,9 @@ impl Measured {
                 crops
             }
         };
-        self.physics.extend(motions.iter().flat_map(|motion| physics(motion, plan.of.dataset.skeleton())));
+        let skeleton = plan.of.dataset.skeleton();
+        let physics = motions.iter().flat_map(|motion| physics_of_features(motion, skeleton));
+        self.physics.extend(physics.map(|value| value as f32));
         self.made.extend(plan.of.trained.motions(&motions));
         Ok(())
     }

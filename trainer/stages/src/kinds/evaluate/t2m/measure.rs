@@ -7,8 +7,9 @@ use protocol::stage::PHYSICS;
 
 use super::plan::{EMBEDDINGS_FILE, Part, Plan, Unit};
 use crate::context::{AttemptContext, StageError};
-use crate::evaluation::entry_draws::{Ranking, mean_physics, reorder};
+use crate::evaluation::entry_draws::{Ranking, reorder};
 use crate::metrics::frechet::{Gaussian, to_f64};
+use crate::metrics::physics::mean_physics;
 use crate::metrics::spread;
 use crate::shards::{self, Units};
 
