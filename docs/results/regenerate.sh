@@ -1,17 +1,20 @@
 #!/usr/bin/env bash
-# Runs a pipeline and writes its results: NAME.json, as `trainer run -o json` prints it, and NAME.md, the template NAME.in.md filled from it and
-# from the pipeline. The book includes the text.
+# Runs pipelines and writes the results of each: NAME.json, as `trainer run -o json` prints it, and NAME.md, the template NAME.in.md filled from it
+# and from the pipeline. The book includes the text.
 #
+#   docs/results/regenerate.sh docs/results/bandai*.yaml
 #   docs/results/regenerate.sh docs/results/mini.yaml --set dataset.path=PATH/TO/humanml3d-mini
 #
-# Arguments after the pipeline are those of `trainer run`. Results in the store are not computed again: a second run only writes the text.
+# Arguments after the pipelines are those of `trainer run`. Results in the store are not computed again: a second run only writes the text.
 # TRAINER and TABLES name existing binaries.
 set -euo pipefail
 
-[ $# -ge 1 ] && [ -f "$1" ] || { echo "usage: $0 PIPELINE.yaml [options of trainer run]" >&2; exit 2; }
-pipeline=$(realpath "$1")
-shift
-base=${pipeline%.yaml}
+[ $# -ge 1 ] && [ -f "$1" ] || { echo "usage: $0 PIPELINE.yaml... [options of trainer run]" >&2; exit 2; }
+pipelines=()
+while [ $# -ge 1 ] && [ -f "$1" ]; do
+    pipelines+=("$(realpath "$1")")
+    shift
+done
 repository=$(cd "$(dirname "${BASH_SOURCE[0]}")/../.." && pwd)
 built() { cargo build --quiet --release --locked --bin "$1" --manifest-path "$repository/Cargo.toml" && echo "$repository/target/release/$1"; }
 trainer=${TRAINER:-$(built trainer)}
@@ -26,9 +29,12 @@ for ((i = 1; i <= $#; i++)); do
         --set=*) sets+=("${!i}") ;;
     esac
 done
-"$trainer" config show "$pipeline" "${sets[@]}" -o json > "$work/pipeline.json"
-"$trainer" run "$pipeline" "$@" -o json > "$work/run.json"
-"$tables" "$base.in.md" "$work/run.json" "$work/pipeline.json" "$work/text.md"
-cp "$work/run.json" "$base.json"
-mv "$work/text.md" "$base.md"
-echo "$base.json, $base.md"
+for pipeline in "${pipelines[@]}"; do
+    base=${pipeline%.yaml}
+    "$trainer" config show "$pipeline" "${sets[@]}" -o json > "$work/pipeline.json"
+    "$trainer" run "$pipeline" "$@" -o json > "$work/run.json"
+    "$tables" "$base.in.md" "$work/run.json" "$work/pipeline.json" "$work/text.md"
+    cp "$work/run.json" "$base.json"
+    mv "$work/text.md" "$base.md"
+    echo "$base.json, $base.md"
+done

@@ -100,6 +100,7 @@ fn a_shipped_template_can_be_filled(bench: &Bench, toy: &Value, path: &Path) {
     let stages = pipeline["stages"].as_array().expect("stages").iter().map(|stage| {
         let own = if stage["settings"].is_object() { &stage["settings"] } else { stage };
         let metrics = match own["kind"].as_str().expect("a kind") {
+            "evaluate.reconstruction" if own["evaluator"] != "" => with("recon", &["fid".to_owned()]),
             "evaluate.reconstruction" => with("recon", &[]),
             "evaluate.latent_fid" => with("fid", &[]),
             "evaluate.recognition" => with("shown", &activities(own)),
