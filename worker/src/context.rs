@@ -21,7 +21,7 @@ use crate::failpoints;
 use crate::gang::exchange::{self, Contribution};
 use crate::gang::member::Phase;
 use crate::gang::mesh::{Halt, Mesh};
-use crate::gang::rendezvous::{self, Met};
+use crate::gang::rendezvous::{self, Line, Met};
 use crate::gang::tree;
 use crate::process;
 use crate::receipts::Receipts;
@@ -56,9 +56,7 @@ pub(crate) struct HttpContext {
 #[derive(Debug)]
 struct Behind {
     mesh: Arc<Mesh>,
-    source: usize,
-    /// Steps applied to that state.
-    step: u64,
+    line: Line,
     applied: Option<u64>,
     begun: Instant,
 }
@@ -334,8 +332,8 @@ impl GangContext for HttpContext {
             let length = (kept.len() as u64).to_le_bytes();
             let offered: Vec<&[u8]> = state.iter().copied().chain([&kept[..], &length[..]]).collect();
             match rendezvous::rendezvous(&mesh, applied, &offered, &|| held.halt(generation)) {
-                Ok(Met::Behind(source, step)) => {
-                    self.behind = Some(Behind { mesh, source, step, applied, begun: Instant::now() });
+                Ok(Met::Behind(line)) => {
+                    self.behind = Some(Behind { mesh, line, applied, begun: Instant::now() });
                     return Ok(Rendezvous::Behind);
                 }
                 Ok(Met::Keep) => {
@@ -348,16 +346,17 @@ impl GangContext for HttpContext {
     }
 
     fn adopt(&mut self, state: &mut [&mut [u8]]) -> Result<Adopted, ContextError> {
-        let Some(Behind { mesh, source, step, applied, begun }) = self.behind.take() else { return Ok(Adopted::Cut) };
+        let Some(Behind { mesh, line, applied, begun }) = self.behind.take() else { return Ok(Adopted::Cut) };
         let held = self.held.clone();
         let generation = mesh.config.generation;
         let directly = applied.is_none();
-        match rendezvous::adopt(&mesh, source, state, directly, &|| held.halt(generation)) {
+        match rendezvous::adopt(&mesh, line, state, directly, &|| held.halt(generation)) {
             Ok(rest) => {
                 let rows = rows(&rest).ok_or_else(|| "is truncated".to_owned());
                 let taken = rows.and_then(|rows| self.telemetry.take_over(rows, applied).map_err(|e| e.to_string()));
                 // The peer's bytes may already overwrite this member's own state, so this try has failed.
                 taken.map_err(|why| ContextError::Fault(format!("a peer's list of recorded values {why}")))?;
+                let step = line.step;
                 self.held.set_holds(Some(step));
                 let bytes = state.iter().map(|piece| piece.len()).sum::<usize>() + rest.len();
                 self.met(&mesh, Some(step), Some((bytes, begun.elapsed().as_secs_f64())));
@@ -374,7 +373,13 @@ impl GangContext for HttpContext {
         self.mesh.as_ref().map_or(0..0, |mesh| tree::share(slices, mesh.config.rank, mesh.size()))
     }
 
-    fn exchange(&mut self, step: u64, slices: usize, parts: &[(usize, Vec<f32>)]) -> Result<Exchange, ContextError> {
+    fn exchange(
+        &mut self,
+        steps: Range<u64>,
+        slices: usize,
+        parts: &[(usize, Vec<f32>)],
+    ) -> Result<Exchange, ContextError> {
+        let step = steps.start;
         self.check()?;
         let saved = self.held.busy().phase() == Phase::Saving;
         self.held.busy().set(Phase::Working);
@@ -412,7 +417,7 @@ impl GangContext for HttpContext {
         }
         match exchanged {
             Ok(total) => {
-                self.held.set_holds(Some(step + 1));
+                self.held.set_holds(Some(steps.end));
                 self.telemetry.forget(total.durable);
                 Ok(Exchange::Sum { sum: total.sum, drain: total.drain })
             }

@@ -314,10 +314,16 @@ impl GangContext for Member {
         slices * rank / of..slices * (rank + 1) / of
     }
 
-    fn exchange(&mut self, step: u64, slices: usize, parts: &[(usize, Vec<f32>)]) -> Result<Exchange, ContextError> {
+    fn exchange(
+        &mut self,
+        steps: Range<u64>,
+        slices: usize,
+        parts: &[(usize, Vec<f32>)],
+    ) -> Result<Exchange, ContextError> {
+        let step = steps.start;
         let gang = Arc::clone(&self.gang);
         let mut state = lock(&gang.state);
-        if self.lost_at.is_some_and(|at| step >= at) {
+        if self.lost_at.is_some_and(|at| steps.end > at) {
             let me = self.me;
             state.regroup(|members| members.retain(|m| *m != me));
             gang.changed.notify_all();
@@ -327,7 +333,7 @@ impl GangContext for Member {
             Some((at, sum)) if *at == step => Some(Arc::clone(sum)),
             _ => None,
         };
-        let drain = self.drain.is_some_and(|at| step >= at);
+        let drain = self.drain.is_some_and(|at| steps.end > at);
         if state.generation != self.generation {
             return Ok(Exchange::Regroup);
         }
@@ -442,7 +448,7 @@ mod tests {
                 .share(SLICES)
                 .map(|slice| (slice, vec![(value + slice as f32 * 0.1 + step as f32 * 1e3).sin()]))
                 .collect();
-            match cx.exchange(step, SLICES, &parts)? {
+            match cx.exchange(step..step + 1, SLICES, &parts)? {
                 Exchange::Regroup => (step, value) = meet(cx, applied, (step, value))?,
                 Exchange::Sum { sum, drain } => {
                     (step, value) = (step + 1, value + sum[0]);

@@ -48,7 +48,7 @@ pub use placement::{CheckpointPolicy, Keep, Placement, WorkerRange};
 pub use problems::{Problem, Problems};
 pub use sampler::{Family, Sampler, Solver, measured_with};
 pub use spec::{LossChange, Output, Ref, Shape, StageSpec, Target};
-pub use training::{Batch, Decay, Optimizer, Training};
+pub use training::{Batch, Decay, Optimizer, Replicas, Training};
 
 /// A folder or file outside the store that a stage reads.
 #[derive(Debug, Clone, PartialEq, Eq)]

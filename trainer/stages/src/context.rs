@@ -134,11 +134,11 @@ pub enum Adopted {
 /// Result of an exchange between members.
 #[derive(Debug)]
 pub enum Exchange {
-    /// The sum over all slices of the step, along the fixed tree.
+    /// The sum over all slices, along the fixed tree.
     Sum {
         /// Element-wise sum.
         sum: Vec<f32>,
-        /// Equal for all members: stop after applying this step (save, then yield).
+        /// Equal for all members: stop after applying it (save, then yield).
         drain: bool,
     },
     /// The membership changed before the sum was complete. Call [`GangContext::rendezvous`], then compute those of your
@@ -188,13 +188,19 @@ pub trait GangContext: AttemptContext {
     /// once.
     fn adopt(&mut self, state: &mut [&mut [u8]]) -> Result<Adopted, ContextError>;
 
-    /// This worker's slices of the coming step, a contiguous range of `0..slices`. Only
+    /// This worker's slices of the coming exchange, a contiguous range of `0..slices`. Only
     /// [`rendezvous`](Self::rendezvous) changes it.
     fn share(&self, slices: usize) -> Range<usize>;
 
-    /// Sums `parts` over all slices of `step` from all members, along the fixed binary tree over `0..slices`. `parts`
-    /// are this worker's slices in order: vectors of equal length.
-    fn exchange(&mut self, step: u64, slices: usize, parts: &[(usize, Vec<f32>)]) -> Result<Exchange, ContextError>;
+    /// Sums `parts` from all members, along the fixed binary tree over `0..slices`. `parts` are this worker's slices in
+    /// order: vectors of equal length. `steps` are the updates that the sum makes: one, or those of a round of replicas,
+    /// which are then the slices.
+    fn exchange(
+        &mut self,
+        steps: Range<u64>,
+        slices: usize,
+        parts: &[(usize, Vec<f32>)],
+    ) -> Result<Exchange, ContextError>;
 
     /// Returns true for rank 0, the only member that saves, records and reports.
     fn leads(&self) -> bool;

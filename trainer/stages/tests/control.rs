@@ -9,8 +9,8 @@ use protocol::artifact::Role;
 use protocol::stage::{
     Batch, ControlDistance, ControlFeedback, ControlHints, ControlLoss, ControlMean, ControlSetting, DataFormat,
     DataSynthetic, Decay, DistillLcm, DistillPcm, Distillation, DrawMotions, EncodeLatents, EvaluateControl,
-    EvaluatorNetwork, LatentShape, MovementPhase, Network, Optimizer, Sampler, StageSettings, TextEmbed, TrainControl,
-    TrainEvaluator, TrainMld, TrainVae, Training,
+    EvaluatorNetwork, LatentShape, MovementPhase, Network, Optimizer, Replicas, Sampler, StageSettings, TextEmbed,
+    TrainControl, TrainEvaluator, TrainMld, TrainVae, Training,
 };
 use protocol::{Digest, Manifest, Seed, Steps};
 use stage_lab::{Bench, Script};
@@ -34,6 +34,7 @@ fn training(steps: u64) -> Training {
         decay: Decay::Constant,
         optimizer: Optimizer::default(),
         max_grad_norm: 1.0,
+        sync: Replicas::default(),
         stop: None,
     }
 }

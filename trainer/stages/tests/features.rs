@@ -4,8 +4,8 @@ use std::collections::BTreeMap;
 
 use protocol::stage::{
     Batch, DataSynthetic, Decay, EvaluateT2m, EvaluatorNetwork, FrequencyLosses, LowFrequency, MdmNetwork,
-    MovementPhase, MultiModality, Network, Optimizer, Prediction, Sampler, Semantic, Solver, StableMoFusionNetwork,
-    StageSettings, TextEmbed, TrainEvaluator, TrainMdm, TrainMld, TrainStableMoFusion, Training,
+    MovementPhase, MultiModality, Network, Optimizer, Prediction, Replicas, Sampler, Semantic, Solver,
+    StableMoFusionNetwork, StageSettings, TextEmbed, TrainEvaluator, TrainMdm, TrainMld, TrainStableMoFusion, Training,
 };
 use protocol::{Digest, Seed, Steps};
 use stage_lab::{Bench, Script};
@@ -23,6 +23,7 @@ fn training(steps: u64) -> Training {
         decay: Decay::Cosine,
         optimizer: Optimizer::default(),
         max_grad_norm: 1.0,
+        sync: Replicas::default(),
         stop: None,
     }
 }

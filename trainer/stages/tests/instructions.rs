@@ -15,7 +15,7 @@ use std::process::Command;
 use burn::tensor::Device;
 use protocol::stage::{
     Batch, DataSynthetic, Decay, DistillLcm, DistillPcm, Distillation, EncodeLatents, LatentShape, Network, Optimizer,
-    Shape, StageSettings, TextEmbed, TrainMld, TrainVae, Training, VaeLoss, Windows,
+    Replicas, Shape, StageSettings, TextEmbed, TrainMld, TrainVae, Training, VaeLoss, Windows,
 };
 use protocol::{Digest, Steps};
 use stage_lab::Bench;
@@ -40,6 +40,7 @@ fn training(steps: u64) -> Training {
         decay: Decay::Cosine,
         optimizer: Optimizer::default(),
         max_grad_norm: 1.0,
+        sync: Replicas::default(),
         stop: None,
     }
 }

@@ -9,7 +9,7 @@ use std::collections::BTreeMap;
 use protocol::stage::{
     Batch, CheckpointPolicy, DataSynthetic, Decay, DistillDiscord, EncodeTokens, EvaluateReconstruction,
     EvaluatorNetwork, FlowNetwork, FlowPrediction, FlowProjection, FlowSolver, ModelDecoder, MovementPhase, Optimizer,
-    Resets, Sampler, StageSettings, TextEmbed, TokenGenerator, TokenNetwork, TokenizerNetwork, TrainDiscord,
+    Replicas, Resets, Sampler, StageSettings, TextEmbed, TokenGenerator, TokenNetwork, TokenizerNetwork, TrainDiscord,
     TrainEvaluator, TrainTokenizer, TrainTokens, Training,
 };
 use protocol::{Digest, Seed, Steps};
@@ -29,6 +29,7 @@ fn training(steps: u64) -> Training {
         decay: Decay::Cosine,
         optimizer: Optimizer::default(),
         max_grad_norm: 1.0,
+        sync: Replicas::default(),
         stop: None,
     }
 }

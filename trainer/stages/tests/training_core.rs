@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex};
 
 use models::optim::{AdamW, LrSchedule};
 use motion::Stream;
-use protocol::stage::{Batch, CheckpointPolicy, Decay, Optimizer, StageSettings, TrainVae, Training};
+use protocol::stage::{Batch, CheckpointPolicy, Decay, Optimizer, Replicas, StageSettings, TrainVae, Training};
 use protocol::{ArtifactKind, Seed, Steps};
 use safetensors::SafeTensors;
 use serde_json::json;
@@ -231,6 +231,7 @@ fn training(steps: u64, slices: usize, lr: f64) -> Training {
         decay: Decay::Cosine,
         optimizer: Optimizer::default(),
         max_grad_norm: 1.0,
+        sync: Replicas::default(),
         stop: None,
     }
 }

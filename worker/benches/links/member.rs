@@ -75,7 +75,7 @@ impl Trainee {
             let parts =
                 share.map(|slice| (slice, self.parts.remove(&slice).unwrap_or_else(|| gradient(slice, length))));
             let parts: Vec<_> = parts.collect();
-            let exchanged = self.context.gang().exchange(step, self.slices, &parts)?;
+            let exchanged = self.context.gang().exchange(step..step + 1, self.slices, &parts)?;
             self.parts.extend(parts);
             match exchanged {
                 Exchange::Regroup => self.has_met = false,

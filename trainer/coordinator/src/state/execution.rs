@@ -136,14 +136,14 @@ impl StageExecution {
         stored.map(|(field, digest)| (field.clone(), *digest)).collect()
     }
 
-    /// Number of workers that may train it together, limited by the number of slices: further members would have no
-    /// work.
+    /// Number of workers that may train it together, limited by the number of slices or replicas: further members would
+    /// have no work.
     pub fn range(&self) -> WorkerRange {
         let WorkerRange { min, max } = self.placement.workers;
         let Some(training) = self.settings.training() else { return self.placement.workers };
-        let slices = training.batch.slices.max(1);
-        let max = if max == 0 { slices } else { max.max(min).min(slices) };
-        WorkerRange { min: min.min(slices), max }
+        let parts = training.parts().max(1);
+        let max = if max == 0 { parts } else { max.max(min).min(parts) };
+        WorkerRange { min: min.min(parts), max }
     }
 
     /// Returns true if it has no gang, or a gang with enough members. A smaller gang saves and ends its attempt.

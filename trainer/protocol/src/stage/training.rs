@@ -64,6 +64,30 @@ impl Default for Optimizer {
     }
 }
 
+/// Replicas that make updates on their own and are averaged. For networks too slow for an exchange in every update.
+///
+/// Each replica has its own share of the slices, and so its own share of the batch. After `every` updates, parameters,
+/// moments of the optimizer and moving averages of all replicas are averaged. Source: Stich, "Local SGD Converges Fast and
+/// Communicates Little" (2019), algorithm 1; averaging the moments of AdamW too is ours. A checkpoint is of an average,
+/// so a loss or a stop costs the updates since the last one at most. Part of a stage's identity: the number of replicas does not
+/// follow the workers.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(default)]
+pub struct Replicas {
+    /// Updates between two averages.
+    #[schemars(range(min = 1, max = 100_000), extend("x-unit" = "updates"))]
+    pub every: Steps,
+    /// Number of replicas; divides `batch.slices`. A worker computes whole replicas, so more workers have no work.
+    #[schemars(range(min = 1, max = 4_096), extend("x-unit" = "replicas"))]
+    pub replicas: usize,
+}
+
+impl Default for Replicas {
+    fn default() -> Self {
+        Self { every: Steps(1), replicas: 1 }
+    }
+}
+
 /// Common settings of training stages.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Training {
@@ -86,6 +110,9 @@ pub struct Training {
     /// Largest global norm of gradients, to which they are scaled down; 0 disables clipping.
     #[schemars(range(min = 0.0, max = 1e6))]
     pub max_grad_norm: f64,
+    /// Averages of replicas; by default, every update has the gradients of all slices.
+    #[serde(default)]
+    pub sync: Replicas,
     /// Step at which a sweep's rung stops before the schedule's end, leaving its state for the next rung. Not for
     /// users: the reader accepts only keys of the default.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -103,6 +130,7 @@ impl Training {
             decay: Decay::Cosine,
             optimizer: Optimizer::default(),
             max_grad_norm: 1.0,
+            sync: Replicas::default(),
             stop: None,
         }
     }
@@ -112,7 +140,23 @@ impl Training {
         self.stop.map_or(self.steps, |stop| stop.min(self.steps))
     }
 
+    /// The replicas, unless every update has the gradients of all slices.
+    pub fn replicas(&self) -> Option<Replicas> {
+        Some(self.sync).filter(|sync| *sync != Replicas::default())
+    }
+
+    /// Number of parts of a step that different workers can compute: slices, or replicas.
+    pub fn parts(&self) -> usize {
+        self.replicas().map_or(self.batch.slices, |sync| sync.replicas)
+    }
+
     pub(super) fn check(&self, p: &mut Problems) {
         self.batch.check_division(p, "batch.global");
+        let Replicas { replicas, .. } = self.sync;
+        if replicas > 0 && !self.batch.slices.is_multiple_of(replicas) {
+            let slices = self.batch.slices;
+            let message = format!("`sync.replicas` is {replicas}, which does not divide the {slices} slices");
+            p.add("sync.replicas", message, "each replica computes as many of `batch.slices`");
+        }
     }
 }

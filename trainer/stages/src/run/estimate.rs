@@ -18,7 +18,7 @@ use burn::tensor::Device;
 use checkpoint::Blobs;
 use pipeline::{Pipeline, PipelineStage};
 use protocol::message::StageTask;
-use protocol::stage::{CheckpointPolicy, Sampler, Shape, Split, StageSettings};
+use protocol::stage::{CheckpointPolicy, Replicas, Sampler, Shape, Split, StageSettings};
 use protocol::{ArtifactKind, Digest, FileEntry, Manifest, RunId, StageName, Steps};
 use serde_json::{Value, json};
 
@@ -275,6 +275,7 @@ fn reduced_training(settings: &StageSettings, examples: usize) -> Result<(StageS
     json["steps"] = json!(STEPS);
     json["warmup"] = json!(0);
     json["batch"] = json!({"global": examples, "slices": 1});
+    json["sync"] = json!(Replicas::default());
     // Phases have their own batches.
     for phase in ["windows", "movement"] {
         if let Some(batch) = json[phase]["batch"].as_u64().filter(|batch| *batch > 0) {

@@ -136,9 +136,9 @@ impl GangContext for Solo {
         0..slices
     }
 
-    fn exchange(&mut self, step: u64, _: usize, parts: &[(usize, Vec<f32>)]) -> Result<Exchange, ContextError> {
+    fn exchange(&mut self, steps: Range<u64>, _: usize, parts: &[(usize, Vec<f32>)]) -> Result<Exchange, ContextError> {
         let parts: Vec<Vec<f32>> = parts.iter().map(|(_, part)| part.clone()).collect();
-        Ok(Exchange::Sum { sum: tree_sum(&parts), drain: step + 1 >= self.until })
+        Ok(Exchange::Sum { sum: tree_sum(&parts), drain: steps.end >= self.until })
     }
 
     fn hold(&mut self) -> Result<(), ContextError> {

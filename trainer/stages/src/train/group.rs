@@ -251,6 +251,22 @@ impl Group {
         self.resident.as_ref().is_none_or(|(_, newer)| *newer == Newer::Nowhere)
     }
 
+    /// Returns true unless it is frozen.
+    pub(super) fn is_trained(&self) -> bool {
+        self.turns != Turns::NEVER
+    }
+
+    /// The host's values: parameters, moments and the average.
+    pub(super) fn flat(&self) -> impl Iterator<Item = &Vec<f32>> {
+        [&self.params, &self.m, &self.v].into_iter().chain(&self.average)
+    }
+
+    /// Like [`flat`](Self::flat), mutable.
+    pub(super) fn flat_mut(&mut self) -> impl Iterator<Item = &mut Vec<f32>> {
+        let Self { params, m, v, average, .. } = self;
+        [params, m, v].into_iter().chain(average)
+    }
+
     fn host(&mut self) -> Host<'_> {
         let Self { params, m, v, average, .. } = self;
         Host { params, m, v, average: average.as_deref_mut() }

@@ -10,6 +10,9 @@
 //! A [`Group`] is parameters with an optimizer. Its [`Turns`] select the steps that train it, so phases, alternating
 //! updates and frozen parts are plans, not loops. [`Buffers`] are values that no optimizer changes;
 //! [`Objective::after`] changes them from sums over the slices.
+//!
+//! With replicas, a member computes several updates of whole replicas before an exchange, whose sum is of states instead
+//! of gradients (`replicas`). The rest of the loop is the same.
 
 mod buffers;
 pub(crate) mod consistency;
@@ -22,6 +25,7 @@ pub(crate) mod network;
 mod objective;
 mod order;
 mod outcome;
+mod replicas;
 mod save;
 mod start;
 mod state;

@@ -162,19 +162,14 @@ impl TrainState {
     /// buffers in memory. Nothing is copied, because copying large models dominates the time.
     pub fn pieces<'a>(&'a self, step: &'a [u8; 8]) -> Vec<&'a [u8]> {
         debug_assert!(self.is_fetched());
-        let groups = self.groups.iter().flat_map(|group| {
-            [&group.params, &group.m, &group.v].into_iter().chain(&group.average).map(|values| cast_slice(values))
-        });
+        let groups = self.groups.iter().flat_map(Group::flat).map(|values| cast_slice(values));
         let buffers = self.buffers.iter().map(|(_, values)| cast_slice(values));
         std::iter::once(step.as_slice()).chain(groups).chain(buffers).collect()
     }
 
     /// The buffers that receive another member's [`Self::pieces`]; `step` receives the step.
     pub fn room<'a>(&'a mut self, step: &'a mut [u8; 8]) -> Vec<&'a mut [u8]> {
-        let groups = self.groups.iter_mut().flat_map(|group| {
-            let Group { params, m, v, average, .. } = group;
-            [params, m, v].into_iter().chain(average).map(|values| cast_slice_mut(values))
-        });
+        let groups = self.groups.iter_mut().flat_map(Group::flat_mut).map(|values| cast_slice_mut(values));
         let buffers = self.buffers.values_mut().map(|(_, values)| cast_slice_mut(values));
         std::iter::once(step.as_mut_slice()).chain(groups).chain(buffers).collect()
     }

@@ -1,6 +1,7 @@
-//! The loop: exchanges slices, updates the state, and saves it when a checkpoint is due.
+//! The loop: exchanges slices or replicas, updates the state, and saves it when a checkpoint is due.
 
 use std::collections::BTreeMap;
+use std::ops::Range;
 
 use burn::tensor::Device;
 use protocol::stage::Training;
@@ -9,6 +10,7 @@ use protocol::{ArtifactKind, Digest, limits};
 use super::buffers::SumPlan;
 use super::objective::Objective;
 use super::outcome::Trained;
+use super::replicas::Averaging;
 use super::save::{STATE_FILE, check_size, meta, parameters};
 use super::start::{Met, begin, meet};
 use super::state::TrainState;
@@ -45,8 +47,8 @@ pub fn train(
             continue;
         }
         let layout = Layout::of(&run.state, run.terms.len(), &run.sums);
-        let Some(sum) = run.sum_of_slices(&layout)? else { continue };
-        run.update(&layout, &sum)?;
+        let Some(sum) = run.sum_of_parts(&layout)? else { continue };
+        run.update(&layout, sum)?;
         run.save_if_due()?;
     }
 }
@@ -58,15 +60,17 @@ struct TrainingLoop<'a> {
     state: TrainState,
     /// The step that ends the training.
     steps: u64,
-    /// Slices of a step.
-    slices: usize,
+    /// Number of parts that the members exchange at once: the slices of a step, or the replicas of a round.
+    parts: usize,
+    /// The replicas, if the training has any.
+    averaging: Option<Averaging>,
     terms: Vec<&'static str>,
     sums: Vec<SumPlan>,
     /// The digest of the settings.
     config: Digest,
     /// The device that keeps the groups, if it is an accelerator.
     accelerator: Option<Device>,
-    /// The packed results of this member's slices of the next step.
+    /// The packed results of this member's parts of the next exchange.
     done: BTreeMap<usize, Vec<f32>>,
     /// The newest step in a committed checkpoint, if this member knows it.
     saved_at: Option<u64>,
@@ -100,7 +104,8 @@ impl<'a> TrainingLoop<'a> {
         let saved_at = begin(objective, &mut state, cx)?;
         let mut run = Self {
             steps: training.end().0,
-            slices: training.batch.slices,
+            parts: training.parts(),
+            averaging: Averaging::of(training),
             sums: objective.sums(),
             // It excludes names of other stages, which do not affect a state; the key of the next rung depends on it.
             config: cx.task().settings.digest(),
@@ -140,19 +145,17 @@ impl<'a> TrainingLoop<'a> {
         Ok(adopted)
     }
 
-    /// Computes this member's slices of the next step and exchanges them with the others. Returns the packed sum over
-    /// all slices, or `None` if the gang was regrouped instead.
-    fn sum_of_slices(&mut self, layout: &Layout) -> Result<Option<Vec<f32>>, StageError> {
-        // A regroup may assign other slices of the same step; computed slices are kept.
-        let share = self.cx.share(self.slices);
-        let missing: Vec<usize> = share.clone().filter(|slice| !self.done.contains_key(slice)).collect();
-        let results = self.objective.slices(self.state.step, &missing)?;
-        for (slice, result) in missing.iter().zip(results) {
-            self.done.insert(*slice, layout.pack(result)?);
-        }
+    /// Computes this member's parts of the next exchange, and exchanges them with the others. Returns the packed sum over
+    /// all parts, or `None` if the gang was regrouped instead.
+    fn sum_of_parts(&mut self, layout: &Layout) -> Result<Option<Vec<f32>>, StageError> {
+        // A regroup may assign other parts of the same step; computed parts are kept.
+        let share = self.cx.share(self.parts);
+        let missing: Vec<usize> = share.clone().filter(|part| !self.done.contains_key(part)).collect();
+        let results = self.compute(layout, &missing)?;
+        self.done.extend(missing.into_iter().zip(results));
         let parts: Vec<_> =
-            share.map(|slice| (slice, self.done.remove(&slice).expect("a result for each slice"))).collect();
-        match self.cx.exchange(self.state.step, self.slices, &parts)? {
+            share.map(|part| (part, self.done.remove(&part).expect("a result for each part"))).collect();
+        match self.cx.exchange(self.coming(), self.parts, &parts)? {
             Exchange::Sum { sum, drain } => {
                 self.done.clear();
                 self.stop = drain;
@@ -167,24 +170,59 @@ impl<'a> TrainingLoop<'a> {
         }
     }
 
-    /// Applies the sum over all slices and records the step's values.
-    fn update(&mut self, layout: &Layout, sum: &[f32]) -> Result<(), StageError> {
-        let report = apply(&mut self.state, layout, sum)?;
-        hook(self.objective, &mut self.state, layout.sums(sum, &self.sums), self.cx.task())?;
-        self.objective.load(&self.state);
+    /// The updates of the next exchange: one, or those of a round.
+    fn coming(&self) -> Range<u64> {
+        let step = self.state.step;
+        self.averaging.map_or(step..step + 1, |averaging| averaging.round(step, self.steps))
+    }
 
-        let values = self.terms.iter().copied().zip(layout.terms(sum).iter().map(|t| f64::from(*t)));
+    /// Computes slices of the next step, or replicas of the next round, and packs each.
+    fn compute(&mut self, layout: &Layout, parts: &[usize]) -> Result<Vec<Vec<f32>>, StageError> {
+        let Some(averaging) = self.averaging else {
+            let results = self.objective.slices(self.state.step, parts)?;
+            return results.into_iter().map(|result| layout.pack(result)).collect();
+        };
+        let round = self.coming();
+        let Self { objective, state, cx, terms, steps, .. } = self;
+        let count = parts.len() as u64;
+        let replica = |(before, part): (u64, &usize)| {
+            // A member's replicas follow each other, and all are of the same steps.
+            let whole = round.end - round.start;
+            let mut done = |step: u64, loss: f32| {
+                let done = round.start + (before * whole + step - round.start) / count;
+                cx.progress(done, *steps, "steps", &[(terms[0], f64::from(loss))]);
+            };
+            averaging.compute(*objective, state, &round, *part, &mut done)
+        };
+        (0..).zip(parts).map(replica).collect()
+    }
+
+    /// Applies the sum over all parts and records the values of the step, or the means of the round.
+    fn update(&mut self, layout: &Layout, sum: Vec<f32>) -> Result<(), StageError> {
+        let coming = self.coming();
+        let (terms, applied) = if let Some(averaging) = self.averaging {
+            let averaged = averaging.apply(&mut self.state, &coming, sum);
+            self.load();
+            averaged
+        } else {
+            let applied = apply(&mut self.state, layout, &sum)?;
+            hook(self.objective, &mut self.state, layout.sums(&sum, &self.sums), self.cx.task())?;
+            self.objective.load(&self.state);
+            (layout.terms(&sum).to_vec(), applied)
+        };
+
+        let values = self.terms.iter().copied().zip(terms.into_iter().map(f64::from));
         let mut values: Vec<(&str, f64)> = values.collect();
         self.recent.push(&values);
-        values.push((GRADIENT_NORM, report.norm));
-        values.push((LEARNING_RATE, report.lr));
+        values.push((GRADIENT_NORM, applied.norm));
+        values.push((LEARNING_RATE, applied.lr));
         let step = self.state.step;
-        if due(step, self.steps) {
+        if (coming.start + 1..=step).any(|step| due(step, self.steps)) {
             self.cx.record(step, &values);
         }
         self.cx.progress(step, self.steps, "steps", &values[..1]);
         let every = self.cx.task().checkpoint.every.0;
-        self.save_is_due |= every > 0 && step.is_multiple_of(every);
+        self.save_is_due |= every > 0 && coming.start / every < step / every;
         Ok(())
     }
 

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use protocol::stage::{
     Batch, DataSynthetic, Decay, DistillLcm, DistillPcm, Distillation, EncodeLatents, EvaluateLatentFid,
-    EvaluateReconstruction, LatentShape, Network, Optimizer, Sampler, StageSettings, TextEmbed, TrainControl,
+    EvaluateReconstruction, LatentShape, Network, Optimizer, Replicas, Sampler, StageSettings, TextEmbed, TrainControl,
     TrainLength, TrainMld, TrainVae, Training,
 };
 use protocol::{Digest, Steps};
@@ -23,6 +23,7 @@ fn training(steps: u64) -> Training {
         decay: Decay::Cosine,
         optimizer: Optimizer::default(),
         max_grad_norm: 1.0,
+        sync: Replicas::default(),
         stop: None,
     }
 }

@@ -8,7 +8,7 @@ use super::*;
 use crate::gang::exchange::{Contribution, Interrupt};
 use crate::gang::frame::MAX_PAYLOAD;
 use crate::gang::handshake;
-use crate::gang::rendezvous::Met;
+use crate::gang::rendezvous::{Line, Met};
 
 const BARRIER: &str = "barrier `test`";
 
@@ -116,9 +116,10 @@ fn p20_bytes_that_move_keep_a_link_of_30_kb_a_second_and_300_ms() {
     let state = vec![7u8; 3 * MAX_PAYLOAD];
     thread::scope(|scope| {
         scope.spawn(|| assert_eq!(rendezvous::rendezvous(&ahead, Some(6), &[&state], &|| None), Ok(Met::Keep)));
-        assert_eq!(rendezvous::rendezvous(&behind, Some(5), &[], &|| None), Ok(Met::Behind(0, 6)));
+        let line = Line { source: 0, next: None, step: 6 };
+        assert_eq!(rendezvous::rendezvous(&behind, Some(5), &[], &|| None), Ok(Met::Behind(line)));
         let mut room = vec![0; state.len()];
-        assert_eq!(rendezvous::adopt(&behind, 0, &mut [&mut room], true, &|| None), Ok(Vec::new()));
+        assert_eq!(rendezvous::adopt(&behind, line, &mut [&mut room], true, &|| None), Ok(Vec::new()));
         assert!(room == state);
     });
     assert!(begun.elapsed() > QUICK.patience * 2, "it took {:.1?}", begun.elapsed());

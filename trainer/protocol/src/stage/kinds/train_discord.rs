@@ -5,7 +5,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::stage::{
-    Batch, Decay, FlowSolver, ImportModel, ImportedPart, Neighbours, Optimizer, Output, Problems, Ref, Shape,
+    Batch, Decay, FlowSolver, ImportModel, ImportedPart, Neighbours, Optimizer, Output, Problems, Ref, Replicas, Shape,
     StageSpec, Training, WindowsOf,
 };
 use crate::{ArtifactKind, Steps};
@@ -188,6 +188,7 @@ impl Default for TrainDiscord {
                 decay: Decay::Cosine,
                 optimizer: Optimizer { weight_decay: 0.01, ..Optimizer::default() },
                 max_grad_norm: 1.0,
+                sync: Replicas::default(),
                 stop: None,
             },
         }

@@ -5,7 +5,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::import_evaluator::{VOCABULARY, WORDS_ORIGIN};
-use crate::stage::{Batch, Decay, LossChange, Optimizer, Output, Problems, Ref, Shape, StageSpec, Training};
+use crate::stage::{Batch, Decay, LossChange, Optimizer, Output, Problems, Ref, Replicas, Shape, StageSpec, Training};
 use crate::{ArtifactKind, Steps};
 
 /// Size of an evaluator. The published one: 512, 1024, 512, 512, dropout 0.2.
@@ -112,6 +112,7 @@ impl Default for TrainEvaluator {
                 decay: Decay::Constant,
                 optimizer: Optimizer::default(),
                 max_grad_norm: 0.5,
+                sync: Replicas::default(),
                 stop: None,
             },
         }

@@ -4,7 +4,7 @@
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::stage::{Batch, Decay, Neighbours, Optimizer, Output, Problems, Ref, Shape, StageSpec, Training};
+use crate::stage::{Batch, Decay, Neighbours, Optimizer, Output, Problems, Ref, Replicas, Shape, StageSpec, Training};
 use crate::{ArtifactKind, Steps};
 
 /// `train.length`: estimates the length of a motion from its caption.
@@ -42,6 +42,7 @@ impl Default for TrainLength {
                 decay: Decay::Constant,
                 optimizer: Optimizer::default(),
                 max_grad_norm: 0.5,
+                sync: Replicas::default(),
                 stop: None,
             },
         }

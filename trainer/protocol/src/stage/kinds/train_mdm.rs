@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 use crate::stage::network::transformer_parameters;
 use crate::stage::{
     Batch, Decay, Diffusion, Family, FrequencyLosses, Neighbours, NoiseSchedule, Optimizer, Output, Prediction,
-    Problems, Ref, Shape, Solver, StageSpec, Training,
+    Problems, Ref, Replicas, Shape, Solver, StageSpec, Training,
 };
 use crate::{ArtifactKind, Steps};
 
@@ -111,6 +111,7 @@ impl Default for TrainMdm {
                 decay: Decay::Constant,
                 optimizer: Optimizer::default(),
                 max_grad_norm: 0.0,
+                sync: Replicas::default(),
                 stop: None,
             },
         }

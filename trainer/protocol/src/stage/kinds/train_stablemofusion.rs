@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 use crate::stage::network::transformer_parameters;
 use crate::stage::{
     Batch, Decay, Diffusion, Family, FrequencyLosses, Neighbours, NoiseSchedule, Optimizer, Output, Prediction,
-    Problems, Ref, Shape, Solver, StageSpec, Training,
+    Problems, Ref, Replicas, Shape, Solver, StageSpec, Training,
 };
 use crate::{ArtifactKind, Steps};
 
@@ -161,6 +161,7 @@ impl Default for TrainStableMoFusion {
                 decay: Decay::Staircase,
                 optimizer: Optimizer { weight_decay: 0.01, ..Optimizer::default() },
                 max_grad_norm: 1.0,
+                sync: Replicas::default(),
                 stop: None,
             },
         }

@@ -3,7 +3,7 @@
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::stage::{Batch, Decay, Optimizer, Output, Problems, Ref, Shape, StageSpec, Training};
+use crate::stage::{Batch, Decay, Optimizer, Output, Problems, Ref, Replicas, Shape, StageSpec, Training};
 use crate::{ArtifactKind, Steps, limits};
 
 /// Weights per residual block and its connections, divided by the square of the width: an upper bound, not a count.
@@ -150,6 +150,7 @@ impl Default for TrainTokenizer {
                 decay: Decay::Cosine,
                 optimizer: Optimizer { beta2: 0.99, ..Optimizer::default() },
                 max_grad_norm: 0.0,
+                sync: Replicas::default(),
                 stop: None,
             },
         }
@@ -187,6 +188,10 @@ impl StageSpec for TrainTokenizer {
         p.whole_tokens("window", self.window);
         if self.loss.feature == 0.0 && self.loss.position == 0.0 {
             p.add("loss.feature", "`loss.feature` and `loss.position` are both 0, so nothing is reconstructed", "");
+        }
+        if self.training.replicas().is_some() {
+            let message = "a codebook follows the codes of every batch, so replicas of it cannot be averaged";
+            p.add("sync", message, "remove `sync`");
         }
         self.training.check(p);
     }

@@ -6,7 +6,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::stage::network::transformer_parameters;
 use crate::stage::{
-    Batch, Decay, Family, Neighbours, Optimizer, Output, Problems, Ref, Shape, StageSpec, TrainTokenizer, Training,
+    Batch, Decay, Family, Neighbours, Optimizer, Output, Problems, Ref, Replicas, Shape, StageSpec, TrainTokenizer,
+    Training,
 };
 use crate::{ArtifactKind, Steps};
 
@@ -122,6 +123,7 @@ impl Default for TrainTokens {
                 decay: Decay::Cosine,
                 optimizer: Optimizer { beta1: 0.5, beta2: 0.9, weight_decay: 1e-6, ..Optimizer::default() },
                 max_grad_norm: 0.0,
+                sync: Replicas::default(),
                 stop: None,
             },
         }
