@@ -12,6 +12,7 @@ use protocol::proof::Vouched;
 use protocol::{ArtifactKind, Digest, Manifest};
 use stages::context::{Adopted, AttemptContext, ContextError, Exchange, GangContext, Rendezvous};
 use stages::external::DataAccess;
+use stages::tree::Node;
 
 use crate::active_assignment::ActiveAssignment;
 use crate::blobs::HttpBlobs;
@@ -377,7 +378,7 @@ impl GangContext for HttpContext {
         &mut self,
         steps: Range<u64>,
         slices: usize,
-        parts: &[(usize, Vec<f32>)],
+        parts: &[(Node, Vec<f32>)],
     ) -> Result<Exchange, ContextError> {
         let step = steps.start;
         self.check()?;
@@ -392,17 +393,14 @@ impl GangContext for HttpContext {
             return Ok(Exchange::Regroup);
         }
         let share = self.share(slices);
-        let mut own = Vec::with_capacity(share.len());
-        for slice in share.clone() {
-            let part = parts.iter().find(|(at, _)| *at == slice).map(|(_, part)| part.as_slice());
-            let part = part.filter(|part| own.first().is_none_or(|(_, first): &(_, &[f32])| first.len() == part.len()));
-            let Some(part) = part else {
-                return Err(ContextError::Fault(format!(
-                    "step {step}: slice {slice} of this member's {share:?} is missing or has another length; this is a \
-                     bug in the stage"
-                )));
-            };
-            own.push((slice..slice + 1, part));
+        let own: Vec<(Node, &[f32])> = parts.iter().map(|(node, part)| (node.clone(), part.as_slice())).collect();
+        let is_whole = own.iter().flat_map(|(node, _)| node.clone()).eq(share.clone());
+        if !is_whole || own.iter().any(|(_, part)| part.len() != own[0].1.len()) {
+            let nodes: Vec<&Node> = own.iter().map(|(node, _)| node).collect();
+            return Err(ContextError::Fault(format!(
+                "step {step}: the slices {nodes:?} are not this member's {share:?}, or have other lengths; this is a bug \
+                 in the stage"
+            )));
         }
         let drain = self.held.drain(mesh.size());
         let durable = self.telemetry.durable();

@@ -64,6 +64,7 @@ pub struct MemoryAttempt {
     pub data: Arc<DataAccess>,
     /// Bytes of the blobs of a long file.
     pub chunk_bytes: u64,
+    pub large: Option<usize>,
     /// Reports of the attempt so far.
     pub told: Told,
 }
@@ -73,7 +74,7 @@ impl MemoryAttempt {
     pub fn new(task: StageTask, device: Device, blobs: Arc<MemoryBlobs>) -> Self {
         let data = Arc::new(DataAccess::unverified());
         let chunk_bytes = limits::CHUNK_BYTES;
-        Self { task, device, blobs, stop: Arc::default(), data, chunk_bytes, told: Told::default() }
+        Self { task, device, blobs, stop: Arc::default(), data, chunk_bytes, large: None, told: Told::default() }
     }
 
     /// A flag that makes [`AttemptContext::interrupted`] true once set.

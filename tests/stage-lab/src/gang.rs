@@ -15,7 +15,7 @@ use protocol::{Digest, Manifest};
 use super::attempt::{MemoryAttempt, Ran, Told, lock};
 use stages::context::{Adopted, AttemptContext, ContextError, Exchange, GangContext, Outcome, Rendezvous, StageError};
 use stages::external::DataAccess;
-use stages::train::tree_sum;
+use stages::tree::{Node, tree_sum};
 
 /// Losses and joins of a gang's members. Members are numbered from 0; the lowest alive member
 /// leads, unless it was demoted.
@@ -44,7 +44,7 @@ struct State {
     arrived: BTreeMap<usize, Option<u64>>,
     donated: Option<Vec<u8>>,
     step: u64,
-    slices: BTreeMap<usize, Vec<f32>>,
+    slices: BTreeMap<usize, (Node, Vec<f32>)>,
     summed: Option<(u64, Arc<Vec<f32>>)>,
     checkpoints: Vec<(u64, Manifest)>,
     /// Some member's thread has ended; no further member joins.
@@ -318,7 +318,7 @@ impl GangContext for Member {
         &mut self,
         steps: Range<u64>,
         slices: usize,
-        parts: &[(usize, Vec<f32>)],
+        parts: &[(Node, Vec<f32>)],
     ) -> Result<Exchange, ContextError> {
         let step = steps.start;
         let gang = Arc::clone(&self.gang);
@@ -342,13 +342,13 @@ impl GangContext for Member {
             state.slices.clear();
         }
         assert!(
-            parts.iter().map(|(slice, _)| *slice).eq(self.share(slices)),
+            parts.iter().flat_map(|(node, _)| node.clone()).eq(self.share(slices)),
             "a member gives its own slices, in order"
         );
-        state.slices.extend(parts.iter().cloned());
-        if state.slices.len() == slices {
-            let parts: Vec<_> = std::mem::take(&mut state.slices).into_values().collect();
-            state.summed = Some((step, Arc::new(tree_sum(&parts))));
+        state.slices.extend(parts.iter().map(|(node, part)| (node.start, (node.clone(), part.clone()))));
+        if state.slices.values().map(|(node, _)| node.len()).sum::<usize>() == slices {
+            let parts = std::mem::take(&mut state.slices).into_values();
+            state.summed = Some((step, Arc::new(tree_sum(slices, parts))));
             gang.changed.notify_all();
         }
         loop {
@@ -360,6 +360,10 @@ impl GangContext for Member {
             }
             state = gang.changed.wait(state).unwrap_or_else(std::sync::PoisonError::into_inner);
         }
+    }
+
+    fn large(&self) -> usize {
+        self.attempt.large.unwrap_or(usize::MAX)
     }
 
     fn leads(&self) -> bool {
@@ -412,15 +416,6 @@ mod tests {
     const SLICES: usize = 6;
     const STEPS: u64 = 12;
 
-    #[test]
-    fn the_tree_does_not_depend_on_who_computed_its_leaves() {
-        let parts: Vec<Vec<f32>> = (0..6).map(|i| vec![0.1 + i as f32 * 1e7, 3.0]).collect();
-        let by_hand = |i: usize| parts[i][0];
-        let expected = ((by_hand(0) + by_hand(1)) + (by_hand(2) + by_hand(3))) + (by_hand(4) + by_hand(5));
-        assert_eq!(tree_sum(&parts), [expected, 18.0]);
-        assert_eq!(tree_sum(&parts[..1]), parts[0]);
-    }
-
     /// A loop without a network: its state is a number that each step maps to another, and the step count.
     fn body(cx: &mut dyn GangContext) -> Result<Outcome, StageError> {
         let fault = |e: serde_json::Error| StageError::Fault(e.to_string());
@@ -446,7 +441,7 @@ mod tests {
         while step < STEPS {
             let parts: Vec<_> = cx
                 .share(SLICES)
-                .map(|slice| (slice, vec![(value + slice as f32 * 0.1 + step as f32 * 1e3).sin()]))
+                .map(|slice| (slice..slice + 1, vec![(value + slice as f32 * 0.1 + step as f32 * 1e3).sin()]))
                 .collect();
             match cx.exchange(step..step + 1, SLICES, &parts)? {
                 Exchange::Regroup => (step, value) = meet(cx, applied, (step, value))?,

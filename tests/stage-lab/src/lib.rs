@@ -22,7 +22,6 @@ use stages::kinds;
 
 pub use attempt::{MemoryAttempt, MemoryBlobs, Ran, Told};
 pub use gang::{Body, Script};
-pub use stages::train::tree_sum;
 
 /// Runs stages one after the other, and keeps their outputs in memory.
 #[derive(Debug)]
@@ -39,6 +38,8 @@ pub struct Bench {
     pub script: Script,
     /// Bytes of the blobs of a long file.
     pub chunk_bytes: u64,
+    /// Number of values from which the results of a slice are large.
+    pub large: Option<usize>,
 }
 
 impl Bench {
@@ -53,6 +54,7 @@ impl Bench {
             members,
             script: Script::default(),
             chunk_bytes: limits::CHUNK_BYTES,
+            large: None,
         }
     }
 
@@ -168,10 +170,10 @@ impl Bench {
     fn attempt(&self, task: StageTask) -> impl Fn() -> MemoryAttempt + use<> {
         let device = self.device.clone();
         let blobs = Arc::clone(&self.blobs);
-        let chunk_bytes = self.chunk_bytes;
+        let (chunk_bytes, large) = (self.chunk_bytes, self.large);
         move || {
             let mut attempt = MemoryAttempt::new(task.clone(), device.clone(), Arc::clone(&blobs));
-            attempt.chunk_bytes = chunk_bytes;
+            (attempt.chunk_bytes, attempt.large) = (chunk_bytes, large);
             attempt
         }
     }

@@ -12,6 +12,11 @@ use motion::data_access::DataAccess;
 use protocol::message::{FailureClass, StageTask};
 use protocol::{Digest, Manifest, limits};
 
+use crate::tree::Node;
+
+/// [`GangContext::large`]: 32 MiB.
+const LARGE: usize = 8 << 20;
+
 /// An error of the context.
 #[derive(Debug, thiserror::Error)]
 pub enum ContextError {
@@ -192,15 +197,21 @@ pub trait GangContext: AttemptContext {
     /// [`rendezvous`](Self::rendezvous) changes it.
     fn share(&self, slices: usize) -> Range<usize>;
 
-    /// Sums `parts` from all members, along the fixed binary tree over `0..slices`. `parts` are this worker's slices in
-    /// order: vectors of equal length. `steps` are the updates that the sum makes: one, or those of a round of replicas,
+    /// Sums `parts` from all members, along the fixed binary tree over `0..slices`. `parts` are vectors of equal length:
+    /// the sums of nodes of this tree that together are this worker's slices, in order. `steps` are the updates that the sum makes: one, or those of a round of replicas,
     /// which are then the slices.
     fn exchange(
         &mut self,
         steps: Range<u64>,
         slices: usize,
-        parts: &[(usize, Vec<f32>)],
+        parts: &[(Node, Vec<f32>)],
     ) -> Result<Exchange, ContextError>;
+
+    /// Number of values from which the results of a slice are large: they are added as soon as both parts of a node of
+    /// the tree are there. Smaller ones are kept apart, because a regroup may take some of them to another member.
+    fn large(&self) -> usize {
+        LARGE
+    }
 
     /// Returns true for rank 0, the only member that saves, records and reports.
     fn leads(&self) -> bool;

@@ -19,3 +19,4 @@ pub mod run;
 mod shards;
 mod stand_in;
 pub mod train;
+pub mod tree;

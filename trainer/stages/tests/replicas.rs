@@ -1,5 +1,5 @@
-//! Replicas that are averaged after several updates: they have the bits of a plain training where there is one of them,
-//! and those of any number of members and losses where there are more.
+//! Replicas that are averaged after several updates. One replica has the bits of a plain training. More of them have the
+//! same bits with any number of members and losses.
 
 mod common;
 

@@ -72,11 +72,11 @@ impl Trainee {
             let share = self.context.gang().share(self.slices);
             self.parts.retain(|slice, _| share.contains(slice));
             let length = self.parameters;
-            let parts =
-                share.map(|slice| (slice, self.parts.remove(&slice).unwrap_or_else(|| gradient(slice, length))));
+            let parts = share
+                .map(|slice| (slice..slice + 1, self.parts.remove(&slice).unwrap_or_else(|| gradient(slice, length))));
             let parts: Vec<_> = parts.collect();
             let exchanged = self.context.gang().exchange(step..step + 1, self.slices, &parts)?;
-            self.parts.extend(parts);
+            self.parts.extend(parts.into_iter().map(|(node, part)| (node.start, part)));
             match exchanged {
                 Exchange::Regroup => self.has_met = false,
                 Exchange::Sum { sum, .. } => {

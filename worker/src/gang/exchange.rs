@@ -339,10 +339,10 @@ fn pieces(chunk: &Range<usize>) -> impl Iterator<Item = Range<usize>> + use<> {
     chunk.clone().step_by(PIECE).map(move |start| start..(start + PIECE).min(chunk.end))
 }
 
-/// The range in `parts` (slices in order) that belongs to `node`.
+/// The range in `parts` (in order) that belongs to `node`.
 fn within(parts: &[(Node, &[f32])], node: &Node) -> Range<usize> {
-    let first = parts.partition_point(|(slice, _)| slice.start < node.start);
-    first..first + node.len()
+    let first = parts.partition_point(|(part, _)| part.start < node.start);
+    first..parts.partition_point(|(part, _)| part.end <= node.end)
 }
 
 pub(super) fn expect(frame: Frame, kind: Kind, mesh: &Mesh, peer: usize) -> Result<Frame, Halt> {

@@ -41,8 +41,8 @@ pub(crate) struct Line {
     pub(crate) step: u64,
 }
 
-/// The newest state among the steps `at` of all ranks, with the rank from which `own` gets it and the rank to which it sends it;
-/// `None` if no member has a state. Lines are of equal length, each behind another of the members that are ahead.
+/// The newest of the states `at` of all ranks, the rank that sends it to `own`, and the rank that `own` sends it to. `None`
+/// if no member has a state. Lines are of equal length, each behind another of the members that are ahead.
 fn line(at: &[Option<u64>], own: usize) -> Option<(u64, Option<usize>, Option<usize>)> {
     let newest = at.iter().flatten().max().copied()?;
     let (mut order, behind): (Vec<usize>, Vec<usize>) = (0..at.len()).partition(|&rank| at[rank] == Some(newest));
@@ -119,7 +119,7 @@ fn send_state(
     Ok(())
 }
 
-/// Receives into `room` the state of which a rendezvous told, and forwards it along the line. Returns the data that
+/// Receives the newest state into `room`, and forwards it along the line. Returns the data that
 /// follows the state.
 ///
 /// With `directly`, the bytes arrive in `room` itself, which is left unusable by an interrupted transfer. Otherwise all

@@ -1,25 +1,13 @@
-//! Sums along the fixed binary tree over a step's slices (design: determinism).
+//! Sums along the fixed binary tree over a step's slices ([`stages::tree::split`]).
 //!
-//! A node is a range of slices; the root is `0..slices`. A node of more than one slice splits so that its left part is
-//! the largest power of two smaller than it. Floating-point addition is not associative. The tree, and not the
-//! membership, decides which two numbers are added. So the sums of any set of disjoint nodes that cover a node give the
-//! same bits for it.
+//! The sums of any set of disjoint nodes that cover a node give the same bits for it.
 
 use std::ops::Range;
 
-/// A range of slices that is a node of the tree.
-pub(crate) type Node = Range<usize>;
+pub(crate) use stages::tree::{Node, split};
 
 /// Floats summed at once: all inputs' blocks and the scratch stay in the CPU cache.
 const BLOCK: usize = 4096;
-
-/// Index at which a node splits, or `None` for a single slice.
-fn split(node: &Node) -> Option<usize> {
-    match node.len() {
-        0 | 1 => None,
-        n => Some(node.start + (n.next_power_of_two() >> 1)),
-    }
-}
 
 /// The largest nodes of the tree over `0..slices` inside `range`, in order; together they are `range`.
 pub(crate) fn cover(slices: usize, range: &Range<usize>) -> Vec<Node> {

@@ -13,7 +13,8 @@ use protocol::{Digest, Manifest};
 use super::clock::Clock;
 use crate::context::{Adopted, AttemptContext, ContextError, Exchange, GangContext, Rendezvous};
 use crate::external::DataAccess;
-use crate::train::{STATE_FILE, tree_sum};
+use crate::train::STATE_FILE;
+use crate::tree::{Node, tree_sum};
 
 /// The digest of a checkpoint's training state. Its manifest also names the build and processor that made it.
 pub fn state_digest(checkpoint: &Manifest) -> Option<Digest> {
@@ -136,9 +137,13 @@ impl GangContext for Solo {
         0..slices
     }
 
-    fn exchange(&mut self, steps: Range<u64>, _: usize, parts: &[(usize, Vec<f32>)]) -> Result<Exchange, ContextError> {
-        let parts: Vec<Vec<f32>> = parts.iter().map(|(_, part)| part.clone()).collect();
-        Ok(Exchange::Sum { sum: tree_sum(&parts), drain: steps.end >= self.until })
+    fn exchange(
+        &mut self,
+        steps: Range<u64>,
+        slices: usize,
+        parts: &[(Node, Vec<f32>)],
+    ) -> Result<Exchange, ContextError> {
+        Ok(Exchange::Sum { sum: tree_sum(slices, parts.iter().cloned()), drain: steps.end >= self.until })
     }
 
     fn hold(&mut self) -> Result<(), ContextError> {

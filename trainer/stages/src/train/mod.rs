@@ -31,7 +31,6 @@ mod start;
 mod state;
 mod step;
 mod training_loop;
-mod tree;
 mod values;
 
 pub use buffers::{AfterStep, BufferPlan, Buffers, SumPlan};
@@ -43,4 +42,3 @@ pub use outcome::Trained;
 pub(crate) use save::STATE_FILE;
 pub use state::{RestoreError, TrainState};
 pub use training_loop::train;
-pub use tree::tree_sum;

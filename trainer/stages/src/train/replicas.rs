@@ -8,8 +8,8 @@ use super::group::Group;
 use super::objective::Objective;
 use super::state::TrainState;
 use super::step::{Applied, Layout, apply};
-use super::tree::tree_sum;
 use crate::context::StageError;
+use crate::tree::tree_sum;
 
 /// The replicas of a training.
 #[derive(Debug, Clone, Copy)]
@@ -33,8 +33,8 @@ impl Averaging {
         step..next.min(steps)
     }
 
-    /// Makes one replica's updates of `round` from `state`, and packs its values for an exchange: of each trained group
-    /// parameters, moments and average; then the terms and the gradient norm, as shares of their means.
+    /// Makes one replica's updates of `round` from `state`, and packs its values for an exchange. They are parameters,
+    /// moments and average of each trained group, then means of the terms and of the gradient norm.
     pub(super) fn compute(
         &self,
         objective: &mut dyn Objective,
@@ -53,7 +53,8 @@ impl Averaging {
             let layout = Layout::of(&own, watched.len() - 1, &[]);
             let results = objective.slices(own.step, &slices)?;
             let packed = results.into_iter().map(|result| layout.pack(result)).collect::<Result<Vec<_>, _>>()?;
-            let mut sum = tree_sum(&packed);
+            let leaves = packed.into_iter().enumerate().map(|(slice, values)| (slice..slice + 1, values));
+            let mut sum = tree_sum(self.slices, leaves);
             // Slices are shares of the global batch; a replica's update is that of its own.
             sum.iter_mut().for_each(|value| *value *= replicas);
             let applied = apply(&mut own, &layout, &sum)?;
@@ -67,7 +68,7 @@ impl Averaging {
         Ok(trained.flatten().copied().chain(watched).collect())
     }
 
-    /// Replaces the values of `state` by the mean of the replicas, of which `sum` is the sum. Returns the means of the
+    /// Replaces the values of `state` by the mean of the replicas; `sum` is their sum. Returns the means of the
     /// terms, and of the gradient norms with the rate of the last update.
     pub(super) fn apply(&self, state: &mut TrainState, round: &Range<u64>, mut sum: Vec<f32>) -> (Vec<f32>, Applied) {
         #[expect(clippy::cast_precision_loss, reason = "at most 4,096 replicas")]
@@ -148,15 +149,16 @@ mod tests {
         // is beside the mean of its slices, .5 or 2.5.
         let parts = [compute(0), compute(1)];
         assert!((parts[0][0] - 0.5).abs() <= 0.5 && (parts[1][0] - 2.5).abs() <= 0.5, "{parts:?}");
-        let (terms, applied) = averaging.apply(&mut state, &round, tree_sum(&parts));
-        assert_eq!(state.params(0), [(parts[0][0] + parts[1][0]) / 2.0]);
+        let mean = (parts[0][0] + parts[1][0]) / 2.0;
+        let (terms, applied) = averaging.apply(&mut state, &round, tree_sum(2, [0..1, 1..2].into_iter().zip(parts)));
+        assert_eq!(state.params(0), [mean]);
         assert_eq!((state.step, applied.lr), (60, 0.5));
         assert!(terms.len() == 1 && (0.0..36.75).contains(&terms[0]) && applied.norm > 0.0, "{terms:?}");
         // The means of one update: losses of 45.25 and 28.25 of the replicas' own batches, gradients of 9.5 and 7.5.
         state = TrainState::new(distances.groups(), Vec::new());
         let parts = [0, 1]
             .map(|replica| averaging.compute(&mut distances, &state, &(0..1), replica, |_, _| {}).expect("computed"));
-        let (terms, applied) = averaging.apply(&mut state, &(0..1), tree_sum(&parts));
+        let (terms, applied) = averaging.apply(&mut state, &(0..1), tree_sum(2, [0..1, 1..2].into_iter().zip(parts)));
         assert_eq!((terms, applied.norm, state.step), (vec![36.75], 8.5, 1));
     }
 }

@@ -26,6 +26,11 @@ impl Layout {
         }
     }
 
+    /// Number of values.
+    pub(super) fn len(&self) -> usize {
+        self.gradients.iter().flatten().chain(&self.sums).sum::<usize>() + self.terms
+    }
+
     /// Packs a slice's result into one vector.
     pub(super) fn pack(&self, result: SliceResult) -> Result<Vec<f32>, StageError> {
         let wanted: Vec<usize> = self.gradients.iter().map(|len| len.unwrap_or(0)).collect();
@@ -39,8 +44,7 @@ impl Layout {
                 self.gradients, self.terms, self.sums
             )));
         }
-        let mut flat =
-            Vec::with_capacity(self.gradients.iter().flatten().chain(&self.sums).sum::<usize>() + self.terms);
+        let mut flat = Vec::with_capacity(self.len());
         result.gradients.into_iter().for_each(|gradient| flat.extend(gradient));
         flat.extend(result.terms);
         result.sums.into_iter().for_each(|sum| flat.extend(sum));

@@ -1,6 +1,5 @@
 //! The loop: exchanges slices or replicas, updates the state, and saves it when a checkpoint is due.
 
-use std::collections::BTreeMap;
 use std::ops::Range;
 
 use burn::tensor::Device;
@@ -18,6 +17,7 @@ use super::step::{Layout, apply, hook};
 use super::values::{GRADIENT_NORM, LEARNING_RATE, Recent, due};
 use crate::artifacts::Draft;
 use crate::context::{ContextError, Exchange, GangContext, StageError};
+use crate::tree::Sums;
 
 /// Trains to the last step (of the schedule, or of a rung that stops earlier), or until a stop is requested.
 ///
@@ -71,7 +71,7 @@ struct TrainingLoop<'a> {
     /// The device that keeps the groups, if it is an accelerator.
     accelerator: Option<Device>,
     /// The packed results of this member's parts of the next exchange.
-    done: BTreeMap<usize, Vec<f32>>,
+    done: Sums,
     /// The newest step in a committed checkpoint, if this member knows it.
     saved_at: Option<u64>,
     save_is_due: bool,
@@ -102,6 +102,7 @@ impl<'a> TrainingLoop<'a> {
         }
         let mut state = TrainState::new(groups, buffers);
         let saved_at = begin(objective, &mut state, cx)?;
+        let done = Sums::new(training.parts(), cx.large());
         let mut run = Self {
             steps: training.end().0,
             parts: training.parts(),
@@ -114,7 +115,7 @@ impl<'a> TrainingLoop<'a> {
             cx,
             state,
             terms,
-            done: BTreeMap::new(),
+            done,
             saved_at,
             save_is_due: false,
             stop: false,
@@ -133,38 +134,36 @@ impl<'a> TrainingLoop<'a> {
         self.objective.load(&self.state);
     }
 
-    /// Meets the other members. Returns true if a peer was ahead and this member took over its state.
-    fn meet(&mut self) -> Result<bool, StageError> {
+    /// Meets the other members, and takes over the state of a peer that is ahead.
+    fn meet(&mut self) -> Result<(), StageError> {
         let applied = Some(self.state.step);
-        let adopted = meet(&mut self.state, applied, self.cx)? == Met::Adopted;
-        if adopted {
+        if meet(&mut self.state, applied, self.cx)? == Met::Adopted {
             // Computed slices belong to a finished step.
             self.done.clear();
             self.load();
         }
-        Ok(adopted)
+        Ok(())
     }
 
     /// Computes this member's parts of the next exchange, and exchanges them with the others. Returns the packed sum over
     /// all parts, or `None` if the gang was regrouped instead.
     fn sum_of_parts(&mut self, layout: &Layout) -> Result<Option<Vec<f32>>, StageError> {
         // A regroup may assign other parts of the same step; computed parts are kept.
-        let share = self.cx.share(self.parts);
-        let missing: Vec<usize> = share.clone().filter(|part| !self.done.contains_key(part)).collect();
-        let results = self.compute(layout, &missing)?;
-        self.done.extend(missing.into_iter().zip(results));
-        let parts: Vec<_> =
-            share.map(|part| (part, self.done.remove(&part).expect("a result for each part"))).collect();
-        match self.cx.exchange(self.coming(), self.parts, &parts)? {
+        let missing = self.done.missing(&self.cx.share(self.parts));
+        // Large results are added one by one: in memory there are few at once.
+        let at_once = if layout.len() >= self.cx.large() { 1 } else { missing.len().max(1) };
+        for parts in missing.chunks(at_once) {
+            let results = self.compute(layout, parts)?;
+            parts.iter().zip(results).for_each(|(part, values)| self.done.insert(*part, values));
+        }
+        match self.cx.exchange(self.coming(), self.parts, self.done.parts())? {
             Exchange::Sum { sum, drain } => {
                 self.done.clear();
                 self.stop = drain;
                 Ok(Some(sum))
             }
             Exchange::Regroup => {
-                if !self.meet()? {
-                    self.done.extend(parts);
-                }
+                self.meet()?;
                 Ok(None)
             }
         }
