@@ -46,8 +46,8 @@ fn a_worker_draws_with_a_registered_model() {
         assert_eq!(motions["captions"], json!(said));
         let drawn = motions["motions"].as_array().expect("a list");
         assert!(drawn.len() == 4 && drawn.iter().all(|motion| motion["frames"] == 50), "{drawn:?}");
-        for form in ["npy", "bvh", "glb"] {
-            assert!(manifest["files"][format!("motion-03.{form}")]["bytes"].as_u64() > Some(1_000), "{form}");
+        for file in ["motion-03.npy", "motion-03.bvh", "motion-03.glb", "motions.gif", "motions.html"] {
+            assert!(manifest["files"][file]["bytes"].as_u64() > Some(1_000), "{file}");
         }
         names.push(stage["outputs"]["report"].clone());
     }

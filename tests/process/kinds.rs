@@ -132,7 +132,7 @@ fn bury(cluster: &Cluster, name: &str, secret: &str) {
     assert_eq!(reply.status, 200, "{:?}", reply.body);
 }
 
-/// Every training stage is lost after its first step, and after its last.
+/// Every training stage is lost after its first checkpoint, and after its last.
 #[test]
 fn p5_every_kind_that_trains_is_killed_after_each_of_its_steps() {
     let (cluster, _) = dies_at("checkpoint::after_commit", 1);
@@ -141,11 +141,12 @@ fn p5_every_kind_that_trains_is_killed_after_each_of_its_steps() {
     let said = cluster.said("w1");
     for stage in stages.filter(|stage| trains(stage["kind"].as_str().expect("a kind"))) {
         let name = stage["name"].as_str().expect("a name");
-        let went_on = |step: u32| {
-            let words = format!("continues from the checkpoint after step {step}");
-            said.lines().any(|line| line.contains(&words) && line.ends_with(&format!("/{name}")))
-        };
-        assert!(went_on(1) && went_on(2), "{name} was not killed twice");
+        let continued: BTreeSet<&str> = said
+            .lines()
+            .filter(|line| line.ends_with(&format!("/{name}")))
+            .filter_map(|line| Some(line.split_once("continues from the checkpoint after step ")?.1))
+            .collect();
+        assert!(continued.len() >= 2, "{name} was not killed twice: {continued:?}");
     }
 }
 

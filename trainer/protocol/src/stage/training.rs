@@ -64,18 +64,17 @@ impl Default for Optimizer {
     }
 }
 
-/// Replicas that make updates on their own and are averaged. For networks too slow for an exchange in every update.
+/// Replicas that make updates on their own and are averaged, for lines too slow for an exchange in every update.
 ///
-/// Each replica has its own share of the slices, and so its own share of the batch. After `every` updates, parameters,
-/// moments of the optimizer and moving averages of all replicas are averaged. Source: Stich, "Local SGD Converges Fast and
-/// Communicates Little" (2019), algorithm 1; averaging the moments of AdamW too is ours. A checkpoint is of an average,
-/// so a loss or a stop costs the updates since the last one at most. Part of a stage's identity: the number of replicas does not
-/// follow the workers.
+/// Each replica has its own share of the slices, and so of the batch. After `every` updates, parameters, moments of the
+/// optimizer and moving averages of all replicas are averaged. Source: Stich, "Local SGD Converges Fast and Communicates
+/// Little" (2019), algorithm 1; averaging the moments of AdamW too is ours. Checkpoints are of averages, so a loss costs
+/// the updates since the last one at most. Part of a stage's identity: the number of replicas does not follow the workers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct Replicas {
     /// Updates between two averages.
-    #[schemars(range(min = 1, max = 100_000), extend("x-unit" = "updates"))]
+    #[schemars(range(min = 1, max = 100_000))]
     pub every: Steps,
     /// Number of replicas; divides `batch.slices`. A worker computes whole replicas, so more workers have no work.
     #[schemars(range(min = 1, max = 4_096), extend("x-unit" = "replicas"))]

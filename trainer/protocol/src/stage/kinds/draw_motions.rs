@@ -16,7 +16,7 @@ const SENTENCE: usize = 1_000;
 const POSITIONS: usize = 1_200;
 
 /// `draw.motions`: motions for sentences, in the form of the viewer of a server's page, and as `.npy`, `.bvh`, `.glb` and
-/// `.html`. Two models draw with the same noise if their seeds are the same. The metrics are the physical measures of the
+/// `.html`. A `.gif` shows the first 24 beside each other. Two models draw with the same noise if their seeds are the same. The metrics are the physical measures of the
 /// motions.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
@@ -62,8 +62,8 @@ impl Default for DrawMotions {
 
 impl StageSpec for DrawMotions {
     const KIND: &'static str = "draw.motions";
-    // Version 2 adds penetration and bones.
-    const VERSION: u32 = 2;
+    // Version 2 adds penetration and bones, version 3 a moving picture.
+    const VERSION: u32 = 3;
     const SHAPE: Shape = Shape::Plain;
     const OUTPUT: Output = Output { name: "report", kind: ArtifactKind::Report };
 

@@ -2,8 +2,8 @@
 //!
 //! Files: `motions.json` has all motions in the viewer's form (`mocap::html`) with their measures, and their captions.
 //! Each motion is also in files of its own, such as `motion-00.npy` with positions `[T, J, 3]` in metres, `motion-00.bvh`
-//! and `motion-00.glb`. `motions.html` is a page with all of them. Motions of one sentence are neighbours and have one
-//! length.
+//! and `motion-00.glb`. `motions.html` is a page with all of them, `motions.gif` a moving picture of the first 24. Motions
+//! of one sentence are neighbours and have one length.
 
 use std::collections::BTreeMap;
 
@@ -12,7 +12,7 @@ use mocap::glb;
 use mocap::html::{Page, Panel, Section, packed};
 use mocap::rig::Rig;
 use motion::waypoints::{self, Waypoint};
-use motion::{Skeleton, npy};
+use motion::{Skeleton, draw, npy};
 use protocol::stage::{DrawMotions, Sampler};
 use protocol::{ArtifactKind, Seed};
 use serde_json::json;
@@ -29,6 +29,10 @@ use crate::parts::hint::Hint;
 const MOTIONS_FILE: &str = "motions.json";
 /// File of all motions as a page.
 const PAGE_FILE: &str = "motions.html";
+/// File of the first motions as one moving picture.
+const FILM_FILE: &str = "motions.gif";
+/// Largest number of motions in the moving picture.
+const FILMED: usize = 24;
 
 impl Plain for DrawMotions {
     fn run(&self, cx: &mut dyn AttemptContext) -> Result<Outcome, StageError> {
@@ -169,10 +173,20 @@ fn publish(
     let mut page = Vec::new();
     Page { title: "Motions".to_owned(), sections }.write(&mut page).map_err(refused)?;
 
+    let row = |drawn: &Drawn<'_>| draw::Row {
+        title: drawn.sentence.to_owned(),
+        note: format!("seed {}", drawn.seed.0),
+        joints: drawn.motion.joints.clone(),
+    };
+    let rows: Vec<draw::Row> = drawn.iter().take(FILMED).map(row).collect();
+    let mut film = Vec::new();
+    draw::gif_of_all_to(&rows, skeleton, &mut film).map_err(refused)?;
+
     let meta = json!({"kind": cx.task().settings.kind(), "metrics": metrics, "sampler": sampler});
     let mut draft = artifacts::Draft::new(cx, ArtifactKind::Report, meta);
     draft.add(MOTIONS_FILE, protocol::canonical::to_bytes(&motions))?;
     draft.add(PAGE_FILE, page)?;
+    draft.add(FILM_FILE, film)?;
     for (number, Drawn { sentence, motion, .. }) in drawn.iter().enumerate() {
         let Skeleton { fps, metres_per_unit, joints, .. } = *skeleton;
         let rig = Rig::fit(&motion.joints, skeleton).map_err(refused)?;
