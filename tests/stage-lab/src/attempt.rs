@@ -64,6 +64,7 @@ pub struct MemoryAttempt {
     pub data: Arc<DataAccess>,
     /// Bytes of the blobs of a long file.
     pub chunk_bytes: u64,
+    /// Number of values from which the results of a slice are large.
     pub large: Option<usize>,
     /// Reports of the attempt so far.
     pub told: Told,

@@ -51,7 +51,7 @@ impl Sums {
         share.clone().filter(|slice| !self.nodes.iter().any(|(node, _)| node.contains(slice))).collect()
     }
 
-    /// Adds the values of a slice; large ones at once to those of the node's other part, if that is there.
+    /// Takes the values of a slice. Large ones are added to those of the node's other part as soon as both are there.
     pub(crate) fn insert(&mut self, slice: usize, values: Vec<f32>) {
         let at = self.nodes.partition_point(|(node, _)| node.start < slice);
         let is_large = values.len() >= self.large;
@@ -61,7 +61,7 @@ impl Sums {
         }
     }
 
-    /// Adds the sum at `at` to that of the other part of the node above, and that again, as far as there are other parts.
+    /// Adds the sum at `at` to the sum of the node's other part, if that is there, and repeats this one node higher.
     fn fold(&mut self, mut at: usize) {
         while let Some((above, other)) = parent(self.slices, &self.nodes[at].0) {
             let left = if other.start < self.nodes[at].0.start { at.checked_sub(1) } else { Some(at) };
@@ -110,7 +110,7 @@ pub fn tree_sum(slices: usize, nodes: impl IntoIterator<Item = (Node, Vec<f32>)>
 mod tests {
     use super::*;
 
-    /// The definition.
+    /// The sum by the definition of the tree.
     fn plain(node: Node, leaf: &dyn Fn(usize) -> f32) -> f32 {
         match split(&node) {
             None => leaf(node.start),

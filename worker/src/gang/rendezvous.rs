@@ -119,8 +119,7 @@ fn send_state(
     Ok(())
 }
 
-/// Receives the newest state into `room`, and forwards it along the line. Returns the data that
-/// follows the state.
+/// Receives the newest state into `room`, and forwards it along the line. Returns the data that follows the state.
 ///
 /// With `directly`, the bytes arrive in `room` itself, which is left unusable by an interrupted transfer. Otherwise all
 /// bytes are received first.
@@ -160,7 +159,7 @@ pub(crate) fn adopt(
         receive(&mut |piece| pieces.push(piece))?;
         pieces.iter().for_each(|piece| room.fill(piece, &mut |_| {}));
         if let Some(next) = next {
-            // The mesh knows the loss of the next member, and this one's state is whole.
+            // As below.
             let _ = send_state(mesh, next, step, length, pieces.iter(), interrupt);
         }
         return Ok(room.behind);
@@ -171,20 +170,21 @@ pub(crate) fn adopt(
         let mut arrived = next.map(|next| {
             let is_broken = &is_broken;
             scope.spawn(move || {
-                let given_up = || if is_broken.load(Ordering::SeqCst) { Some(Halt::Peer) } else { interrupt() };
-                // As above.
-                let _ = send_state(mesh, next, step, length, arrivals.into_iter(), &given_up);
+                // Ends between two frames: a part of one would spoil the connection to a member that stays.
+                let pieces = arrivals.into_iter().take_while(|_| !is_broken.load(Ordering::SeqCst));
+                // The mesh knows the loss of the next member, and this one's state is whole without it.
+                let _ = send_state(mesh, next, step, length, pieces, interrupt);
             });
             arrived
         });
         let received = receive(&mut |piece| {
             room.fill(&piece, &mut |filled| {
-                // If nobody listens any more, the next member is lost.
+                // It fails once the next member is lost.
                 let _ = arrived.as_ref().map(|arrived| arrived.send(Cow::Borrowed(filled)));
             });
         });
         is_broken.store(received.is_err(), Ordering::SeqCst);
-        // What follows the state is whole only now.
+        // The data behind the state is whole only now.
         if let Some(arrived) = arrived.take().filter(|_| received.is_ok()) {
             let _ = arrived.send(Cow::Owned(room.behind.clone()));
         }

@@ -126,7 +126,7 @@ fn a_state_passes_through_a_member_while_it_arrives() {
     [ahead, first, second].into_iter().for_each(|mesh| mesh.close(None));
 }
 
-/// The loss of the source or of the next member leaves nobody waiting.
+/// After the loss of the source or of the next member, no member waits.
 #[test]
 fn a_state_that_is_cut_short_in_a_line_ends_for_all() {
     for loses_the_source in [true, false] {

@@ -16,8 +16,8 @@ const SENTENCE: usize = 1_000;
 const POSITIONS: usize = 1_200;
 
 /// `draw.motions`: motions for sentences, in the form of the viewer of a server's page, and as `.npy`, `.bvh`, `.glb` and
-/// `.html`. A `.gif` shows the first 24 beside each other. Two models draw with the same noise if their seeds are the same. The metrics are the physical measures of the
-/// motions.
+/// `.html`. A `.gif` shows the first 24 beside each other. Two models draw with the same noise if their seeds are the
+/// same. The metrics are the physical measures of the motions.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default)]
 pub struct DrawMotions {
