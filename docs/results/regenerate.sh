@@ -16,7 +16,7 @@ while [ $# -ge 1 ] && [ -f "$1" ]; do
     shift
 done
 repository=$(cd "$(dirname "${BASH_SOURCE[0]}")/../.." && pwd)
-built() { cargo build --quiet --release --locked --bin "$1" --manifest-path "$repository/Cargo.toml" && echo "$repository/target/release/$1"; }
+built() { cargo build --quiet --release --locked -p "$1" --bin "$1" --manifest-path "$repository/Cargo.toml" && echo "$repository/target/release/$1"; }
 trainer=${TRAINER:-$(built trainer)}
 tables=${TABLES:-$(built tables)}
 

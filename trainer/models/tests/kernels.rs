@@ -2,7 +2,7 @@
 #![cfg(feature = "flex")]
 
 use burn::tensor::{Device, Tensor, TensorData};
-use models::kernels::{self, Derivative, Dropout, KeyMask, stock};
+use models::kernels::{self, Derivative, Dropout, KeyMask, Sweep, stock};
 use motion::skeleton::Skeleton;
 use protocol::stage::DataFormat;
 
@@ -71,6 +71,75 @@ fn linear_is_the_stock_linear() {
                 let mut all = vec![values(y), values(x.grad(&gradients).unwrap()), values(w.grad(&gradients).unwrap())];
                 all.extend(biased.then(|| values(b.grad(&gradients).unwrap())));
                 all
+            });
+        }
+    }
+}
+
+/// Value, and gradients of the inputs, of `run` on leaves.
+fn with_gradients<const N: usize>(leaves: [Tensor<3>; N], run: impl Fn([Tensor<3>; N]) -> Tensor<3>) -> Vec<Vec<f32>> {
+    let out = run(leaves.clone());
+    let gradients = weighted(out.clone()).backward();
+    std::iter::once(values(out))
+        .chain(leaves.map(|x| values(x.grad(&gradients).expect("a leaf has a gradient"))))
+        .collect()
+}
+
+#[test]
+fn convolutions_are_the_stock_convolutions() {
+    // Frames, in, out, taps, and how the window moves.
+    for (frames, inner, out, taps, stride, dilation, padding) in [
+        (1, 1, 1, 1, 1, 1, 0),
+        (9, 5, 7, 1, 1, 1, 0),
+        (16, 6, 4, 3, 1, 1, 1),
+        (16, 6, 4, 3, 1, 9, 9),
+        (7, 6, 4, 3, 1, 3, 3),
+        (12, 5, 8, 4, 2, 1, 1),
+        (13, 5, 8, 3, 2, 1, 1),
+        (3, 4, 3, 5, 1, 1, 2),
+        (11, 4, 3, 5, 3, 2, 4),
+    ] {
+        let sweep = Sweep { stride, dilation, padding };
+        for biased in [true, false] {
+            agree(&format!("{frames} frames, {inner}x{taps}->{out}, {sweep:?}, bias {biased}"), 3e-6, || {
+                let leaves = [leaf([2, frames, inner], 1), leaf([out, inner, taps], 2), leaf([1, 1, out], 3)];
+                with_gradients(leaves, |[x, w, b]| {
+                    let bias = b.reshape([out]);
+                    let y = kernels::conv(x, w, biased.then(|| bias.clone()), sweep);
+                    if biased { y } else { y + bias.reshape([1, 1, out]) }
+                })
+            });
+        }
+        agree(&format!("transposed, {frames} frames, {inner}x{taps}->{out}, {sweep:?}"), 3e-6, || {
+            let leaves = [leaf([2, frames, inner], 1), leaf([inner, out, taps], 2), leaf([1, 1, out], 3)];
+            with_gradients(leaves, |[x, w, b]| kernels::transposed_conv(x, w, b.reshape([out]), sweep))
+        });
+    }
+}
+
+#[test]
+fn dropout_and_leaky_relu_are_the_stock_ones() {
+    for slope in [0.0, 0.2] {
+        agree(&format!("leaky ReLU of slope {slope} after dropout"), 1e-6, || {
+            with_gradients([leaf([3, 7, 33], 1)], |[x]| {
+                let y = kernels::dropout(x.clone() * 2.0, &mut Dropout::new(0.3, 5, 1, 2));
+                kernels::leaky_relu(y, slope) + x
+            })
+        });
+    }
+}
+
+#[test]
+fn norms_before_a_silu_are_the_stock_norms() {
+    for (frames, width) in [(1, 2), (5, 7), (16, 96)] {
+        for changed in [true, false] {
+            agree(&format!("{frames} frames of {width}, scale and shift {changed}"), 5e-6, || {
+                let leaves = [leaf([2, frames, width], 1), leaf([1, 1, width], 2), leaf([1, 2, 2 * width], 3)];
+                with_gradients(leaves, |[x, gain, change]| {
+                    let change = change.reshape([2, 2 * width]);
+                    let y = kernels::rms_norm_silu(x, gain.reshape([width]), changed.then(|| change.clone()));
+                    if changed { y } else { y + change.sum().reshape([1, 1, 1]) }
+                })
             });
         }
     }
@@ -215,6 +284,13 @@ fn attention_is_the_stock_attention() {
                 let x = leaf([batch, len, 3 * width], 1);
                 let mut dropout = Dropout::new(probability, 9, 2, 1);
                 let y = kernels::self_attention(x.clone(), heads, mask.as_ref(), &mut dropout);
+                let gradients = weighted(y.clone()).backward();
+                vec![values(y), values(x.grad(&gradients).unwrap())]
+            });
+            agree(&format!("causal attention {name}"), 3e-6, || {
+                let x = leaf([batch, len, 3 * width], 1);
+                let mut dropout = Dropout::new(probability, 9, 2, 1);
+                let y = kernels::causal_attention(x.clone(), heads, &mut dropout);
                 let gradients = weighted(y.clone()).backward();
                 vec![values(y), values(x.grad(&gradients).unwrap())]
             });

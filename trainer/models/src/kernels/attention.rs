@@ -12,6 +12,7 @@ use burn::tensor::activation::softmax;
 use burn::tensor::{Tensor, TensorData};
 
 use super::Dropout;
+use super::dropout::Factors;
 #[cfg(feature = "flex")]
 use super::fused;
 
@@ -40,15 +41,24 @@ impl KeyMask {
 /// Self-attention. `qkv` [B, T, 3H], queries, keys and values side by side -> [B, T, H].
 pub fn self_attention(qkv: Tensor<3>, heads: usize, mask: Option<&KeyMask>, dropout: &mut Dropout) -> Tensor<3> {
     let [batch, len, triple] = qkv.dims();
-    let width = triple / 3;
-    let sizes = Sizes { batch, queries: len, keys: len, heads, width };
-    let dropout = dropout.next_key().map(|key| (key, dropout.clone()));
+    own(qkv, Sizes { batch, queries: len, keys: len, heads, width: triple / 3, causal: false }, mask, dropout)
+}
+
+fn own(qkv: Tensor<3>, sizes: Sizes, mask: Option<&KeyMask>, dropout: &mut Dropout) -> Tensor<3> {
+    let Sizes { batch, keys: len, width, .. } = sizes;
+    let dropout = dropout.next_layer();
     #[cfg(feature = "flex")]
     if fused::takes(&qkv) {
         return fused::run(kernel::Attend::new(sizes, mask, dropout), [qkv.into()]);
     }
     let part = |i: usize| qkv.clone().slice([0..batch, 0..len, i * width..(i + 1) * width]);
-    composed(part(0), part(1), part(2), sizes, mask, dropout.as_ref())
+    composed(part(0), part(1), part(2), sizes, mask, dropout)
+}
+
+/// Like [`self_attention`], but no token attends to the tokens after it.
+pub fn causal_attention(qkv: Tensor<3>, heads: usize, dropout: &mut Dropout) -> Tensor<3> {
+    let [batch, len, triple] = qkv.dims();
+    own(qkv, Sizes { batch, queries: len, keys: len, heads, width: triple / 3, causal: true }, None, dropout)
 }
 
 /// Cross-attention. `q` [B, Q, H]; `kv` [B, K, 2H], keys and values side by side -> [B, Q, H].
@@ -61,14 +71,14 @@ pub fn cross_attention(
 ) -> Tensor<3> {
     let [batch, queries, width] = q.dims();
     let keys = kv.dims()[1];
-    let sizes = Sizes { batch, queries, keys, heads, width };
-    let dropout = dropout.next_key().map(|key| (key, dropout.clone()));
+    let sizes = Sizes { batch, queries, keys, heads, width, causal: false };
+    let dropout = dropout.next_layer();
     #[cfg(feature = "flex")]
     if fused::takes(&q) {
         return fused::run(kernel::Attend::new(sizes, mask, dropout), [q.into(), kv.into()]);
     }
     let part = |i: usize| kv.clone().slice([0..batch, 0..keys, i * width..(i + 1) * width]);
-    composed(q, part(0), part(1), sizes, mask, dropout.as_ref())
+    composed(q, part(0), part(1), sizes, mask, dropout)
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -78,7 +88,12 @@ struct Sizes {
     keys: usize,
     heads: usize,
     width: usize,
+    /// Hides the keys after a query's own place.
+    causal: bool,
 }
+
+/// Score of a hidden key: far below any other, but finite, so that a gradient through it is 0 and not undefined.
+const HIDDEN: f32 = -1e9;
 
 impl Sizes {
     fn head(self) -> usize {
@@ -97,21 +112,23 @@ fn composed(
     v: Tensor<3>,
     sizes: Sizes,
     mask: Option<&KeyMask>,
-    dropout: Option<&(u64, Dropout)>,
+    dropout: Option<Factors>,
 ) -> Tensor<3> {
-    let Sizes { batch, queries, keys, heads, width } = sizes;
+    let Sizes { batch, queries, keys, heads, width, causal } = sizes;
     let device = q.device();
     let split = |x: Tensor<3>, len: usize| x.reshape([batch, len, heads, width / heads]).swap_dims(1, 2);
     let mut scores = split(q, queries).matmul(split(k, keys).swap_dims(2, 3)) * sizes.scale();
     if let Some(mask) = mask {
-        // Far below any score, but finite, so that a gradient through it is 0 and not undefined.
-        let bias =
-            (0..batch).flat_map(|b| (0..keys).map(move |j| if j < mask.of(b) { 0.0 } else { -1e9_f32 })).collect();
+        let bias = (0..batch).flat_map(|b| (0..keys).map(move |j| if j < mask.of(b) { 0.0 } else { HIDDEN })).collect();
         scores = scores + Tensor::from_data(TensorData::new(bias, [batch, 1, 1, keys]), &device);
     }
+    if causal {
+        let bias = (0..queries).flat_map(|i| (0..keys).map(move |j| if j <= i { 0.0 } else { HIDDEN })).collect();
+        scores = scores + Tensor::from_data(TensorData::new(bias, [1, 1, queries, keys]), &device);
+    }
     let mut weights = softmax(scores, 3);
-    if let Some((key, dropout)) = dropout {
-        let kept = (0..batch * heads * queries * keys).map(|i| dropout.mask(*key, i)).collect::<Vec<_>>();
+    if let Some(factors) = dropout {
+        let kept = (0..batch * heads * queries * keys).map(|i| factors.of(i)).collect::<Vec<_>>();
         weights = weights * Tensor::from_data(TensorData::new(kept, [batch, heads, queries, keys]), &device);
     }
     weights.matmul(split(v, keys)).swap_dims(1, 2).reshape([batch, queries, width])
@@ -121,7 +138,7 @@ fn composed(
 mod kernel {
     use burn::backend::flex::FlexTensor;
 
-    use super::{Dropout, KeyMask, Sizes, large, small};
+    use super::{Factors, KeyMask, Sizes, large, small};
     use crate::kernels::fused::{Fused, make, slice};
 
     /// Attention of one call: among the tokens of one tensor, or from a tensor to another.
@@ -129,8 +146,8 @@ mod kernel {
     pub(super) struct Attend {
         pub(super) sizes: Sizes,
         mask: Option<KeyMask>,
-        /// Key and probability of the dropout of weights.
-        pub(super) dropout: Option<(u64, Dropout)>,
+        /// Factors of the weights.
+        pub(super) dropout: Option<Factors>,
     }
 
     /// Queries, keys and values inside one or two slices.
@@ -161,7 +178,7 @@ mod kernel {
     }
 
     impl Attend {
-        pub(super) fn new(sizes: Sizes, mask: Option<&KeyMask>, dropout: Option<(u64, Dropout)>) -> Self {
+        pub(super) fn new(sizes: Sizes, mask: Option<&KeyMask>, dropout: Option<Factors>) -> Self {
             Self { sizes, mask: mask.cloned(), dropout }
         }
 

@@ -3,6 +3,9 @@
 
 use burn::tensor::{Tensor, TensorData};
 
+#[cfg(feature = "flex")]
+use super::fused;
+
 /// Position in the run, and the dropout probability there.
 #[derive(Debug, Clone)]
 pub struct Dropout {
@@ -10,6 +13,18 @@ pub struct Dropout {
     layer: u64,
     probability: f64,
 }
+
+/// The factors of a layer's elements: 0 or `1 / (1 - p)`.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Factors {
+    key: u64,
+    /// Hashes below this drop an element.
+    limit: u64,
+    kept: f32,
+}
+
+/// Bits of a hash that decide.
+const BITS: u32 = 53;
 
 impl Dropout {
     /// Disables dropout, for evaluation or a frozen network.
@@ -27,26 +42,31 @@ impl Dropout {
         self.probability
     }
 
-    /// The key of the next layer, or `None` when nothing is dropped.
-    pub(super) fn next_key(&mut self) -> Option<u64> {
+    /// The factors of the next layer, or `None` when nothing is dropped.
+    pub(super) fn next_layer(&mut self) -> Option<Factors> {
         if self.probability <= 0.0 {
             return None;
         }
         self.layer += 1;
-        Some(mix(self.key ^ self.layer))
+        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a share of 2^53, and a factor")]
+        Some(Factors {
+            key: mix(self.key ^ self.layer),
+            limit: (self.probability * (1_u64 << BITS) as f64).ceil() as u64,
+            kept: (1.0 / (1.0 - self.probability)) as f32,
+        })
     }
+}
 
+impl Factors {
     /// Factor of an element: `1 / (1 - p)` if it is kept, 0 if it is dropped.
-    pub(super) fn mask(&self, key: u64, index: usize) -> f32 {
-        #[expect(clippy::cast_precision_loss, reason = "53 bits are drawn")]
-        let uniform = (mix(key ^ index as u64) >> 11) as f64 / (1_u64 << 53) as f64;
-        #[expect(clippy::cast_possible_truncation, reason = "a probability")]
-        let kept = (1.0 / (1.0 - self.probability)) as f32;
-        if uniform < self.probability { 0.0 } else { kept }
+    #[inline(always)]
+    pub(super) fn of(self, index: usize) -> f32 {
+        if mix(self.key ^ index as u64) >> (u64::BITS - BITS) < self.limit { 0.0 } else { self.kept }
     }
 }
 
 /// The 64-bit finaliser of SplitMix64 (Steele et al., 2014).
+#[inline(always)]
 fn mix(x: u64) -> u64 {
     let x = x.wrapping_add(0x9e37_79b9_7f4a_7c15);
     let x = (x ^ (x >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
@@ -56,10 +76,47 @@ fn mix(x: u64) -> u64 {
 
 /// Drops elements of `x` and scales the others by `1 / (1 - p)`.
 pub fn dropout<const D: usize>(x: Tensor<D>, dropout: &mut Dropout) -> Tensor<D> {
-    let Some(key) = dropout.next_key() else { return x };
+    let Some(factors) = dropout.next_layer() else { return x };
+    #[cfg(feature = "flex")]
+    if fused::takes(&x) {
+        return fused::run(kernel::Drop(factors), [x.into()]);
+    }
     let shape = x.dims();
     let count = shape.iter().product::<usize>();
-    let mask: Vec<f32> = (0..count).map(|i| dropout.mask(key, i)).collect();
+    let mask: Vec<f32> = (0..count).map(|i| factors.of(i)).collect();
     let mask = Tensor::from_data(TensorData::new(mask, shape), &x.device());
     x * mask
+}
+
+#[cfg(feature = "flex")]
+mod kernel {
+    use burn::backend::flex::FlexTensor;
+
+    use super::Factors;
+    use crate::kernels::fused::{Fused, overwrite};
+    use crate::kernels::simd::multiversion;
+
+    /// Multiplication by factors that both passes compute.
+    #[derive(Debug, Clone)]
+    pub(super) struct Drop(pub(super) Factors);
+
+    multiversion! {
+        fn multiply(factors: Factors, x: &mut [f32]) {
+            for (i, x) in x.iter_mut().enumerate() {
+                *x *= factors.of(i);
+            }
+        }
+    }
+
+    impl Fused<1> for Drop {
+        type Kept = ();
+
+        fn forward(&self, [x]: [FlexTensor; 1]) -> (FlexTensor, ()) {
+            (overwrite(x, |x| multiply(self.0, x)), ())
+        }
+
+        fn backward(&self, (): (), dy: FlexTensor, _: [bool; 1]) -> [Option<FlexTensor>; 1] {
+            [Some(overwrite(dy, |dy| multiply(self.0, dy)))]
+        }
+    }
 }

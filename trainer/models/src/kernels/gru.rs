@@ -5,8 +5,8 @@
 //! the gates and `u = h U^T + c` the state's part. A token past a sequence's end leaves the state unchanged. So the
 //! forward direction stops at a sequence's own last token and the backward direction starts there.
 //!
-//! Fused: a whole direction is one node of the tape. The gates are kept, and the gradient of U is one product over all
-//! tokens.
+//! Fused: a whole direction is one node of the tape. A turn computes only the sequences that have its token. The gates
+//! are kept, and the gradient of U is one product over all tokens.
 
 use burn::tensor::{Tensor, TensorData, activation::sigmoid};
 
@@ -74,7 +74,7 @@ mod kernel {
 
     use crate::kernels::fused::{Fused, make, slice};
     use crate::kernels::raw::{View, matmul, product};
-    use crate::kernels::simd::{add_rows, exp, multiversion};
+    use crate::kernels::simd::{add_rows, exp, logistic, multiversion, repeat_row};
 
     /// One direction over a batch.
     #[derive(Debug, Clone)]
@@ -92,62 +92,66 @@ mod kernel {
             if self.reverse { self.tokens - 1 - i } else { i }
         }
 
-        /// Reorders states from [turn, B, g] to [B, T, g].
-        fn by_sequence(&self, states: &[f32]) -> Vec<f32> {
-            let size = self.batch * self.width;
-            let width = self.width;
-            let mut out = vec![0.0; states.len()];
-            for i in 0..self.tokens {
-                for b in 0..self.batch {
-                    let to = (b * self.tokens + self.token(i)) * width;
-                    out[to..to + width].copy_from_slice(&states[i * size + b * width..][..width]);
-                }
-            }
-            out
+        /// The sequences, the longest first. The first of them are those that a turn works on.
+        fn order(&self) -> Vec<usize> {
+            let mut order: Vec<usize> = (0..self.batch).collect();
+            order.sort_by_key(|b| std::cmp::Reverse(self.lengths[*b]));
+            order
+        }
+
+        /// Number of sequences that have a token `t`.
+        fn live(&self, t: usize) -> usize {
+            self.lengths.iter().filter(|length| **length > t).count()
+        }
+
+        /// The place of the state after token `t` of sequence `b` in [B, T, g].
+        fn place(&self, b: usize, t: usize) -> std::ops::Range<usize> {
+            let at = (b * self.tokens + t) * self.width;
+            at..at + self.width
         }
     }
 
-    /// The results of a forward pass by turn: states after it [turn, B, g], and r, z, n, u_n [turn, B, 4g].
+    /// What the backward pass reads of a forward pass: one row for each token of each sequence, by turn.
     #[derive(Debug, Clone)]
     pub(super) struct Run {
-        states: Vec<f32>,
+        /// The state before, [g].
+        olds: Vec<f32>,
+        /// r, z, n, u_n, [4g].
         gates: Vec<f32>,
     }
 
-    fn forward(shape: &Gru, input: &[f32], start: &[f32], weight: &[f32], bias: &[f32]) -> Run {
+    /// The states [B, T, g], and the run.
+    fn forward(shape: &Gru, input: &[f32], start: &[f32], weight: &[f32], bias: &[f32]) -> (Vec<f32>, Run) {
         let &Gru { batch, tokens, width, .. } = shape;
-        let size = batch * width;
-        let mut run = Run { states: vec![0.0; tokens * size], gates: vec![0.0; tokens * size * 4] };
-        let mut u = Vec::with_capacity(3 * size);
-        for i in 0..tokens {
-            let t = shape.token(i);
-            let (before, after) = run.states.split_at_mut(i * size);
-            let old = if i == 0 { start } else { &before[(i - 1) * size..] };
-            u.clear();
-            (0..batch).for_each(|_| u.extend_from_slice(bias));
-            let by_row = View::rows(width);
-            let by_gate = View::rows(3 * width);
-            matmul((batch, 3 * width, width), old, by_row, weight, by_row.t(), &mut u, by_gate, 1.0, 1.0);
-            for b in 0..batch {
-                let old = &old[b * width..][..width];
-                let new = &mut after[b * width..][..width];
-                if t < shape.lengths[b] {
+        let order = shape.order();
+        let rows = shape.lengths.iter().sum::<usize>();
+        let mut run = Run { olds: Vec::with_capacity(rows * width), gates: vec![0.0; rows * 4 * width] };
+        let mut states = vec![0.0; batch * tokens * width];
+        let mut now: Vec<f32> = order.iter().flat_map(|b| &start[b * width..(b + 1) * width]).copied().collect();
+        // In this order the product reads the weights where they lie, instead of copying them in every turn.
+        let mut by_input = vec![0.0; weight.len()];
+        for (gate, row) in weight.chunks_exact(width).enumerate() {
+            row.iter().enumerate().for_each(|(k, w)| by_input[k * 3 * width + gate] = *w);
+        }
+        let by_row = View::rows(width);
+        let by_gate = View::rows(3 * width);
+        for t in (0..tokens).map(|i| shape.token(i)) {
+            let live = shape.live(t);
+            let first = run.olds.len() / width;
+            run.olds.extend_from_slice(&now[..live * width]);
+            let olds = &run.olds[first * width..];
+            let mut u = repeat_row(bias, live);
+            matmul((live, 3 * width, width), olds, by_row, &by_input, by_gate, &mut u, by_gate, 1.0, 1.0);
+            for (j, (b, new)) in order.iter().zip(now.chunks_exact_mut(width)).enumerate() {
+                if j < live {
                     let a = &input[(b * tokens + t) * 3 * width..][..3 * width];
-                    let gates = &mut run.gates[(i * batch + b) * 4 * width..][..4 * width];
-                    unit(a, &u[b * 3 * width..][..3 * width], old, gates, new);
-                } else {
-                    new.copy_from_slice(old);
+                    let gates = &mut run.gates[(first + j) * 4 * width..][..4 * width];
+                    unit(a, &u[j * 3 * width..][..3 * width], &olds[j * width..][..width], gates, new);
                 }
+                states[shape.place(*b, t)].copy_from_slice(new);
             }
         }
-        run
-    }
-
-    #[inline(always)]
-    fn logistic(x: f32) -> f32 {
-        let e = exp(-x.abs());
-        let s = 1.0 / (1.0 + e);
-        if x >= 0.0 { s } else { e * s }
+        (states, run)
     }
 
     #[inline(always)]
@@ -219,65 +223,67 @@ mod kernel {
     }
 
     impl Fused<4> for Gru {
-        type Kept = (Run, FlexTensor, FlexTensor);
+        type Kept = (Run, FlexTensor);
 
         fn forward(&self, [input, start, weight, bias]: [FlexTensor; 4]) -> (FlexTensor, Self::Kept) {
-            let run = forward(self, slice(&input), slice(&start), slice(&weight), slice(&bias));
-            let states = make(self.by_sequence(&run.states), &[self.batch, self.tokens, self.width]);
-            (states, (run, start, weight))
+            let (states, run) = forward(self, slice(&input), slice(&start), slice(&weight), slice(&bias));
+            (make(states, &[self.batch, self.tokens, self.width]), (run, weight))
         }
 
-        fn backward(
-            &self,
-            (run, start, weight): Self::Kept,
-            dy: FlexTensor,
-            wanted: [bool; 4],
-        ) -> [Option<FlexTensor>; 4] {
+        fn backward(&self, (run, weight): Self::Kept, dy: FlexTensor, wanted: [bool; 4]) -> [Option<FlexTensor>; 4] {
             let shape = self;
             let &Gru { batch, tokens, width, .. } = shape;
+            let order = shape.order();
+            let Run { olds, gates } = &run;
             let dy = slice(&dy);
-            let start = slice(&start);
-            let weight = slice(&weight);
-            let size = batch * width;
-            let mut dh = vec![0.0; size];
-            let mut da = vec![0.0; 3 * size * tokens];
-            let mut du = vec![0.0; 3 * size * tokens];
-            // The states before each turn.
-            let mut olds = Vec::with_capacity(size * tokens);
-            olds.extend_from_slice(start);
-            olds.extend_from_slice(&run.states[..size * tokens.saturating_sub(1)]);
-            for i in (0..tokens).rev() {
-                let t = shape.token(i);
-                let du = &mut du[i * 3 * size..][..3 * size];
-                for b in 0..batch {
-                    let dh = &mut dh[b * width..][..width];
-                    for (d, y) in dh.iter_mut().zip(&dy[(b * tokens + t) * width..][..width]) {
-                        *d += y;
-                    }
-                    if t < shape.lengths[b] {
+            let mut dh = vec![0.0; batch * width];
+            let mut da = vec![0.0; 3 * batch * width * tokens];
+            let mut du = vec![0.0; 3 * olds.len()];
+            let by_row = View::rows(width);
+            let by_gate = View::rows(3 * width);
+            let mut end = olds.len() / width;
+            for t in (0..tokens).rev().map(|i| shape.token(i)) {
+                let live = shape.live(t);
+                let first = end - live;
+                for (j, (b, dh)) in order.iter().zip(dh.chunks_exact_mut(width)).enumerate() {
+                    dh.iter_mut().zip(&dy[shape.place(*b, t)]).for_each(|(d, y)| *d += y);
+                    if j < live {
+                        let row = first + j;
                         let da = &mut da[(b * tokens + t) * 3 * width..][..3 * width];
-                        let gates = &run.gates[(i * batch + b) * 4 * width..][..4 * width];
-                        let old = &olds[i * size + b * width..][..width];
-                        unit_back(gates, old, dh, da, &mut du[b * 3 * width..][..3 * width]);
+                        let gates = &gates[row * 4 * width..][..4 * width];
+                        unit_back(
+                            gates,
+                            &olds[row * width..][..width],
+                            dh,
+                            da,
+                            &mut du[row * 3 * width..][..3 * width],
+                        );
                     }
                 }
-                let by_row = View::rows(width);
-                let by_gate = View::rows(3 * width);
-                matmul((batch, width, 3 * width), du, by_gate, weight, by_row, &mut dh, by_row, 1.0, 1.0);
+                let du = &du[first * 3 * width..end * 3 * width];
+                matmul((live, width, 3 * width), du, by_gate, slice(&weight), by_row, &mut dh, by_row, 1.0, 1.0);
+                end = first;
             }
             let by_weight = || {
-                let by_row = View::rows(width);
-                let by_gate = View::rows(3 * width);
-                make(product((3 * width, width, tokens * batch), &du, by_gate.t(), &olds, by_row), &[3 * width, width])
+                let rows = olds.len() / width;
+                let dw = match rows {
+                    0 => vec![0.0; 3 * width * width],
+                    _ => product((3 * width, width, rows), &du, by_gate.t(), olds, by_row),
+                };
+                make(dw, &[3 * width, width])
             };
             let by_bias = || {
                 let mut db = vec![0.0; 3 * width];
                 add_rows(&mut db, &du);
                 make(db, &[3 * width])
             };
+            let mut dstart = vec![0.0; batch * width];
+            for (b, dh) in order.iter().zip(dh.chunks_exact(width)) {
+                dstart[b * width..(b + 1) * width].copy_from_slice(dh);
+            }
             let weight = wanted[2].then(by_weight);
             let bias = wanted[3].then(by_bias);
-            [Some(make(da, &[batch, tokens, 3 * width])), Some(make(dh, &[batch, width])), weight, bias]
+            [Some(make(da, &[batch, tokens, 3 * width])), Some(make(dstart, &[batch, width])), weight, bias]
         }
     }
 }

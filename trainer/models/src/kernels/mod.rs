@@ -10,6 +10,7 @@
 //! Not its job: parameters, and the shapes of networks.
 
 mod attention;
+mod conv;
 mod distance;
 mod dropout;
 #[cfg(feature = "flex")]
@@ -22,11 +23,14 @@ mod mish;
 mod norm;
 #[cfg(feature = "flex")]
 mod raw;
+mod relu;
+mod rms;
 pub(crate) mod simd;
 #[cfg(feature = "flex")]
 mod tile;
 
-pub use attention::{KeyMask, cross_attention, self_attention};
+pub use attention::{KeyMask, causal_attention, cross_attention, self_attention};
+pub use conv::{Sweep, conv, transposed_conv};
 pub use distance::{Pointwise, weighted_distance};
 pub use dropout::{Dropout, dropout};
 pub use gelu::gelu;
@@ -35,6 +39,8 @@ pub use joints::{Derivative, joint_derivative, joints};
 pub use linear::linear;
 pub use mish::mish;
 pub use norm::{add_layer_norm, layer_norm, leaky_layer_norm};
+pub use relu::leaky_relu;
+pub use rms::{rms_norm, rms_norm_silu};
 
 /// Runs `body` with Burn's operations instead of the fused kernels on this thread, as the reference for comparisons.
 pub fn stock<T>(body: impl FnOnce() -> T) -> T {

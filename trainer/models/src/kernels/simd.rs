@@ -111,6 +111,14 @@ pub(super) fn exp_by<const SET: u8>(x: f32) -> f32 {
     if x < -87.0 { 0.0 } else { p * scale }
 }
 
+/// `1 / (1 + e^-x)`.
+#[inline(always)]
+pub(super) fn logistic(x: f32) -> f32 {
+    let e = exp(-x.abs());
+    let s = 1.0 / (1.0 + e);
+    if x >= 0.0 { s } else { e * s }
+}
+
 /// erf(x) within about 1e-7, as the odd rational function x P(x^2) / Q(x^2) on |x| < 4 whose coefficients Eigen publishes
 /// (`generic_fast_erf_float`, degrees 13 and 8).
 #[inline(always)]

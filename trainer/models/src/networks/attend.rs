@@ -66,6 +66,8 @@ pub(super) fn hiding(visible: &[bool], batch: usize, device: &Device) -> Tensor<
 pub(super) enum Sight {
     /// All keys up to the end of the sequence.
     Keys(Option<KeyMask>),
+    /// The keys up to the query's own place.
+    Before,
     /// The keys that a bias on the scores leaves visible.
     Bias(Box<Tensor<4>>),
 }
@@ -140,10 +142,10 @@ impl SplitAttention {
         let q = self.query.forward(x_bth.clone());
         let k = self.key.forward(x_bth.clone());
         let v = self.value.forward(x_bth);
+        let packed = |q, k, v| Tensor::cat(vec![q, k, v], 2);
         let attended = match sight {
-            Sight::Keys(mask) => {
-                kernels::self_attention(Tensor::cat(vec![q, k, v], 2), self.heads, mask.as_ref(), dropout)
-            }
+            Sight::Keys(mask) => kernels::self_attention(packed(q, k, v), self.heads, mask.as_ref(), dropout),
+            Sight::Before => kernels::causal_attention(packed(q, k, v), self.heads, dropout),
             Sight::Bias(bias) => attend(q, k, v, self.heads, Some((**bias).clone()), dropout),
         };
         kernels::dropout(self.proj.forward(attended), dropout)

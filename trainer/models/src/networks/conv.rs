@@ -1,13 +1,10 @@
-//! Convolutions over time on [B, T, C] as matrix products over windows, and the parts of upstream's sequences.
-//!
-//! The rows of a window are gathered tap after tap. So a convolution of any stride and dilation is one
-//! [`kernels::linear`]: weights are published as [out, in, taps], and the fused product runs on the calling thread.
+//! Convolutions over time on [B, T, C], and the parts of upstream's sequences.
 
 use burn::module::{Module, Param};
 use burn::tensor::Tensor;
 
 use super::Init;
-use crate::kernels;
+use crate::kernels::{self, Sweep};
 
 /// An entry of a sequence without parameters, such as an activation or a reshape; it only takes up a number.
 pub(super) type Gap = bool;
@@ -21,9 +18,8 @@ pub struct Conv1d {
     pub weight: Param<Tensor<3>>,
     /// Bias of shape [out].
     pub bias: Option<Param<Tensor<1>>>,
-    stride: usize,
-    dilation: usize,
-    padding: usize,
+    #[module(skip)]
+    sweep: Sweep,
     /// Pads with repeated edges instead of zeros.
     replicate: bool,
 }
@@ -37,7 +33,8 @@ impl Conv1d {
 
     /// Like [`same`](Self::same), with `dilation` frames between taps.
     pub fn dilated(init: &mut Init<'_>, inner: usize, out: usize, taps: usize, dilation: usize) -> Self {
-        Self { padding: dilation * (taps / 2), dilation, ..Self::strided(init, inner, out, taps, 1, 0) }
+        let sweep = Sweep { stride: 1, dilation, padding: dilation * (taps / 2) };
+        Self { sweep, ..Self::strided(init, inner, out, taps, 1, 0) }
     }
 
     /// Creates a layer on every `stride`-th window, with `padding` frames of zeros on either side.
@@ -46,9 +43,7 @@ impl Conv1d {
         Self {
             weight: init.fan_in(fan, [out, inner, taps]),
             bias: Some(init.fan_in(fan, [out])),
-            stride,
-            dilation: 1,
-            padding,
+            sweep: Sweep { stride, dilation: 1, padding },
             replicate: false,
         }
     }
@@ -70,56 +65,21 @@ impl Conv1d {
     /// # Panics
     /// If the padded sequence is shorter than a window.
     pub fn forward(&self, x_btc: Tensor<3>) -> Tensor<3> {
-        let [out, inner, taps] = self.weight.dims();
         let weight = self.weight.val();
-        let weight = if taps == 1 { weight } else { weight.swap_dims(1, 2) };
-        let weight = weight.reshape([out, taps * inner]);
-        kernels::linear(self.windows(x_btc, taps), weight, self.bias.as_ref().map(Param::val))
+        let bias = self.bias.as_ref().map(Param::val);
+        if self.replicate {
+            let x = edged(x_btc, self.sweep.padding);
+            return kernels::conv(x, weight, bias, Sweep { padding: 0, ..self.sweep });
+        }
+        kernels::conv(x_btc, weight, bias, self.sweep)
     }
+}
 
-    /// Gathers windows: [B, T, in] -> [B, T', taps in].
-    fn windows(&self, x_btc: Tensor<3>, taps: usize) -> Tensor<3> {
-        if taps == 1 && self.stride == 1 && self.padding == 0 {
-            return x_btc;
-        }
-        let [batch, frames, inner] = x_btc.dims();
-        let reach = self.dilation * (taps - 1);
-        assert!(frames + 2 * self.padding > reach, "{frames} frames are shorter than a window of {}", reach + 1);
-        let count = (frames + 2 * self.padding - reach - 1) / self.stride + 1;
-        // Viewed in blocks of `stride` rows, every tap is a column of blocks.
-        let rows = self.stride * (reach / self.stride + count);
-        let blocks = self.padded(x_btc, rows).reshape([batch, rows / self.stride, self.stride * inner]);
-        let tap = |k: usize| {
-            let block = k * self.dilation / self.stride;
-            let at = k * self.dilation % self.stride * inner;
-            blocks.clone().slice([0..batch, block..block + count, at..at + inner])
-        };
-        Tensor::cat((0..taps).map(tap).collect(), 2)
-    }
-
-    /// Pads to `rows` rows, including the padding on the left.
-    fn padded(&self, x_btc: Tensor<3>, rows: usize) -> Tensor<3> {
-        let [batch, frames, inner] = x_btc.dims();
-        let edge = |at: usize, count: usize| {
-            if self.replicate {
-                x_btc.clone().slice([0..batch, at..at + 1, 0..inner]).expand([batch, count, inner])
-            } else {
-                Tensor::zeros([batch, count, inner], &x_btc.device())
-            }
-        };
-        let mut parts = Vec::with_capacity(3);
-        if self.padding > 0 {
-            parts.push(edge(0, self.padding));
-        }
-        // Frames beyond the last window are cut off.
-        let kept = frames.min(rows - self.padding);
-        parts.push(x_btc.clone().slice([0..batch, 0..kept, 0..inner]));
-        let missing = rows - self.padding - kept;
-        if missing > 0 {
-            parts.push(edge(frames - 1, missing));
-        }
-        if parts.len() == 1 { parts.remove(0) } else { Tensor::cat(parts, 1) }
-    }
+/// Repeats the first and the last frame `count` times each.
+fn edged(x_btc: Tensor<3>, count: usize) -> Tensor<3> {
+    let [batch, frames, inner] = x_btc.dims();
+    let edge = |at: usize| x_btc.clone().slice([0..batch, at..at + 1, 0..inner]).expand([batch, count, inner]);
+    Tensor::cat(vec![edge(0), x_btc.clone(), edge(frames - 1)], 1)
 }
 
 /// A transposed convolution of two taps and stride 2: it doubles the frames, and windows do not overlap.

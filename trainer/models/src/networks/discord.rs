@@ -15,14 +15,12 @@ use serde::{Deserialize, Serialize};
 
 use super::conv::{Conv1d, Doubling, GAP, Gap, repeat};
 use super::{Init, Linear};
-use crate::kernels::{Dropout, dropout, gelu};
+use crate::kernels::{self, Dropout, dropout, gelu};
 
 /// Frames per token.
 const UNIT: usize = 4;
 /// Number of heads of the linear attentions, and the width of each.
 const LINEAR_HEADS: (usize, usize) = (4, 32);
-/// Lower limit of a norm used as a divisor.
-const LEAST: f32 = 1e-12;
 /// Added to variances in batch norms.
 const BATCH_EPS: f64 = 1e-5;
 
@@ -91,10 +89,13 @@ impl RmsNorm {
         Self { g: init.constant(1.0, [1, width, 1]) }
     }
 
+    fn gain(&self) -> Tensor<1> {
+        let width = self.g.dims()[1];
+        self.g.val().reshape([width])
+    }
+
     fn forward(&self, x_btc: Tensor<3>) -> Tensor<3> {
-        let width = x_btc.dims()[2];
-        let norm = x_btc.clone().square().sum_dim(2).sqrt().clamp_min(LEAST);
-        x_btc / norm * self.g.val().reshape([1, 1, width]) * (width as f32).sqrt()
+        kernels::rms_norm(x_btc, self.gain())
     }
 }
 
@@ -112,8 +113,9 @@ impl ConvBlock {
         Self { proj: Conv1d::same(init, inner, out, 3), norm: RmsNorm::new(init, out) }
     }
 
-    fn normed(&self, x_btc: Tensor<3>) -> Tensor<3> {
-        self.norm.forward(self.proj.forward(x_btc))
+    /// `change` [B, 2 out] is a scale and a shift between norm and SiLU.
+    fn forward(&self, x_btc: Tensor<3>, change: Option<Tensor<2>>) -> Tensor<3> {
+        kernels::rms_norm_silu(self.proj.forward(x_btc), self.norm.gain(), change)
     }
 }
 
@@ -141,12 +143,9 @@ impl TimedBlock {
     }
 
     fn forward(&self, x_btc: Tensor<3>, time_bc: &Tensor<2>, drop: &mut Dropout) -> Tensor<3> {
-        let moved = self.mlp.1.forward(silu(time_bc.clone()));
-        let [batch, both] = moved.dims();
-        let out = both / 2;
-        let part = |at: usize| moved.clone().slice([0..batch, at..at + out]).reshape([batch, 1, out]);
-        let h = self.block1.normed(x_btc.clone()) * (part(0) + 1.0) + part(out);
-        let h = silu(self.block2.normed(dropout(silu(h), drop)));
+        let change = self.mlp.1.forward(silu(time_bc.clone()));
+        let h = self.block1.forward(x_btc.clone(), Some(change));
+        let h = self.block2.forward(dropout(h, drop), None);
         match &self.res_conv {
             Some(conv) => h + conv.forward(x_btc),
             None => h + x_btc,

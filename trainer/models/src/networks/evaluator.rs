@@ -10,17 +10,18 @@
 //! autoencoder.
 
 use burn::module::{Module, Param};
-use burn::tensor::activation::leaky_relu;
 use burn::tensor::{Device, Tensor};
 use serde::{Deserialize, Serialize};
 
 use super::{Init, Linear, Norm};
-use crate::kernels::{self, Dropout, dropout, gru};
+use crate::kernels::{self, Dropout, Sweep, dropout, gru, leaky_relu};
 
 /// Slope of every leaky ReLU here.
 const SLOPE: f64 = 0.2;
 /// Added to variances in layer norms.
 const EPS: f64 = 1e-5;
+/// Windows that halve the frames.
+const HALVING: Sweep = Sweep { stride: 2, dilation: 1, padding: 1 };
 /// Frames per movement.
 pub(crate) const UNIT: usize = 4;
 
@@ -65,19 +66,8 @@ impl Conv {
     }
 
     /// Maps [B, T, in] to [B, T / 2, out].
-    ///
-    /// A window is two neighbouring pairs of padded frames, so the convolution is a Linear over windows.
     pub fn forward(&self, x_btc: Tensor<3>) -> Tensor<3> {
-        let [batch, frames, inner] = x_btc.dims();
-        let [out, _, taps] = self.weight.dims();
-        let edge = Tensor::zeros([batch, 1, inner], &x_btc.device());
-        let pairs = (frames + 2) / 2;
-        let padded = Tensor::cat(vec![edge.clone(), x_btc, edge], 1);
-        let paired = padded.slice([0..batch, 0..2 * pairs, 0..inner]).reshape([batch, pairs, 2 * inner]);
-        let part = |from: usize| paired.clone().slice([0..batch, from..from + pairs - 1, 0..2 * inner]);
-        let windows = Tensor::cat(vec![part(0), part(1)], 2);
-        let weight = self.weight.val().swap_dims(1, 2).reshape([out, taps * inner]);
-        kernels::linear(windows, weight, Some(self.bias.val()))
+        kernels::conv(x_btc, self.weight.val(), Some(self.bias.val()), HALVING)
     }
 }
 
@@ -101,23 +91,8 @@ impl Deconv {
     }
 
     /// Maps [B, T, in] to [B, 2 T, out].
-    ///
-    /// Frame 2m applies taps 3 and 1 to inputs m-1 and m. Frame 2m+1 applies taps 2 and 0 to inputs m and m+1.
     pub fn forward(&self, x_btc: Tensor<3>) -> Tensor<3> {
-        let [batch, frames, inner] = x_btc.dims();
-        let out = self.weight.dims()[1];
-        let edge = Tensor::zeros([batch, 1, inner], &x_btc.device());
-        let padded = Tensor::cat(vec![edge.clone(), x_btc, edge], 1);
-        let at = |from: usize| padded.clone().slice([0..batch, from..from + frames, 0..inner]);
-        let tap = |k: usize| {
-            let tap = self.weight.val().slice([0..inner, 0..out, k..k + 1]);
-            tap.reshape([inner, out]).swap_dims(0, 1)
-        };
-        let half = |from: usize, first: usize, second: usize| {
-            let windows = Tensor::cat(vec![at(from), at(from + 1)], 2);
-            kernels::linear(windows, Tensor::cat(vec![tap(first), tap(second)], 1), Some(self.bias.val()))
-        };
-        Tensor::cat(vec![half(0, 3, 1), half(1, 2, 0)], 2).reshape([batch, 2 * frames, out])
+        kernels::transposed_conv(x_btc, self.weight.val(), self.bias.val(), HALVING)
     }
 }
 

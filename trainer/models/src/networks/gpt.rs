@@ -11,7 +11,7 @@ use burn::module::Module;
 use burn::tensor::Tensor;
 use protocol::stage::TokenNetwork;
 
-use super::attend::{Embedding, GptBlock, GptHead, Sight, causal, linear, sinusoids};
+use super::attend::{Embedding, GptBlock, GptHead, Sight, linear, sinusoids};
 use super::{Init, Linear};
 use crate::kernels::Dropout;
 
@@ -94,8 +94,7 @@ impl Gpt {
             _ => Tensor::cat(vec![condition, self.trans_base.tok_emb.rows(ids, batch)], 1),
         };
         let x = x + sinusoids(len, width, &device);
-        let sight = Sight::Bias(Box::new(causal(len, &device)));
-        let x = self.trans_base.blocks.iter().fold(x, |x, block| block.forward(x, &sight, dropout));
-        self.trans_head.forward(x, &sight, dropout)
+        let x = self.trans_base.blocks.iter().fold(x, |x, block| block.forward(x, &Sight::Before, dropout));
+        self.trans_head.forward(x, &Sight::Before, dropout)
     }
 }

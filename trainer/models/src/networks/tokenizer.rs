@@ -7,12 +7,11 @@
 
 use burn::module::Module;
 use burn::tensor::Tensor;
-use burn::tensor::activation::relu;
 use protocol::stage::TokenizerNetwork;
 
 use super::Init;
 use super::conv::{Conv1d, GAP, Gap, repeat};
-use crate::kernels::{Dropout, dropout};
+use crate::kernels::{Dropout, dropout, leaky_relu};
 
 /// Size of a tokenizer's networks.
 #[derive(Debug, Clone, PartialEq)]
@@ -31,6 +30,10 @@ pub const LEVELS: usize = 2;
 pub const STRIDE: usize = 2;
 /// Frames per token.
 pub const UNIT: usize = STRIDE.pow(LEVELS as u32);
+
+fn relu(x_btc: Tensor<3>) -> Tensor<3> {
+    leaky_relu(x_btc, 0.0)
+}
 
 /// A residual block, `x + D(C1(relu(C3(relu(x)))))` with dropout D.
 #[derive(Module, Debug)]

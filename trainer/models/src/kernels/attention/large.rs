@@ -1,7 +1,7 @@
 //! Attention over sequences of any length: matrix products on strided views of the packed projections.
 
-use super::Sizes;
 use super::kernel::{Attend, Packed};
+use super::{HIDDEN, Sizes};
 use crate::kernels::raw::{View, matmul};
 use crate::kernels::simd::{exp, multiversion};
 
@@ -102,12 +102,17 @@ pub(super) fn forward(attend: &Attend, packed: &Packed<'_>) -> (Vec<f32>, Vec<f3
                 (weight_view(s, b, h), packed.q_view(s, b, h), packed.k_view(s, b, h), packed.v_view(s, b, h));
             matmul((s.queries, valid, s.head()), packed.q, q, packed.kv, k.t(), &mut weights, at, 0.0, s.scale());
             let range = at.offset..at.offset + s.queries * s.keys;
+            if s.causal {
+                for (query, row) in weights[range.clone()].chunks_exact_mut(s.keys).enumerate() {
+                    row[(query + 1).min(s.keys)..].fill(HIDDEN);
+                }
+            }
             softmax_rows(&mut weights[range.clone()], s.keys, valid);
             let (p, pv) = match &attend.dropout {
                 None => (&weights[..], at),
-                Some((key, dropout)) => {
+                Some(factors) => {
                     dropped.clear();
-                    dropped.extend(range.map(|i| weights[i] * dropout.mask(*key, i)));
+                    dropped.extend(range.map(|i| weights[i] * factors.of(i)));
                     (&dropped[..], View::rows(s.keys))
                 }
             };
@@ -139,9 +144,9 @@ pub(super) fn backward(attend: &Attend, packed: &Packed<'_>, weights: &[f32], do
             matmul((s.queries, valid, s.head()), dout, out, packed.kv, v.t(), &mut scores, by_keys, 0.0, 1.0);
             match &attend.dropout {
                 None => dropped.copy_from_slice(p),
-                Some((key, dropout)) => {
+                Some(factors) => {
                     for (i, (d, score)) in dropped.iter_mut().zip(&mut scores).enumerate() {
-                        let kept = dropout.mask(*key, at.offset + i);
+                        let kept = factors.of(at.offset + i);
                         *d = p[i] * kept;
                         *score *= kept;
                     }

@@ -4,8 +4,9 @@
 //! The softmax over keys then needs no sum across lanes, and all products are those of [`tile`]. A head's operands stay
 //! in the nearest cache. Weights of queries that are only rounding have no influence.
 
-use super::Sizes;
 use super::kernel::{Attend, Packed};
+use super::{HIDDEN, Sizes};
+use crate::kernels::dropout::Factors;
 use crate::kernels::simd::{exp_by, mul_add, multiversion};
 use crate::kernels::tile::{LANES, Left, multiply, transpose};
 
@@ -129,19 +130,28 @@ impl Places {
 
 /// Fills the factors and the dropped weights of a head if there is dropout.
 fn dropped(attend: &Attend, (b, h): (usize, usize), valid: usize, scratch: &mut Scratch) -> bool {
-    let Some((key, dropout)) = &attend.dropout else { return false };
+    let Some(factors) = attend.dropout else { return false };
     let s = attend.sizes;
-    let lanes = s.queries.next_multiple_of(LANES);
     // The place of a weight is that in [B, heads, Q, K].
-    let base = (b * s.heads + h) * s.queries * s.keys;
-    for j in 0..valid {
-        for i in 0..s.queries {
-            let factor = dropout.mask(*key, base + i * s.keys + j);
-            scratch.factors[j * lanes + i] = factor;
-            scratch.dropped[j * lanes + i] = scratch.weights[j * lanes + i] * factor;
+    drop_weights(s, factors, (b * s.heads + h) * s.queries * s.keys, valid, scratch);
+    true
+}
+
+multiversion! {
+    fn drop_weights(s: Sizes, factors: Factors, base: usize, valid: usize, scratch: &mut Scratch) {
+        let lanes = s.queries.next_multiple_of(LANES);
+        for j in 0..valid {
+            let row = j * lanes..j * lanes + s.queries;
+            let weights = &scratch.weights[row.clone()];
+            let dropped = &mut scratch.dropped[row.clone()];
+            let kept = &mut scratch.factors[row];
+            for i in 0..s.queries {
+                let factor = factors.of(base + i * s.keys + j);
+                kept[i] = factor;
+                dropped[i] = weights[i] * factor;
+            }
         }
     }
-    true
 }
 
 multiversion! {
@@ -153,6 +163,11 @@ multiversion! {
         let keys = Left { values: &packed.kv[at.k..], row: packed.kv_row, col: 1 };
         let weights = &mut scratch.weights[..valid * lanes];
         multiply::<SET>((valid, lanes, s.head()), keys, (&scratch.turned, lanes), (weights, lanes));
+        if s.causal {
+            for (key, row) in weights.chunks_exact_mut(lanes).enumerate() {
+                row[..key].fill(HIDDEN);
+            }
+        }
         for column in (0..lanes).step_by(LANES) {
             let mut most = [f32::NEG_INFINITY; LANES];
             for row in weights.chunks_exact(lanes) {

@@ -179,7 +179,7 @@ impl TrainStableMoFusion {
 
 impl StageSpec for TrainStableMoFusion {
     const KIND: &'static str = "train.stablemofusion";
-    const VERSION: u32 = 3;
+    const VERSION: u32 = 4;
     const SHAPE: Shape = Shape::Gang;
     const OUTPUT: Output = Output { name: "model", kind: ArtifactKind::Model };
 
