@@ -10,7 +10,7 @@ use std::time::Duration;
 use access::Server;
 use burn::tensor::Device;
 use protocol::message::{Join, PROTOCOL_VERSION};
-use protocol::stage::Backend;
+use protocol::stage::{Backend, StageSettings};
 use protocol::{Labels, WorkerId};
 use stages::external::{DataAccess, open_roots};
 use tokio::runtime;
@@ -180,6 +180,7 @@ fn work(options: Options, device: Device, kinds: Arc<dyn Kinds>, timing: Timing)
         pid: std::process::id(),
         backend: options.backend,
         instruction_set: models::instruction_set().to_owned(),
+        code_versions: StageSettings::code_versions(),
         peer_address: advertised.unwrap_or_else(|| endpoint.address().to_string()),
         labels: options.labels.clone(),
     };

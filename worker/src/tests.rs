@@ -109,6 +109,7 @@ impl Worker {
             pid: 1,
             backend: Backend::Flex,
             instruction_set: "avx2".into(),
+            code_versions: protocol::stage::StageSettings::code_versions(),
             peer_address,
             labels: Default::default(),
         };

@@ -196,6 +196,7 @@ fn beat(server: &Restarted, stop: &AtomicBool) -> Result<Vec<Duration>> {
         pid: 7,
         backend: Backend::Ndarray,
         instruction_set: "avx2".into(),
+        code_versions: protocol::stage::StageSettings::code_versions(),
         peer_address: "127.0.0.1:1".into(),
         labels: Default::default(),
     };
@@ -345,6 +346,7 @@ fn recorded(server: &Restarted) -> Result<(Assignment, Poll)> {
         pid: 7,
         backend: Backend::Flex,
         instruction_set: "avx2".into(),
+        code_versions: protocol::stage::StageSettings::code_versions(),
         peer_address: "127.0.0.1:1".into(),
         labels: Default::default(),
     };

@@ -151,6 +151,7 @@ async fn acts_as_a_worker() {
         pid: std::process::id(),
         backend: Backend::Flex,
         instruction_set: "avx2".into(),
+        code_versions: protocol::stage::StageSettings::code_versions(),
         peer_address: "127.0.0.1:1".into(),
         labels,
     };

@@ -27,7 +27,7 @@ mod sampler;
 mod spec;
 mod training;
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
 use crate::model_ref::names_version;
 use crate::{ArtifactKind, Digest, Steps};
@@ -93,6 +93,12 @@ impl StageSettings {
     /// The kind's [`StageSpec::VERSION`].
     pub fn code_version(&self) -> u32 {
         self.spec().version()
+    }
+
+    /// Code versions of all kinds of this build, those above 1.
+    pub fn code_versions() -> BTreeMap<String, u32> {
+        let all = Self::all().into_iter().map(|settings| (settings.kind().to_owned(), settings.code_version()));
+        all.filter(|(_, version)| *version > 1).collect()
     }
 
     /// Distribution of its work over workers.

@@ -120,6 +120,7 @@ impl Worker {
             pid: 1,
             backend: Backend::Flex,
             instruction_set: "avx2".into(),
+            code_versions: protocol::stage::StageSettings::code_versions(),
             peer_address: "127.0.0.1:1".into(),
             labels: Default::default(),
         };

@@ -187,25 +187,28 @@ fn idle_that<'a>(state: &'a State, takes: impl Fn(&Worker) -> bool + 'a) -> impl
     fit.map(|(name, worker)| worker.member(name))
 }
 
-/// Idle workers that have the inputs of a task and, as far as known, enough memory for it. All have the same
-/// instruction set: that of the execution's earlier work, or else the most common one. A shunned worker never joins
-/// others. If only shunned workers are left, one of them starts alone, or as many as the minimum requires.
+/// Idle workers that have the inputs of a task and, as far as known, enough memory for it. All have the same instruction
+/// set and code: those of the gang's members, or else the most common ones. The instruction set is also that of the
+/// execution's earlier work. A shunned worker never joins others. If only shunned workers are left, one of them starts alone, or as many as the minimum requires.
 fn fit(state: &State, shares: &Shares, execution: &StageExecution, task: &Task) -> Vec<Member> {
     let fits = |member: &Member| {
         state.workers[&member.worker].ready.contains(&task.id) && !task.too_small.contains(&member.worker)
     };
     let is_shunned = |member: &Member| state.workers[&member.worker].shunned.is_some();
-    let mut by_set: Vec<(&str, Vec<Member>)> = Vec::new();
+    let arithmetic = |member: &Member| state.workers[&member.worker].arithmetic();
+    let given = task.holders().first().map(arithmetic);
+    let mut alike: Vec<((&str, Option<Digest>), Vec<Member>)> = Vec::new();
     for member in allowed(state, shares, execution).filter(fits).filter(|member| !task.is_held() || !is_shunned(member))
     {
-        let set = state.workers[&member.worker].instruction_set.as_str();
-        match by_set.iter_mut().find(|(known, _)| *known == set) {
+        let own = arithmetic(&member);
+        match alike.iter_mut().find(|(known, _)| *known == own) {
             Some((_, members)) => members.push(member),
-            None => by_set.push((set, vec![member])),
+            None if given.is_none_or(|given| given == own) => alike.push((own, vec![member])),
+            None => {}
         }
     }
-    // In a tie, the first set wins, which has the first worker in the order of assignment.
-    let of_most = by_set.into_iter().rev().max_by_key(|(_, members)| members.len());
+    // In a tie, the first ones win, which have the first worker in the order of assignment.
+    let of_most = alike.into_iter().rev().max_by_key(|(_, members)| members.len());
     let (shunned, mut welcome): (Vec<Member>, Vec<Member>) =
         of_most.map(|(_, members)| members).unwrap_or_default().into_iter().partition(is_shunned);
     let missing = execution.range().min.max(1).saturating_sub(welcome.len());

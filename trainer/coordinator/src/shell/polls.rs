@@ -1,5 +1,6 @@
 //! Calls of workers: join, poll, leave.
 
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -8,6 +9,7 @@ use axum::extract::State;
 use protocol::WorkerId;
 use protocol::message::{DesiredAssignments, Gone, Join, Joined, PROTOCOL_VERSION, Poll};
 use protocol::proof::Process;
+use protocol::stage::StageSettings;
 
 use super::actor_handle::ActorHandle;
 use super::body::Message;
@@ -30,6 +32,15 @@ pub(crate) async fn join(
         );
         return Err(Rejected::Invalid(message).into());
     }
+    let other = other_code(&join.code_versions, &StageSettings::code_versions());
+    if !other.is_empty() {
+        let message = format!(
+            "worker `{}` computes other versions of stage kinds than this coordinator: {}; use one build for both",
+            join.worker,
+            other.join(", ")
+        );
+        return Err(Rejected::Invalid(message).into());
+    }
     let by = proof.of_join(&join.worker)?;
     let effects = actor_handle.decide(Event::Join { join, by }).await?;
     let incarnation = effects.into_iter().find_map(|effect| match effect {
@@ -39,6 +50,20 @@ pub(crate) async fn join(
     let policy = actor_handle.state().policy.clone();
     let incarnation = incarnation.expect("a join gives an incarnation");
     Ok(Json(Joined { incarnation, lease_ms: policy.lease_ms, poll_ms: policy.poll_ms }))
+}
+
+/// Most kinds that a refusal names.
+const NAMED: usize = 3;
+
+/// Says which kinds have another version in `found` than in `expected`; kinds without one have version 1.
+fn other_code(found: &BTreeMap<String, u32>, expected: &BTreeMap<String, u32>) -> Vec<String> {
+    let version = |versions: &BTreeMap<String, u32>, kind: &str| versions.get(kind).copied().unwrap_or(1);
+    let kinds: BTreeSet<&String> = found.keys().chain(expected.keys()).collect();
+    let other = kinds.into_iter().filter(|kind| version(found, kind) != version(expected, kind));
+    let says = |kind: &String| {
+        format!("`{}` {} instead of {}", kind.escape_debug(), version(found, kind), version(expected, kind))
+    };
+    other.take(NAMED).map(says).collect()
 }
 
 /// Answers at once if the worker's assignments have changed, otherwise after `poll_ms`.

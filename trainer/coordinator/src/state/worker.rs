@@ -104,6 +104,9 @@ pub struct Worker {
     /// The instruction set that its kernels use.
     #[serde(default)]
     pub instruction_set: String,
+    /// Digest of the code versions of its stage kinds. `None`: the worker joined before they were compared.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub code: Option<Digest>,
     /// The address at which peers reach it.
     pub peer_address: String,
     /// Labels that stages may require.
@@ -139,6 +142,7 @@ impl Worker {
             pid: join.pid,
             backend: join.backend,
             instruction_set: join.instruction_set.clone(),
+            code: Some(protocol::canonical::digest(&join.code_versions)),
             peer_address: join.peer_address.clone(),
             labels: join.labels.clone(),
             presence: Presence::Here,
@@ -149,6 +153,11 @@ impl Worker {
             ready: BTreeSet::new(),
             holds: None,
         }
+    }
+
+    /// What all members of a gang have in common, so that each would compute the same bits.
+    pub fn arithmetic(&self) -> (&str, Option<Digest>) {
+        (&self.instruction_set, self.code)
     }
 
     /// Returns true if the worker may be given work.

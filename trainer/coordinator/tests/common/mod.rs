@@ -114,15 +114,26 @@ impl PureCoordinator {
     }
 
     pub(crate) fn join_labelled(&mut self, name: &str, instruction_set: &str, labels: &str) -> Incarnation {
-        let join = Join {
+        let labels = labels.parse().expect("labels");
+        self.join_as(Join { instruction_set: instruction_set.into(), labels, ..Self::offer(name) })
+    }
+
+    /// What a worker of this build says when it joins.
+    pub(crate) fn offer(name: &str) -> Join {
+        Join {
             protocol: PROTOCOL_VERSION,
             worker: name.into(),
             pid: 1,
             backend: Backend::Flex,
-            instruction_set: instruction_set.into(),
+            instruction_set: "avx2".into(),
+            code_versions: protocol::stage::StageSettings::code_versions(),
             peer_address: format!("{name}:1"),
-            labels: labels.parse().expect("labels"),
-        };
+            labels: Default::default(),
+        }
+    }
+
+    pub(crate) fn join_as(&mut self, join: Join) -> Incarnation {
+        let name = join.worker.to_string();
         // Always the same process, with the same secret.
         let by = Identity { caller: "t".into(), secret: Digest::of(name.as_bytes()) };
         let effects = self.happen(Event::Join { join, by }).expect("joined");

@@ -34,6 +34,7 @@ fn join(name: &str) -> Ask {
         pid: 1,
         backend: Backend::Flex,
         instruction_set: "avx2".into(),
+        code_versions: protocol::stage::StageSettings::code_versions(),
         peer_address: format!("{name}:1"),
         labels: Default::default(),
     };

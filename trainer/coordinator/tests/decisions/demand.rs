@@ -92,6 +92,7 @@ fn a_worker_with_malformed_labels_is_refused() {
         pid: 1,
         backend: Backend::Flex,
         instruction_set: "avx2".into(),
+        code_versions: protocol::stage::StageSettings::code_versions(),
         peer_address: "a:1".into(),
         labels,
     };

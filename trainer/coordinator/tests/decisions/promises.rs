@@ -402,6 +402,34 @@ fn p4_a_gang_waits_for_nobody_who_fetches_its_inputs() {
     assert_eq!(coordinator.asked("c")[0].resume, Some(Digest::of(b"state")));
 }
 
+/// Sampled: workers that joined a coordinator of another build, and new ones.
+#[test]
+fn p1_members_of_a_gang_share_their_code() {
+    let mut coordinator = PureCoordinator::new(Policy::default());
+    coordinator.submit("vae", WorkerRange { min: 1, max: 4 });
+    let older = |name: &str| {
+        let mut join = PureCoordinator::offer(name);
+        join.code_versions.insert("train.vae".into(), 1);
+        join
+    };
+    coordinator.join_as(older("a"));
+    let dataset = coordinator.assignment("a").expect("the only worker gets it");
+    coordinator.report(&dataset, TaskOutcome::Finished { output: Digest::of(b"clips"), metrics: Default::default() });
+    coordinator.join("b");
+    coordinator.join_as(older("c"));
+    assert_eq!(members(&coordinator), ["a", "c"], "it is not taken in");
+    for name in ["a", "c"] {
+        coordinator.happen(Event::WorkerGone { worker: name.into(), incarnation: None }).expect("gone");
+    }
+    for _ in 0..5 {
+        coordinator.now += 1_000;
+        coordinator.tick();
+    }
+    assert_eq!(members(&coordinator), ["b"]);
+    coordinator.join("d");
+    assert_eq!(members(&coordinator), ["b", "d"]);
+}
+
 /// Sampled: two workers of one instruction set and one of another, before and after a checkpoint.
 #[test]
 fn p1_all_that_work_on_a_stage_share_an_instruction_set() {

@@ -162,6 +162,7 @@ async fn join(client: &Client, name: &str) -> TestResult<Joined> {
         pid: 7,
         backend: Backend::Flex,
         instruction_set: "avx2".into(),
+        code_versions: protocol::stage::StageSettings::code_versions(),
         peer_address: "127.0.0.1:1".into(),
         labels: Default::default(),
     };
@@ -416,12 +417,19 @@ async fn p2_a_silent_worker_loses_its_task_and_its_writes_are_refused() -> TestR
         pid: 8,
         backend: Backend::Flex,
         instruction_set: "avx2".into(),
+        code_versions: protocol::stage::StageSettings::code_versions(),
         peer_address: "127.0.0.1:1".into(),
         labels: Default::default(),
     };
-    let (status, error) = client.refused("/v1/workers", other).await?;
+    let (status, error) = client.refused("/v1/workers", other.clone()).await?;
     assert_eq!((status, error.code.as_str()), (400, "invalid"));
     assert!(error.message.contains("use one build for both"), "{}", error.message);
+    // So is one whose numbers would differ.
+    let mut older = Join { protocol: PROTOCOL_VERSION, ..other };
+    older.code_versions.insert("train.vae".into(), 2);
+    let (status, error) = client.refused("/v1/workers", older).await?;
+    assert_eq!((status, error.code.as_str()), (400, "invalid"));
+    assert!(error.message.contains("`train.vae` 2 instead of 3"), "{}", error.message);
 
     // A process that joins with the same name replaces the old one, whose polls are refused.
     join(&client, "b").await?;

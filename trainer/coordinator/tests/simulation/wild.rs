@@ -38,6 +38,7 @@ pub(crate) fn events(state: &State, ended: &[Run]) -> Vec<Event> {
             pid: 1,
             backend: Backend::Flex,
             instruction_set: "avx2".into(),
+            code_versions: protocol::stage::StageSettings::code_versions(),
             peer_address,
             labels: Default::default(),
         };

@@ -255,6 +255,7 @@ impl FakeWorker {
                 pid: self.process,
                 backend: Backend::Flex,
                 instruction_set: self.instruction_set(),
+                code_versions: protocol::stage::StageSettings::code_versions(),
                 peer_address: format!("{}:{}", self.name, self.process),
                 labels: Default::default(),
             })];

@@ -9,7 +9,7 @@ use crate::stage::{Backend, CheckpointPolicy, StageSettings};
 use crate::{Attempt, Digest, Fence, Generation, Incarnation, Labels, RunId, Seed, StageName, TaskId, WorkerId};
 
 /// Version of these messages; a worker with another version is refused.
-pub const PROTOCOL_VERSION: u32 = 6;
+pub const PROTOCOL_VERSION: u32 = 7;
 
 /// `POST /v1/workers`: a process registers as a worker.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -26,6 +26,9 @@ pub struct Join {
     /// Instruction set of its processor's kernels, such as `avx512` or `neon`. Sums round differently under another
     /// one, so all workers of one stage must have the same.
     pub instruction_set: String,
+    /// Code versions of its stage kinds, those above 1. Another version computes other numbers, so a worker with other
+    /// versions than the coordinator is refused.
+    pub code_versions: BTreeMap<String, u32>,
     /// Address of its collective listener for peers, `host:port`.
     pub peer_address: String,
     /// Labels that stages may require.

@@ -130,9 +130,15 @@ impl TrainedTokenizer {
     /// Encodes one motion of at least 4 normalised rows `[frames, features]` as ids `[frames / 4, Q]`.
     pub fn encode(&self, rows: Vec<f32>) -> Vec<i64> {
         let frames = rows.len() / self.meta.features;
-        let rows = Tensor::<3>::from_data(TensorData::new(rows, [1, frames, self.meta.features]), &self.device);
-        let encoded = self.network.encode(rows, &mut Dropout::off());
-        let encoded = host(encoded);
+        self.encode_windows(rows, frames)
+    }
+
+    /// Encodes motions of `frames` normalised rows each as ids `[motions, frames / 4, Q]`.
+    pub(crate) fn encode_windows(&self, rows: Vec<f32>, frames: usize) -> Vec<i64> {
+        let features = self.meta.features;
+        let shape = [rows.len() / (frames * features), frames, features];
+        let rows = Tensor::<3>::from_data(TensorData::new(rows, shape), &self.device);
+        let encoded = host(self.network.encode(rows, &mut Dropout::off()));
         let book = |layer: usize, _: &[f32]| std::borrow::Cow::<[f32]>::Borrowed(self.books[layer].as_slice());
         let quantizers = self.meta.quantizers;
         Pass::through(encoded, self.meta.code_dim, quantizers, &self.device, book, None).ids(quantizers)

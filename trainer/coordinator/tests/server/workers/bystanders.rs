@@ -129,6 +129,7 @@ pub(crate) fn join_of(name: &str) -> Join {
         pid: 1,
         backend: Backend::Flex,
         instruction_set: "avx2".into(),
+        code_versions: protocol::stage::StageSettings::code_versions(),
         peer_address: "127.0.0.1:1".into(),
         labels: Default::default(),
     }

@@ -61,14 +61,17 @@ impl Encoder {
         }
     }
 
-    /// Encodes normalised rows `[frames, features]` as codes `[frames / 4, code]`.
-    fn codes(&self, window: &[f32], stream: &mut Stream) -> Vec<f32> {
+    /// Encodes normalised windows `[windows, frames, features]` as codes `[windows, frames / 4, code]`. `stream` returns the
+    /// generator of a window.
+    fn codes(&self, windows: &[f32], frames: usize, stream: impl Fn(usize) -> Stream) -> Vec<f32> {
         match self {
-            Self::Tokenizer(tokenizer) => tokenizer.codes(&tokenizer.encode(window.to_vec())),
+            Self::Tokenizer(tokenizer) => tokenizer.codes(&tokenizer.encode_windows(windows.to_vec(), frames)),
             Self::Vae(vae) => {
-                let frames = window.len() / vae.meta().features;
-                let z = vae.encode(window.to_vec(), frames).sample(stream);
-                vae.decode(z, frames)
+                let window = |(i, window): (usize, &[f32])| {
+                    let z = vae.encode(window.to_vec(), frames).sample(&mut stream(i));
+                    vae.decode(z, frames)
+                };
+                windows.chunks_exact(frames * vae.meta().features).enumerate().flat_map(window).collect()
             }
         }
     }
@@ -132,9 +135,7 @@ impl FlowData {
         self.encoder.normalise(&mut rows);
         let stream =
             |what: &str, place| Stream::new(self.windows.seed, &format!("{}/{what}", self.windows.purpose), place, 0);
-        let windows = rows.chunks_exact(frames * width).zip(&picks);
-        let codes: Vec<f32> =
-            windows.flat_map(|(window, pick)| self.encoder.codes(window, &mut stream("latent", pick.place))).collect();
+        let codes = self.encoder.codes(&rows, frames, |i| stream("latent", picks[i].place));
         let mut noise = vec![0.0; rows.len()];
         let mut uniforms = Vec::with_capacity(picks.len());
         for (pick, noise) in picks.iter().zip(noise.chunks_exact_mut(frames * width)) {
