@@ -862,7 +862,8 @@ def make_control(n, args, generator, base, vae, own, embedding, batch):
         adam.step()
         return loss.detach()
 
-    return step, {"control": net}, batch
+    # Upstream's copy has the projection of its denoiser, unused.
+    return step, {"control": net, "unused": torch.nn.Linear(width, 32)}, batch
 
 
 MAKERS = {

@@ -36,7 +36,7 @@ use crate::state::gang::{self, Change};
 use crate::state::queue::{Need, Rank, in_turn, open_member};
 use crate::state::shared::Map;
 use crate::state::task::{Lease, Task};
-use crate::state::worker::Worker;
+use crate::state::worker::{Arithmetic, Worker};
 use crate::state::{Idle, State};
 
 /// Maximum number of gangs that idle workers prepare for. More than that occur in sweeps, where the remaining gangs get
@@ -197,7 +197,7 @@ fn fit(state: &State, shares: &Shares, execution: &StageExecution, task: &Task) 
     let is_shunned = |member: &Member| state.workers[&member.worker].shunned.is_some();
     let arithmetic = |member: &Member| state.workers[&member.worker].arithmetic();
     let given = task.holders().first().map(arithmetic);
-    let mut alike: Vec<((&str, Option<Digest>), Vec<Member>)> = Vec::new();
+    let mut alike: Vec<(Arithmetic<'_>, Vec<Member>)> = Vec::new();
     for member in allowed(state, shares, execution).filter(fits).filter(|member| !task.is_held() || !is_shunned(member))
     {
         let own = arithmetic(&member);

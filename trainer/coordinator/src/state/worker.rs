@@ -133,6 +133,13 @@ pub struct Worker {
     pub holds: Option<(Digest, usize)>,
 }
 
+/// What decides the bits that a worker computes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Arithmetic<'a> {
+    instruction_set: &'a str,
+    code: Option<Digest>,
+}
+
 impl Worker {
     /// Creates the process that `join` announces.
     pub fn joined(join: &Join, by: Identity, incarnation: Incarnation) -> Self {
@@ -155,9 +162,9 @@ impl Worker {
         }
     }
 
-    /// What all members of a gang have in common, so that each would compute the same bits.
-    pub fn arithmetic(&self) -> (&str, Option<Digest>) {
-        (&self.instruction_set, self.code)
+    /// What all members of a gang have in common.
+    pub fn arithmetic(&self) -> Arithmetic<'_> {
+        Arithmetic { instruction_set: &self.instruction_set, code: self.code }
     }
 
     /// Returns true if the worker may be given work.
