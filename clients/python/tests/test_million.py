@@ -39,7 +39,18 @@ class Worker:
         # The refusal names the version that is expected.
         refused = self.http.post("/v1/workers", json=join, headers={"x-stride-secret": SECRET}).json()
         join["protocol"] = int(re.findall(r"\d+", refused["detail"] + (refused.get("hint") or ""))[-1])
+        join["code_versions"] = self.code_versions(join)
         self.incarnation = self.call("/v1/workers", join, SECRET)["incarnation"]
+
+    def code_versions(self, join: dict[str, Any]) -> dict[str, int]:
+        """The server's versions of stage kinds, which refusals name a few at a time."""
+        versions: dict[str, int] = {}
+        while True:
+            answer = self.http.post("/v1/workers", json={**join, "code_versions": versions}, headers={"x-stride-secret": SECRET})
+            expected = re.findall(r"`([\w.]+)` \d+ instead of (\d+)", "" if answer.is_success else answer.json()["detail"])
+            if not expected:
+                return versions
+            versions |= {kind: int(version) for kind, version in expected}
 
     def call(self, path: str, body: object, secret: str) -> Any:
         answer = self.http.post(path, json=body, headers={"x-stride-secret": secret})

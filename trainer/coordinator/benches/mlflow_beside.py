@@ -67,12 +67,19 @@ class Stride:
         self.add_versions()
         self.body = {"pipeline": self.start(), "source": PIPELINE, "until": None}
         self.run = self.submit("first")
-        join = {"protocol": 0, "worker": "bench", "pid": 1, "backend": "flex", "instruction_set": "any", "peer_address": "a:1"}
+        join: dict = {"protocol": 0, "worker": "bench", "pid": 1, "backend": "flex", "instruction_set": "any", "peer_address": "a:1"}
+        join["code_versions"] = {}
         answer = self.call("POST", "/v1/workers", join, SECRET, check=False)
-        # The refusal names the version that is expected.
-        if answer.is_error:
-            join["protocol"] = int(re.findall(r"\d+", answer.json()["detail"] + (answer.json().get("hint") or ""))[-1])
-            answer = self.call("POST", "/v1/workers", join, SECRET)
+        # Refusals name the versions that are expected, those of kinds a few at a time.
+        for _ in range(20):
+            if not answer.is_error:
+                break
+            said = answer.json()["detail"] + (answer.json().get("hint") or "")
+            if kinds := re.findall(r"`([\w.]+)` \d+ instead of (\d+)", said):
+                join["code_versions"] |= {kind: int(version) for kind, version in kinds}
+            else:
+                join["protocol"] = int(re.findall(r"\d+", said)[-1])
+            answer = self.call("POST", "/v1/workers", join, SECRET, check=False)
         self.incarnation = answer.json()["incarnation"]
         while not (found := self.poll()["assignments"]):
             time.sleep(0.1)

@@ -28,6 +28,7 @@ pub struct Join {
     pub instruction_set: String,
     /// Code versions of its stage kinds, those above 1. Another version computes other numbers, so a worker with other
     /// versions than the coordinator is refused.
+    #[serde(default)]
     pub code_versions: BTreeMap<String, u32>,
     /// Address of its collective listener for peers, `host:port`.
     pub peer_address: String,
