@@ -303,13 +303,13 @@ def small(asked: argparse.Namespace) -> str:
 
 def recipe(published: Published) -> list[str]:
     """Settings that train a recipe on procedural clips, one slice of eight clips an update."""
-    lines = (ROOT / published.config).read_text().splitlines()
+    lines = [line for line in (ROOT / published.config).read_text().splitlines() if not line.strip().startswith("#")]
     data = "dataset" if any(line.startswith("dataset:") for line in lines) else "stages.dataset"
     made = "format: synthetic" if data == "dataset" else "kind: data.synthetic"
     settings = ["text={encoder: hashed}", f"{data}={{{made}, clips: 40, val: 0.1, test: 0.2}}", *published.settings]
     name = ""
     for line in lines:
-        if line.startswith("  ") and not line.startswith(("   ", "  #")) and ":" in line:
+        if line.startswith("  ") and not line.startswith("   ") and ":" in line:
             name = line.strip().split(":")[0]
         if "kind: import.evaluator" in line:
             batch = f"batch: {{global: {PUBLISHED_BATCH}, slices: 1}}, movement: {{batch: {PUBLISHED_BATCH}}}"
