@@ -19,6 +19,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -323,8 +324,8 @@ def recipe(published: Published) -> list[str]:
     return settings
 
 
-def published(rounds: int) -> str:
-    """One worker at published widths: updates and memory."""
+def published(rounds: int) -> Iterator[str]:
+    """One worker at published widths: updates and memory. Each table has one more row."""
     few, many = 2, 6
     rows = []
     for case in PUBLISHED:
@@ -348,7 +349,7 @@ def published(rounds: int) -> str:
         mine, other = statistics.median(own), statistics.median(theirs)
         rows.append([case.name, f"{mine:.2f}", f"{other:.2f}", f"{other / mine:.2f}", f"{memory[0]:.1f}", f"{memory[1]:.1f}"])
         print(rows[-1], flush=True)
-    return table(["published widths, 8 examples", "Stride, s", "tuned, s", "times faster", "Stride, GB", "PyTorch, GB"], rows)
+        yield table(["published widths, 8 examples", "Stride, s", "tuned, s", "times faster", "Stride, GB", "PyTorch, GB"], rows)
 
 
 def main() -> None:
@@ -365,6 +366,22 @@ def main() -> None:
             size.samplings = [row for row in size.samplings if asked.only in row[0]]
         PUBLISHED[:] = [case for case in PUBLISHED if asked.only in case.name]
     before = os.getloadavg()[0]
+    version = run([str(TRAINER), "--version"]).splitlines()[0]
+    import torch as framework
+
+    head = (
+        f"# Performance\n\n`trainer/benches/compare.sh` made this page: {version}, PyTorch {framework.__version__}, {processor()}, {time.strftime('%Y-%m-%d')}. "
+        f"The load before was {before:.1f}.\n\n"
+    )
+
+    def show(*parts: str) -> None:
+        """Writes what is known so far, since all of it takes hours."""
+        text = head + "\n\n".join(parts) + "\n"
+        if asked.write:
+            asked.write.write_text(text)
+        else:
+            print(text)
+
     parts = []
     if asked.sizes != "published":
         parts.append(
@@ -373,21 +390,14 @@ def main() -> None:
             "With two workers PyTorch has the better of two threads and two processes (gloo). "
             '"Scaling" is the share of what two runs of one worker give together at the same time.\n\n' + small(asked)
         )
+        show(*parts)
     if asked.sizes != "quickstart":
-        parts.append(
+        what = (
             "## Published widths\n\nOne worker and one thread, an update of eight examples in one slice. "
-            "Memory is the largest resident set of a process.\n\n" + published(asked.rounds)
+            "Memory is the largest resident set of a process.\n\n"
         )
-    version = run([str(TRAINER), "--version"]).splitlines()[0]
-    import torch as framework
-
-    text = (
-        f"# Performance\n\n`trainer/benches/compare.sh` made this page: {version}, PyTorch {framework.__version__}, {processor()}, {time.strftime('%Y-%m-%d')}. "
-        f"The load before was {before:.1f}.\n\n" + "\n\n".join(parts) + "\n"
-    )
-    print(text)
-    if asked.write:
-        asked.write.write_text(text)
+        for rows in published(asked.rounds):
+            show(*parts, what + rows)
 
 
 if __name__ == "__main__":

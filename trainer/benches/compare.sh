@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Training and sampling beside PyTorch on this machine's CPU: `trainer/benches/compare.sh [--sizes quickstart|published|all] [--seconds N] [--only ROW] [--write FILE]`.
 # Needs STRIDE_SHARED (its `bench/pytorch` has some of the networks and steps in PyTorch, `torch_kinds.py` the others) and python3 with venv; installs PyTorch from PyPI.
-# Prints tables, and writes them to FILE. They name the processor and the load before. Takes about two hours.
+# Prints tables, and writes them to FILE. They name the processor and the load before. Takes some three hours.
 set -euo pipefail
 cd "$(dirname "$0")/../.."
 target=${CARGO_TARGET_DIR:-target}

@@ -1,5 +1,5 @@
 //! Times training steps of the VAE, the denoiser and PCM with Burn's operations and with the fused kernels. The two
-//! alternate in one run. The least processor time of each is printed, so that other work on the machine counts little.
+//! alternate in one run. The least time of each is printed, so that other work on the machine counts little.
 //!
 //! Run it with `RAYON_NUM_THREADS=1 cargo bench -p models` for one thread. A number after `--` sets the timed steps of
 //! each. Words after `--` choose the cases that contain one of them; `fused` runs no stock steps, for a profiler.
@@ -39,8 +39,7 @@ impl<M: Module> Trained<M> {
     /// Runs one update, as the training loop does.
     fn step(&mut self, loss: impl FnOnce(&M) -> Tensor<1>) {
         let mut gradients = loss(&self.network).backward();
-        let mut flat = vec![0.0; self.params.len()];
-        flat::add_gradients(&self.network, &mut gradients, &mut flat);
+        let flat = flat::take_gradients(&self.network, &mut gradients);
         let factor = clip_factor(global_norm(&flat), 1.0) as f32;
         self.done += 1;
         let adam = AdamW { beta1: 0.9, beta2: 0.999, eps: 1e-8, weight_decay: 0.0 };
@@ -152,16 +151,6 @@ fn pcm_step(state: &mut Distilled, batch: usize, device: &Device) {
     state.heads.step(|heads| losses::hinge_discriminator(heads.forward(real), heads.forward(seen)) / batch as f32);
 }
 
-/// Processor time of all threads of this process; the time since `begun` where Linux does not tell it.
-fn time(begun: Instant) -> Duration {
-    let Ok(threads) = std::fs::read_dir("/proc/self/task") else { return begun.elapsed() };
-    let spent = threads.flatten().filter_map(|thread| {
-        let text = std::fs::read_to_string(thread.path().join("schedstat")).ok()?;
-        text.split(' ').next()?.parse::<u64>().ok()
-    });
-    Duration::from_nanos(spent.sum())
-}
-
 fn least(times: Vec<Duration>) -> f64 {
     times.into_iter().min().unwrap_or_default().as_secs_f64()
 }
@@ -190,16 +179,16 @@ impl Plan {
         let (mut fast, mut slow) = (Vec::new(), Vec::new());
         let begun = Instant::now();
         for turn in 0..self.count + 2 {
-            let start = time(begun);
+            let start = begun.elapsed();
             step(&mut fused);
-            let middle = time(begun);
+            let middle = begun.elapsed();
             if !self.alone {
                 kernels::stock(|| step(&mut stock));
             }
             // The first two turns warm up caches and the allocator.
             if turn >= 2 {
                 fast.push(middle - start);
-                slow.push(time(begun) - middle);
+                slow.push(begun.elapsed() - middle);
             }
         }
         let (fast, slow) = (least(fast), least(slow));

@@ -7,6 +7,7 @@ use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
 use burn::tensor::{Gradients, Tensor, TensorData};
 
 use crate::device::is_accelerator;
+use crate::kernels::with_values;
 
 /// One parameter tensor inside a flat buffer.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -74,8 +75,7 @@ pub fn read<M: Module>(module: &M) -> Vec<f32> {
     struct Read(Vec<f32>);
     impl ModuleVisitor for Read {
         fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
-            let data = param.val().into_data();
-            self.0.extend_from_slice(data.as_slice::<f32>().expect("parameters are f32"));
+            with_values(param.val(), |values| self.0.extend_from_slice(values));
         }
     }
     let mut visitor = Read(Vec::with_capacity(module.num_params()));
@@ -221,52 +221,38 @@ impl ModuleMapper for Cut<'_> {
     }
 }
 
-/// Adds the gradients of all parameters to `out`, in the order of [`read`]. A parameter without a gradient adds
-/// nothing.
-///
-/// # Panics
-/// If `out` has another length than the module has parameters.
-pub fn add_gradients<M: Module>(module: &M, gradients: &mut Gradients, out: &mut [f32]) {
-    struct Add<'a> {
+/// Takes the gradients of all parameters, in the order of [`read`]; zeros for a parameter without one.
+pub fn take_gradients<M: Module>(module: &M, gradients: &mut Gradients) -> Vec<f32> {
+    struct Take<'a> {
         gradients: &'a mut Gradients,
-        out: &'a mut [f32],
-        at: usize,
+        out: Vec<f32>,
         /// Gradients on an accelerator with their offsets in `out`; one transfer copies them all.
         there: Vec<(usize, Tensor<1>)>,
     }
-    fn add(gradient: Tensor<1>, mut to: impl FnMut(&[f32])) {
-        to(gradient.into_data().as_slice::<f32>().expect("gradients are f32"));
-    }
-    fn sum(to: &mut [f32], from: &[f32]) {
-        to.iter_mut().zip(from).for_each(|(o, g)| *o += g);
-    }
-    impl ModuleVisitor for Add<'_> {
+    impl ModuleVisitor for Take<'_> {
         fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
             let len = param.dims().iter().product::<usize>();
-            if let Some(gradient) = param.val().grad_remove(self.gradients) {
-                let gradient = gradient.reshape([len]);
-                if is_accelerator(&gradient.device()) {
-                    self.there.push((self.at, gradient));
-                } else {
-                    add(gradient, |from| sum(&mut self.out[self.at..self.at + len], from));
-                }
+            let end = self.out.len() + len;
+            match param.val().grad_remove(self.gradients).map(|gradient| gradient.reshape([len])) {
+                Some(gradient) if is_accelerator(&gradient.device()) => self.there.push((self.out.len(), gradient)),
+                Some(gradient) => with_values(gradient, |from| self.out.extend_from_slice(from)),
+                None => {}
             }
-            self.at += len;
+            self.out.resize(end, 0.0);
         }
     }
-    let mut visitor = Add { gradients, out, at: 0, there: Vec::new() };
+    let mut visitor = Take { gradients, out: Vec::with_capacity(module.num_params()), there: Vec::new() };
     module.visit(&mut visitor);
-    let Add { out, at: seen, there, .. } = visitor;
-    assert_eq!(seen, out.len(), "the buffer and the module have different lengths");
-    if there.is_empty() {
-        return;
+    let Take { mut out, there, .. } = visitor;
+    if !there.is_empty() {
+        let (places, tensors): (Vec<_>, Vec<_>) = there.into_iter().map(|(at, t)| ((at, t.dims()[0]), t)).unzip();
+        with_values(Tensor::cat(tensors, 0), |mut from| {
+            for (at, len) in places {
+                let (head, tail) = from.split_at(len);
+                out[at..at + len].copy_from_slice(head);
+                from = tail;
+            }
+        });
     }
-    let (places, tensors): (Vec<_>, Vec<_>) = there.into_iter().map(|(at, t)| ((at, t.dims()[0]), t)).unzip();
-    add(Tensor::cat(tensors, 0), |mut from| {
-        for (at, len) in &places {
-            let (head, tail) = from.split_at(*len);
-            sum(&mut out[*at..at + len], head);
-            from = tail;
-        }
-    });
+    out
 }

@@ -93,7 +93,7 @@ struct Sizes {
 }
 
 /// Score of a hidden key: far below any other, but finite, so that a gradient through it is 0 and not undefined.
-const HIDDEN: f32 = -1e9;
+pub(crate) const HIDDEN: f32 = -1e9;
 
 impl Sizes {
     fn head(self) -> usize {

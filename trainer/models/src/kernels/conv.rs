@@ -82,7 +82,7 @@ mod kernel {
 
     use super::Sweep;
     use crate::kernels::fused::{Fused, make, shape, slice};
-    use crate::kernels::raw::{View, matmul, product};
+    use crate::kernels::raw::{View, affine, product};
     use crate::kernels::simd::{add_rows, multiversion, repeat_row};
 
     /// A convolution, with a bias if there are three inputs.
@@ -251,11 +251,7 @@ mod kernel {
             let sizes = (windows.rows(), out, width);
             let (a, b) = (View::rows(width), View::rows(width).t());
             let y = match bias {
-                Some(bias) => {
-                    let mut y = repeat_row(slice(bias), windows.rows());
-                    matmul(sizes, &rows, a, &weight, b, &mut y, View::rows(out), 1.0, 1.0);
-                    y
-                }
+                Some(bias) => affine(sizes, &rows, a, &weight, b, slice(bias)),
                 None => product(sizes, &rows, a, &weight, b),
             };
             make(y, &[windows.batch, windows.count, out])

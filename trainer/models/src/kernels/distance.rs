@@ -45,32 +45,29 @@ mod kernel {
 
     use super::Pointwise;
     use crate::kernels::fused::{Fused, make, shape, slice};
-    use crate::kernels::simd::{lanes, multiversion};
+    use crate::kernels::simd::{Lanes, multiversion, sum};
 
     #[derive(Debug, Clone)]
     pub(super) struct Distance(pub(super) Pointwise);
 
     multiversion! {
         /// Rows are summed in f32 lanes, and their weighted sums in f64.
-        fn total(distance: Pointwise, found: &[f32], expected: &[f32], weights: &[f32]) -> f64 {
+        fn total<const SET>(distance: Pointwise, found: &[f32], expected: &[f32], weights: &[f32]) -> f64 {
             let width = found.len() / weights.len().max(1);
             let mut total = 0.0;
-            for (row, weight) in weights.iter().enumerate() {
-                let a = &found[row * width..][..width];
-                let b = &expected[row * width..][..width];
-                let sum = match distance {
-                    Pointwise::SmoothL1 => lanes(
-                        |i| {
-                            let d = (a[i] - b[i]).abs();
-                            let m = if d < 1.0 { d } else { 1.0 };
-                            m * (d - m * 0.5)
-                        },
-                        width,
-                    ),
-                    Pointwise::L1 => lanes(|i| (a[i] - b[i]).abs(), width),
-                    Pointwise::L2 => lanes(|i| (a[i] - b[i]) * (a[i] - b[i]), width),
+            for (i, weight) in weights.iter().enumerate() {
+                let a = &found[i * width..][..width];
+                let b = &expected[i * width..][..width];
+                let row = match distance {
+                    Pointwise::SmoothL1 => sum::<SET, 2>([a, b], |[a, b]| {
+                        let d = (a - b).abs();
+                        let m = d.min(Lanes::splat(1.0));
+                        m * (d - m * Lanes::splat(0.5))
+                    }),
+                    Pointwise::L1 => sum::<SET, 2>([a, b], |[a, b]| (a - b).abs()),
+                    Pointwise::L2 => sum::<SET, 2>([a, b], |[a, b]| (a - b) * (a - b)),
                 };
-                total += f64::from(*weight) * f64::from(sum);
+                total += f64::from(*weight) * f64::from(row);
             }
             total
         }

@@ -113,6 +113,12 @@ pub(super) fn takes<const D: usize>(x: &Tensor<D>) -> bool {
         && (x.clone().try_into_primitive::<Tracked>().is_ok() || x.clone().try_into_primitive::<Flex>().is_ok())
 }
 
+/// A tensor on flex without its tape, in row-major order.
+pub(super) fn plain<const D: usize>(x: &Tensor<D>) -> Option<FlexTensor> {
+    let tracked = x.clone().try_into_primitive::<Tracked>().map(|x| x.into_primitive());
+    tracked.or_else(|_| x.clone().try_into_primitive::<Flex>()).ok().map(contiguous)
+}
+
 /// The elements of `x` in row-major order; copies only if `x` is a view.
 fn contiguous(x: FlexTensor) -> FlexTensor {
     if x.as_slice::<f32>().is_some() { x } else { x.to_contiguous() }

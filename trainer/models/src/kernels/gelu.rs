@@ -6,7 +6,7 @@ use burn::tensor::Tensor;
 #[cfg(feature = "flex")]
 use super::fused::{self, Elementwise};
 #[cfg(feature = "flex")]
-use super::simd::{erf_by, exp_by, mul_add, multiversion};
+use super::simd::{Lanes, append, multiversion, update};
 
 /// GELU of every element.
 pub fn gelu<const D: usize>(x: Tensor<D>) -> Tensor<D> {
@@ -20,21 +20,12 @@ pub fn gelu<const D: usize>(x: Tensor<D>) -> Tensor<D> {
     x * cdf * 0.5
 }
 
-/// Elements that are computed before they are appended. A closure for `collect` may be compiled for the baseline.
-#[cfg(feature = "flex")]
-const BLOCK: usize = 256;
-
 #[cfg(feature = "flex")]
 multiversion! {
     fn forward<const SET>(x: &[f32]) -> Vec<f32> {
-        let mut y = Vec::with_capacity(x.len());
-        for x in x.chunks(BLOCK) {
-            let mut block = [0.0; BLOCK];
-            for (y, x) in block.iter_mut().zip(x) {
-                *y = 0.5 * x * (1.0 + erf_by::<SET>(x * std::f32::consts::FRAC_1_SQRT_2));
-            }
-            y.extend_from_slice(&block[..x.len()]);
-        }
+        let mut y = Vec::new();
+        let half = Lanes::splat(0.5);
+        append::<SET, 1>(&mut y, [x], |[x]| half * x * twice_cdf(x));
         y
     }
 }
@@ -42,10 +33,18 @@ multiversion! {
 #[cfg(feature = "flex")]
 multiversion! {
     fn backward<const SET>(x: &[f32], dy: &mut [f32]) {
-        const DENSITY: f32 = 0.398_942_3;
-        for (dy, x) in dy.iter_mut().zip(x) {
-            let cdf = 0.5 * (1.0 + erf_by::<SET>(x * std::f32::consts::FRAC_1_SQRT_2));
-            *dy *= mul_add::<SET>(x * DENSITY, exp_by::<SET>(-0.5 * x * x), cdf);
-        }
+        let density = Lanes::splat(0.398_942_3);
+        let half = Lanes::splat(0.5);
+        update::<SET, 1>(dy, [x], |dy, [x]| {
+            let bell = (Lanes::splat(-0.5) * x * x).exp();
+            dy * (x * density).mul_add(bell, half * twice_cdf(x))
+        });
     }
+}
+
+/// Twice the normal distribution function.
+#[cfg(feature = "flex")]
+#[inline(always)]
+fn twice_cdf<const SET: u8>(x: Lanes<SET>) -> Lanes<SET> {
+    Lanes::splat(1.0) + (x * Lanes::splat(std::f32::consts::FRAC_1_SQRT_2)).erf()
 }

@@ -1,7 +1,7 @@
 //! One direction of a layer of gated recurrent units over ragged sequences (Cho et al., arXiv:1406.1078, in PyTorch's
 //! form).
 //!
-//! `r = s(a_r + u_r)`, `z = s(a_z + u_z)`, `n = tanh(a_n + r u_n)`, `h' = (1 - z) n + z h`. `a` is the input's part of
+//! `r = s(a_r + u_r)`, `z = s(a_z + u_z)`, `n = tanh::<SET>(a_n + r u_n)`, `h' = (1 - z) n + z h`. `a` is the input's part of
 //! the gates and `u = h U^T + c` the state's part. A token past a sequence's end leaves the state unchanged. So the
 //! forward direction stops at a sequence's own last token and the backward direction starts there.
 //!
@@ -73,8 +73,8 @@ mod kernel {
     use burn::backend::flex::FlexTensor;
 
     use crate::kernels::fused::{Fused, make, slice};
-    use crate::kernels::raw::{View, matmul, product};
-    use crate::kernels::simd::{add_rows, exp, logistic, multiversion, repeat_row};
+    use crate::kernels::raw::{Start, View, affine, matmul, product};
+    use crate::kernels::simd::{Lanes, add_rows, multiversion, update};
 
     /// One direction over a batch.
     #[derive(Debug, Clone)]
@@ -140,8 +140,7 @@ mod kernel {
             let first = run.olds.len() / width;
             run.olds.extend_from_slice(&now[..live * width]);
             let olds = &run.olds[first * width..];
-            let mut u = repeat_row(bias, live);
-            matmul((live, 3 * width, width), olds, by_row, &by_input, by_gate, &mut u, by_gate, 1.0, 1.0);
+            let u = affine((live, 3 * width, width), olds, by_row, &by_input, by_gate, bias);
             for (j, (b, new)) in order.iter().zip(now.chunks_exact_mut(width)).enumerate() {
                 if j < live {
                     let a = &input[(b * tokens + t) * 3 * width..][..3 * width];
@@ -155,14 +154,16 @@ mod kernel {
     }
 
     #[inline(always)]
-    fn tanh(x: f32) -> f32 {
-        let e = exp(-2.0 * x.abs());
-        ((1.0 - e) / (1.0 + e)).copysign(x)
+    fn tanh<const SET: u8>(x: Lanes<SET>) -> Lanes<SET> {
+        let one = Lanes::splat(1.0);
+        let e = (Lanes::splat(-2.0) * x.abs()).exp();
+        let size = (one - e) / (one + e);
+        x.by_sign(Lanes::splat(0.0) - size, size)
     }
 
     multiversion! {
         /// Computes one token of one sequence.
-        fn unit(a: &[f32], u: &[f32], old: &[f32], gates: &mut [f32], new: &mut [f32]) {
+        fn unit<const SET>(a: &[f32], u: &[f32], old: &[f32], gates: &mut [f32], new: &mut [f32]) {
             let g = old.len();
             let a_r = &a[..g];
             let a_z = &a[g..2 * g];
@@ -175,16 +176,11 @@ mod kernel {
             let (gate_n, kept) = rest.split_at_mut(g);
             let new = &mut new[..g];
             let kept = &mut kept[..g];
-            for k in 0..g {
-                let r = logistic(a_r[k] + u_r[k]);
-                let z = logistic(a_z[k] + u_z[k]);
-                let n = tanh(a_n[k] + r * u_n[k]);
-                new[k] = (1.0 - z) * n + z * old[k];
-                gate_r[k] = r;
-                gate_z[k] = z;
-                gate_n[k] = n;
-                kept[k] = u_n[k];
-            }
+            update::<SET, 2>(gate_r, [a_r, u_r], |_, [a, u]| (a + u).logistic());
+            update::<SET, 2>(gate_z, [a_z, u_z], |_, [a, u]| (a + u).logistic());
+            update::<SET, 3>(gate_n, [a_n, gate_r, u_n], |_, [a, r, u]| tanh(a + r * u));
+            update::<SET, 3>(new, [gate_z, gate_n, old], |_, [z, n, old]| (Lanes::splat(1.0) - z) * n + z * old);
+            kept.copy_from_slice(u_n);
         }
     }
 
@@ -261,7 +257,17 @@ mod kernel {
                     }
                 }
                 let du = &du[first * 3 * width..end * 3 * width];
-                matmul((live, width, 3 * width), du, by_gate, slice(&weight), by_row, &mut dh, by_row, 1.0, 1.0);
+                matmul(
+                    (live, width, 3 * width),
+                    du,
+                    by_gate,
+                    slice(&weight),
+                    by_row,
+                    &mut dh,
+                    by_row,
+                    Start::Kept,
+                    1.0,
+                );
                 end = first;
             }
             let by_weight = || {

@@ -33,8 +33,8 @@ mod kernel {
     use burn::backend::flex::FlexTensor;
 
     use crate::kernels::fused::{Fused, make, shape, slice};
-    use crate::kernels::raw::{View, matmul, product};
-    use crate::kernels::simd::{add_rows, repeat_row};
+    use crate::kernels::raw::{View, affine, product};
+    use crate::kernels::simd::add_rows;
 
     /// The product with a weight, and a bias if there are three inputs.
     #[derive(Debug, Clone)]
@@ -49,11 +49,7 @@ mod kernel {
         let out = w.len() / inner;
         let sizes = (rows, out, inner);
         let y = match bias {
-            Some(bias) => {
-                let mut y = repeat_row(slice(bias), rows);
-                matmul(sizes, x, View::rows(inner), w, View::rows(inner).t(), &mut y, View::rows(out), 1.0, 1.0);
-                y
-            }
+            Some(bias) => affine(sizes, x, View::rows(inner), w, View::rows(inner).t(), slice(bias)),
             None => product(sizes, x, View::rows(inner), w, View::rows(inner).t()),
         };
         *to.last_mut().expect("an axis of inputs") = out;

@@ -9,7 +9,7 @@ use burn::tensor::Tensor;
 #[cfg(feature = "flex")]
 use super::fused::{self, Elementwise};
 #[cfg(feature = "flex")]
-use super::simd::{exp, multiversion};
+use super::simd::{Lanes, append, multiversion, update};
 
 /// Upper limit of the exponent in the composed path.
 const CAP: f32 = 20.0;
@@ -27,25 +27,44 @@ pub fn mish<const D: usize>(x: Tensor<D>) -> Tensor<D> {
 
 #[cfg(feature = "flex")]
 multiversion! {
-    fn forward(x: &[f32]) -> Vec<f32> {
-        let one = |x: &f32| {
-            let e = exp(-x.abs());
-            let (top, rest) = if *x < 0.0 { (e * (e + 2.0), 2.0) } else { (1.0 + 2.0 * e, 2.0 * e * e) };
-            x * (top / (top + rest))
-        };
-        x.iter().map(one).collect()
+    fn forward<const SET>(x: &[f32]) -> Vec<f32> {
+        let mut y = Vec::new();
+        append::<SET, 1>(&mut y, [x], |[x]| {
+            let parts = Parts::of(x);
+            x * (parts.top / (parts.top + parts.rest))
+        });
+        y
     }
 }
 
 #[cfg(feature = "flex")]
 multiversion! {
-    fn backward(x: &[f32], dy: &mut [f32]) {
-        for (dy, x) in dy.iter_mut().zip(x) {
-            let e = exp(-x.abs());
-            let (top, rest, slope) =
-                if *x < 0.0 { (e * (e + 2.0), 2.0, e) } else { (1.0 + 2.0 * e, 2.0 * e * e, e * e) };
-            let q = 1.0 / (top + rest);
-            *dy *= top * q + x * 4.0 * (1.0 + e) * slope * q * q;
-        }
+    fn backward<const SET>(x: &[f32], dy: &mut [f32]) {
+        let one = Lanes::splat(1.0);
+        update::<SET, 1>(dy, [x], |dy, [x]| {
+            let Parts { e, top, rest } = Parts::of(x);
+            let slope = x.by_sign(e, e * e);
+            let q = one / (top + rest);
+            dy * (top * q + x * Lanes::splat(4.0) * (one + e) * slope * q * q)
+        });
+    }
+}
+
+/// tanh(softplus(x)) is `top / (top + rest)`, without overflow.
+#[cfg(feature = "flex")]
+struct Parts<const SET: u8> {
+    /// e^-|x|.
+    e: Lanes<SET>,
+    top: Lanes<SET>,
+    rest: Lanes<SET>,
+}
+
+#[cfg(feature = "flex")]
+impl<const SET: u8> Parts<SET> {
+    #[inline(always)]
+    fn of(x: Lanes<SET>) -> Self {
+        let (one, two) = (Lanes::splat(1.0), Lanes::splat(2.0));
+        let e = (Lanes::splat(0.0) - x.abs()).exp();
+        Self { e, top: x.by_sign(e * (e + two), one + two * e), rest: x.by_sign(two, two * e * e) }
     }
 }

@@ -9,6 +9,8 @@
 //!
 //! Not its job: parameters, and the shapes of networks.
 
+use burn::tensor::Tensor;
+
 mod attention;
 mod conv;
 mod distance;
@@ -29,6 +31,7 @@ pub(crate) mod simd;
 #[cfg(feature = "flex")]
 mod tile;
 
+pub(crate) use attention::HIDDEN;
 pub use attention::{KeyMask, causal_attention, cross_attention, self_attention};
 pub use conv::{Sweep, conv, transposed_conv};
 pub use distance::{Pointwise, weighted_distance};
@@ -41,6 +44,16 @@ pub use mish::mish;
 pub use norm::{add_layer_norm, layer_norm, leaky_layer_norm};
 pub use relu::leaky_relu;
 pub use rms::{rms_norm, rms_norm_silu};
+
+/// Gives `to` the values of `x` in row-major order. On flex no value is copied, unless `x` is a view; `into_data` copies
+/// twice.
+pub(crate) fn with_values<const D: usize>(x: Tensor<D>, to: impl FnOnce(&[f32])) {
+    #[cfg(feature = "flex")]
+    if let Some(values) = fused::plain(&x) {
+        return to(fused::slice(&values));
+    }
+    to(x.into_data().as_slice::<f32>().expect("values are f32"));
+}
 
 /// Runs `body` with Burn's operations instead of the fused kernels on this thread, as the reference for comparisons.
 pub fn stock<T>(body: impl FnOnce() -> T) -> T {

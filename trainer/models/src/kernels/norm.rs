@@ -68,7 +68,7 @@ mod kernel {
     use burn::backend::flex::FlexTensor;
 
     use crate::kernels::fused::{Fused, make, overwrite, shape, slice};
-    use crate::kernels::simd::{lanes, multiversion};
+    use crate::kernels::simd::{Lanes, append, multiversion, sum, update};
 
     /// The norm of a tensor, and the slope of what follows below 0; 1 is no ReLU.
     #[derive(Debug, Clone)]
@@ -110,38 +110,37 @@ mod kernel {
     multiversion! {
         /// Appends to `hat` the normed rows, to `scales` what they were multiplied by, and to `out` the results. Without
         /// `keep` the first two hold only the last row.
-        fn forward(rows: &Rows<'_>, eps: f32, slope: f32, keep: bool, hat: &mut Vec<f32>, scales: &mut Vec<f32>, out: &mut Vec<f32>) {
+        fn forward<const SET>(rows: &Rows<'_>, eps: f32, slope: f32, keep: bool, hat: &mut Vec<f32>, scales: &mut Vec<f32>, out: &mut Vec<f32>) {
             let width = rows.gamma.len();
             #[expect(clippy::cast_precision_loss, reason = "a width is small")]
-            let count = width as f32;
+            let share = 1.0 / width as f32;
             for start in (0..rows.x.len()).step_by(width) {
                 if !keep {
                     hat.clear();
                     scales.clear();
                 }
-                let x = &rows.x[start..start + width];
                 let from = hat.len();
+                let x = &rows.x[start..start + width];
                 if rows.before.is_empty() {
                     hat.extend_from_slice(x);
                 } else {
-                    hat.extend(x.iter().zip(&rows.before[start..start + width]).map(|(x, y)| x + y));
+                    append::<SET, 2>(hat, [x, &rows.before[start..start + width]], |[x, y]| x + y);
                 }
                 let row = &mut hat[from..];
-                let mean = lanes(|i| row[i], width) / count;
-                let variance = lanes(|i| (row[i] - mean) * (row[i] - mean), width) / count;
+                let mean = Lanes::splat(sum::<SET, 1>([row], |[x]| x) * share);
+                let variance = sum::<SET, 1>([row], |[x]| (x - mean) * (x - mean)) * share;
                 let scale = 1.0 / (variance + eps).sqrt();
-                for v in row.iter_mut() {
-                    *v = (*v - mean) * scale;
-                }
                 scales.push(scale);
-                let scaled = row.iter().zip(rows.gamma).zip(rows.beta).map(|((v, g), b)| {
-                    let z = v * g + b;
-                    if z < 0.0 { z * slope } else { z }
-                });
-                if rows.after.is_empty() {
-                    out.extend(scaled);
-                } else {
-                    out.extend(scaled.zip(&rows.after[start..start + width]).map(|(z, y)| y + z));
+                let scale = Lanes::splat(scale);
+                update::<SET, 0>(row, [], |x, []| (x - mean) * scale);
+                append::<SET, 3>(out, [row, rows.gamma, rows.beta], |[z, g, b]| z.mul_add(g, b));
+                let to = &mut out[start..];
+                if slope != 1.0 {
+                    let slope = Lanes::splat(slope);
+                    update::<SET, 0>(to, [], |z, []| z.by_sign(z * slope, z));
+                }
+                if !rows.after.is_empty() {
+                    update::<SET, 1>(to, [&rows.after[start..start + width]], |z, [y]| z + y);
                 }
             }
         }
@@ -150,29 +149,23 @@ mod kernel {
     multiversion! {
         /// `dx = scale (g - mean(g) - hat mean(g hat))` in place of `dy`, with `g = dy gamma` and `dy` behind the ReLU;
         /// adds to `dgamma` and `dbeta`.
-        fn backward(hat: &[f32], scales: &[f32], gamma: &[f32], beta: &[f32], slope: f32, dy: &mut [f32], dgamma: &mut [f32], dbeta: &mut [f32]) {
+        fn backward<const SET>(hat: &[f32], scales: &[f32], gamma: &[f32], beta: &[f32], slope: f32, dy: &mut [f32], dgamma: &mut [f32], dbeta: &mut [f32]) {
             let width = gamma.len();
             #[expect(clippy::cast_precision_loss, reason = "a width is small")]
-            let count = width as f32;
-            let beta = &beta[..width];
-            let dgamma = &mut dgamma[..width];
-            let dbeta = &mut dbeta[..width];
+            let share = 1.0 / width as f32;
             for ((hat, dy), scale) in hat.chunks_exact(width).zip(dy.chunks_exact_mut(width)).zip(scales) {
                 if slope != 1.0 {
-                    for i in 0..width {
-                        let z = hat[i] * gamma[i] + beta[i];
-                        dy[i] = if z < 0.0 { dy[i] * slope } else { dy[i] };
-                    }
+                    let slope = Lanes::splat(slope);
+                    update::<SET, 3>(dy, [hat, gamma, beta], |dy, [hat, g, b]| {
+                        hat.mul_add(g, b).by_sign(dy * slope, dy)
+                    });
                 }
-                for i in 0..width {
-                    dgamma[i] += dy[i] * hat[i];
-                    dbeta[i] += dy[i];
-                }
-                let first = lanes(|i| dy[i] * gamma[i], width) / count;
-                let second = lanes(|i| dy[i] * gamma[i] * hat[i], width) / count;
-                for i in 0..width {
-                    dy[i] = scale * (dy[i] * gamma[i] - first - hat[i] * second);
-                }
+                update::<SET, 2>(dgamma, [dy, hat], |sum, [dy, hat]| dy.mul_add(hat, sum));
+                update::<SET, 1>(dbeta, [dy], |sum, [dy]| sum + dy);
+                let first = Lanes::splat(sum::<SET, 2>([dy, gamma], |[dy, g]| dy * g) * share);
+                let second = Lanes::splat(sum::<SET, 3>([dy, gamma, hat], |[dy, g, hat]| dy * g * hat) * share);
+                let scale = Lanes::splat(*scale);
+                update::<SET, 2>(dy, [gamma, hat], |dy, [g, hat]| scale * (dy * g - first - hat * second));
             }
         }
     }

@@ -1,5 +1,8 @@
 //! Matrix products on slices.
 
+#[cfg(target_arch = "x86_64")]
+mod wide;
+
 /// A matrix inside a slice: element (i, j) is at `offset + i * row + j * col`.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct View {
@@ -24,89 +27,224 @@ impl View {
     }
 }
 
-/// `a b` as rows of n elements, with `a` m x k and `b` k x n.
-pub(super) fn product((m, n, k): (usize, usize, usize), a: &[f32], av: View, b: &[f32], bv: View) -> Vec<f32> {
-    let mut c = Vec::with_capacity(m * n);
-    if m == 0 || n == 0 {
-        return c;
-    }
-    assert!(k > 0 && av.last(m, k) < a.len() && bv.last(k, n) < b.len(), "matrix out of bounds");
-    #[expect(unsafe_code, reason = "the product is written into memory that is not zeroed first")]
-    // SAFETY: the extents of `a` and `b` were checked, `c` has room for m n elements, and a product with k > 0 that does
-    // not read `c` writes all of them.
-    unsafe {
-        multiply((m, n, k), a, av, b, bv, c.as_mut_ptr(), View::rows(n), 0.0, 1.0);
-        c.set_len(m * n);
-    }
-    c
+/// A product to which something may be added: `scale a b`, with `a` m x k and `b` k x n.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Product<'a> {
+    /// m, n and k.
+    pub(super) sizes: (usize, usize, usize),
+    pub(super) a: (&'a [f32], View),
+    pub(super) b: (&'a [f32], View),
+    pub(super) scale: f32,
+    pub(super) start: Start<'a>,
 }
 
-/// `c = keep * c + scale * a b`, with `a` m x k, `b` k x n, `c` m x n. `keep` of 0 does not read `c`.
+/// What a product is added to.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum Start<'a> {
+    /// Nothing; the result's old values are not read.
+    Zero,
+    /// The result's old values.
+    Kept,
+    /// The same row for each row of the result. The product is not scaled.
+    Row(&'a [f32]),
+}
+
+impl Product<'_> {
+    /// # Panics
+    /// If an operand is shorter than its view.
+    fn check(&self) {
+        let (m, n, k) = self.sizes;
+        let [(a, av), (b, bv)] = [self.a, self.b];
+        assert!(k > 0 && av.last(m, k) < a.len() && bv.last(k, n) < b.len(), "matrix out of bounds");
+        if let Start::Row(row) = self.start {
+            assert!(row.len() == n && self.scale == 1.0, "a row for each column");
+        }
+    }
+
+    /// The result as rows of n elements.
+    ///
+    /// # Panics
+    /// If an operand is shorter than its view.
+    pub(super) fn made(self) -> Vec<f32> {
+        let (m, n, _) = self.sizes;
+        let mut c = Vec::with_capacity(m * n);
+        if m == 0 || n == 0 {
+            return c;
+        }
+        self.check();
+        #[expect(unsafe_code, reason = "the product is written into memory that is not zeroed first")]
+        // SAFETY: the extents of the operands were checked, `c` has room for m n elements, and all of them are written.
+        unsafe {
+            self.multiply(c.as_mut_ptr(), View::rows(n));
+            c.set_len(m * n);
+        }
+        c
+    }
+
+    /// Writes the result into `c`.
+    ///
+    /// # Panics
+    /// If an operand or `c` is shorter than its view.
+    pub(super) fn into(self, c: &mut [f32], cv: View) {
+        let (m, n, _) = self.sizes;
+        if m == 0 || n == 0 {
+            return;
+        }
+        self.check();
+        assert!(cv.last(m, n) < c.len(), "matrix out of bounds");
+        #[expect(unsafe_code, reason = "every extent was checked above")]
+        // SAFETY: all elements that the strides reach lie inside the slices, and `c` overlaps no operand because it is
+        // borrowed exclusively.
+        unsafe {
+            self.multiply(c.as_mut_ptr(), cv);
+        }
+    }
+
+    /// # Safety
+    /// The views lie inside the operands and the memory of `c`, which overlaps neither. `c` is initialised if it is kept.
+    #[expect(unsafe_code, reason = "the product works on strided pointers")]
+    unsafe fn multiply(self, c: *mut f32, cv: View) {
+        #[cfg(target_arch = "x86_64")]
+        if cv.col == 1 && wide::fits(&self) {
+            // SAFETY: as promised by the caller.
+            return unsafe { wide::multiply(&self, c, cv) };
+        }
+        // SAFETY: as promised by the caller.
+        unsafe { self.general(c, cv) }
+    }
+
+    /// [`multiply`](Self::multiply) for all instruction sets and layouts.
+    ///
+    /// # Safety
+    /// As for [`multiply`](Self::multiply).
+    #[expect(unsafe_code, reason = "the product works on strided pointers")]
+    unsafe fn general(mut self, c: *mut f32, cv: View) {
+        let (m, n, k) = self.sizes;
+        if let Start::Row(row) = self.start {
+            for i in 0..m {
+                for (j, value) in row.iter().enumerate() {
+                    // SAFETY: the view lies inside the memory of `c`.
+                    unsafe { c.add(cv.offset + i * cv.row + j * cv.col).write(*value) };
+                }
+            }
+            self.start = Start::Kept;
+        }
+        let stride = |s: usize| isize::try_from(s).expect("a stride fits");
+        let [(a, av), (b, bv)] = [self.a, self.b];
+        let kept = matches!(self.start, Start::Kept);
+        // SAFETY: as promised by the caller.
+        unsafe {
+            gemm::gemm(
+                m,
+                n,
+                k,
+                c.add(cv.offset),
+                stride(cv.col),
+                stride(cv.row),
+                kept,
+                a.as_ptr().add(av.offset),
+                stride(av.col),
+                stride(av.row),
+                b.as_ptr().add(bv.offset),
+                stride(bv.col),
+                stride(bv.row),
+                1.0,
+                self.scale,
+                false,
+                false,
+                false,
+                gemm::Parallelism::None,
+            );
+        }
+    }
+}
+
+/// `a b` as rows of n elements, with `a` m x k and `b` k x n.
+pub(super) fn product(sizes: (usize, usize, usize), a: &[f32], av: View, b: &[f32], bv: View) -> Vec<f32> {
+    Product { sizes, a: (a, av), b: (b, bv), scale: 1.0, start: Start::Zero }.made()
+}
+
+/// Adds `scale a b` to what `start` says, with `a` m x k, `b` k x n and `c` m x n.
 #[expect(clippy::too_many_arguments, reason = "a matrix product has three matrices and three sizes")]
 pub(super) fn matmul(
-    (m, n, k): (usize, usize, usize),
+    sizes: (usize, usize, usize),
     a: &[f32],
     av: View,
     b: &[f32],
     bv: View,
     c: &mut [f32],
     cv: View,
-    keep: f32,
+    start: Start<'_>,
     scale: f32,
 ) {
-    if m == 0 || n == 0 {
-        return;
-    }
-    assert!(
-        k > 0 && av.last(m, k) < a.len() && bv.last(k, n) < b.len() && cv.last(m, n) < c.len(),
-        "matrix out of bounds"
-    );
-    #[expect(unsafe_code, reason = "every extent was checked above")]
-    // SAFETY: all elements that the strides reach lie inside the slices, and `c` overlaps neither `a` nor `b` because it
-    // is borrowed exclusively.
-    unsafe {
-        multiply((m, n, k), a, av, b, bv, c.as_mut_ptr(), cv, keep, scale);
-    }
+    Product { sizes, a: (a, av), b: (b, bv), scale, start }.into(c, cv);
 }
 
-/// # Safety
-/// The views lie inside `a`, `b` and the memory of `c`, which overlaps neither. `c` is initialised unless `keep` is 0.
-#[expect(clippy::too_many_arguments, reason = "a matrix product has three matrices and three sizes")]
-#[expect(unsafe_code, reason = "the product works on strided pointers")]
-unsafe fn multiply(
-    (m, n, k): (usize, usize, usize),
-    a: &[f32],
-    av: View,
-    b: &[f32],
-    bv: View,
-    c: *mut f32,
-    cv: View,
-    keep: f32,
-    scale: f32,
-) {
-    let stride = |s: usize| isize::try_from(s).expect("a stride fits");
-    // SAFETY: as promised by the caller.
-    unsafe {
-        gemm::gemm(
-            m,
-            n,
-            k,
-            c.add(cv.offset),
-            stride(cv.col),
-            stride(cv.row),
-            keep != 0.0,
-            a.as_ptr().add(av.offset),
-            stride(av.col),
-            stride(av.row),
-            b.as_ptr().add(bv.offset),
-            stride(bv.col),
-            stride(bv.row),
-            keep,
-            scale,
-            false,
-            false,
-            false,
-            gemm::Parallelism::None,
-        );
+/// `a b` with `row` added to each row of the result, as rows of n elements.
+pub(super) fn affine(sizes: (usize, usize, usize), a: &[f32], av: View, b: &[f32], bv: View, row: &[f32]) -> Vec<f32> {
+    Product { sizes, a: (a, av), b: (b, bv), scale: 1.0, start: Start::Row(row) }.made()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn wave(count: usize) -> Vec<f32> {
+        (0..count).map(|i| (i as f32 * 0.37).sin()).collect()
+    }
+
+    /// Checks the products of one size, in both orders of each operand, against sums in f64.
+    fn check(sizes @ (m, n, k): (usize, usize, usize)) {
+        let (a, b, row, old) = (wave(m * k + 3), wave(k * n), wave(n), wave(m * (n + 2)));
+        let shifted = |view: View| View { offset: 3, ..view };
+        for av in [shifted(View::rows(k)), shifted(View::rows(m).t())] {
+            for bv in [View::rows(n), View::rows(k).t()] {
+                let exact = |i: usize, j: usize| -> f64 {
+                    let left = |p: usize| f64::from(a[av.offset + i * av.row + p * av.col]);
+                    (0..k).map(|p| left(p) * f64::from(b[p * bv.row + j * bv.col])).sum()
+                };
+                let near = |found: f32, exact: f64, what: &str| {
+                    assert!(
+                        (f64::from(found) - exact).abs() < 1e-6 * k as f64 + 1e-6,
+                        "{sizes:?} {av:?} {bv:?} {what}: {found} {exact}"
+                    );
+                };
+                let zero = product(sizes, &a, av, &b, bv);
+                let with_row = affine(sizes, &a, av, &b, bv, &row);
+                let cv = View { offset: 1, row: n + 2, col: 1 };
+                let mut kept = old.clone();
+                kept.push(0.0);
+                matmul(sizes, &a, av, &b, bv, &mut kept, cv, Start::Kept, 0.5);
+                for i in 0..m {
+                    for j in 0..n {
+                        near(zero[i * n + j], exact(i, j), "alone");
+                        near(with_row[i * n + j], exact(i, j) + f64::from(row[j]), "with a row");
+                        let at = cv.offset + i * cv.row + j;
+                        near(kept[at], 0.5 * exact(i, j) + f64::from(old[at]), "added");
+                    }
+                    // What lies between the rows of the result stays.
+                    for at in cv.offset + i * cv.row + n..((i + 1) * cv.row).min(old.len()) {
+                        assert_eq!(kept[at], old[at], "{sizes:?}: beside row {i}");
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn products_of_all_layouts_are_sums() {
+        for sizes in
+            [(1, 1, 1), (8, 16, 1), (9, 17, 5), (25, 33, 16), (31, 48, 40), (14, 70, 96), (40, 130, 17), (9, 20, 600)]
+        {
+            check(sizes);
+        }
+        // Rows that fall on the same lines of a cache are packed.
+        check((10, 256, 3));
+    }
+
+    #[test]
+    #[should_panic(expected = "matrix out of bounds")]
+    fn an_operand_that_is_too_short_is_refused() {
+        product((8, 16, 4), &wave(8 * 4), View::rows(4), &wave(4 * 16 - 1), View::rows(16));
     }
 }

@@ -41,7 +41,7 @@ mod kernel {
 
     use super::LEAST;
     use crate::kernels::fused::{Fused, make, overwrite, shape, slice};
-    use crate::kernels::simd::{lanes, logistic, multiversion};
+    use crate::kernels::simd::{Lanes, multiversion, sum, update};
 
     /// SiLU after a norm, with scale and shift if there are three inputs.
     #[derive(Debug, Clone)]
@@ -64,29 +64,24 @@ mod kernel {
 
     /// The Euclidean norm of a row.
     #[inline(always)]
-    fn norm(row: &[f32]) -> f32 {
-        lanes(|i| row[i] * row[i], row.len()).sqrt()
+    fn norm<const SET: u8>(row: &[f32]) -> f32 {
+        sum::<SET, 1>([row], |[x]| x * x).sqrt()
     }
 
     multiversion! {
-        fn value(of: &Operands<'_>) -> Vec<f32> {
+        fn value<const SET>(of: &Operands<'_>) -> Vec<f32> {
             let width = of.gain.len();
             let root = (width as f32).sqrt();
             let mut y = of.x.to_vec();
             for (row, y) in y.chunks_exact_mut(width).enumerate() {
-                let by = root / norm(y).max(LEAST);
-                if of.change.is_empty() {
-                    for (y, g) in y.iter_mut().zip(of.gain) {
-                        let z = *y * by * g;
-                        *y = z * logistic(z);
-                    }
-                } else {
+                let by = root / norm::<SET>(y).max(LEAST);
+                let by = Lanes::splat(by);
+                update::<SET, 1>(y, [of.gain], |y, [g]| y * by * g);
+                if !of.change.is_empty() {
                     let (scale, shift) = of.change[row / of.frames * 2 * width..][..2 * width].split_at(width);
-                    for ((y, g), (scale, shift)) in y.iter_mut().zip(of.gain).zip(scale.iter().zip(shift)) {
-                        let z = *y * by * g * (1.0 + scale) + shift;
-                        *y = z * logistic(z);
-                    }
+                    update::<SET, 2>(y, [scale, shift], |z, [scale, shift]| z * (Lanes::splat(1.0) + scale) + shift);
                 }
+                update::<SET, 0>(y, [], |z, []| z * z.logistic());
             }
             y
         }
@@ -94,7 +89,7 @@ mod kernel {
 
     multiversion! {
         /// Replaces `dy` by the gradient of x.
-        fn slopes(of: &Operands<'_>, dy: &mut [f32], sums: &mut Sums<'_>) {
+        fn slopes<const SET>(of: &Operands<'_>, dy: &mut [f32], sums: &mut Sums<'_>) {
             let width = of.gain.len();
             let root = (width as f32).sqrt();
             let gain = &of.gain[..width];
@@ -102,20 +97,27 @@ mod kernel {
             // Without scale and shift these stay 0 and their sums are not used.
             let none = vec![0.0; 2 * width];
             let mut unused = vec![0.0; 2 * width];
+            // The slope of SiLU at the elements of a row.
+            let mut slope = vec![0.0; width];
             for (row, (x, dy)) in of.x.chunks_exact(width).zip(dy.chunks_exact_mut(width)).enumerate() {
-                let norm = norm(x);
+                let norm = norm::<SET>(x);
                 let by = 1.0 / norm.max(LEAST);
                 let at = row / of.frames * 2 * width;
                 let change = if of.change.is_empty() { &none } else { &of.change[at..at + 2 * width] };
                 let dchange = if of.change.is_empty() { &mut unused } else { &mut sums.change[at..at + 2 * width] };
                 let (scale, shift) = change.split_at(width);
                 let (dscale, dshift) = dchange.split_at_mut(width);
+                let one = Lanes::splat(1.0);
+                let length = Lanes::splat(by * root);
+                update::<SET, 4>(&mut slope, [x, gain, scale, shift], |_, [x, g, scale, shift]| {
+                    let z = x * length * g * (one + scale) + shift;
+                    let s = z.logistic();
+                    s + z * s * (one - s)
+                });
                 for i in 0..width {
                     let unit = x[i] * by * root;
                     let n = unit * gain[i];
-                    let z = n * (1.0 + scale[i]) + shift[i];
-                    let s = logistic(z);
-                    let dz = dy[i] * (s + z * s * (1.0 - s));
+                    let dz = dy[i] * slope[i];
                     dscale[i] += dz * n;
                     dshift[i] += dz;
                     let dn = dz * (1.0 + scale[i]);
@@ -123,7 +125,7 @@ mod kernel {
                     dy[i] = dn * gain[i] * root;
                 }
                 // A row of zeros is divided by a constant, which has no gradient.
-                let along = if norm > LEAST { lanes(|i| dy[i] * x[i] * by, width) } else { 0.0 };
+                let along = if norm > LEAST { sum::<SET, 2>([dy, x], |[dy, x]| dy * x) * by } else { 0.0 };
                 for i in 0..width {
                     dy[i] = by * (dy[i] - x[i] * by * along);
                 }

@@ -1,10 +1,7 @@
 //! Small matrix products whose operands lie in the nearest cache: without packing, on the calling thread. A call costs
 //! what its multiplications cost, where the general product spends most of its time on packing.
 
-use super::simd::{mul_add, set};
-
-/// Number of columns that are computed together: widths of right operands are multiples of it.
-pub(super) const LANES: usize = 8;
+use super::simd::{LANES, mul_add, set};
 
 /// The left operand: element (i, j) is at `i * row + j * col`.
 #[derive(Debug, Clone, Copy)]

@@ -6,14 +6,12 @@ use burn::tensor::{Device, Int, Tensor, TensorData};
 
 use super::conv::{GAP, Gap};
 use super::{Init, Linear, Norm};
-use crate::kernels::{self, Dropout, KeyMask};
+use crate::kernels::{self, Dropout, HIDDEN, KeyMask};
 
 /// Standard deviation of GPT-style initial weights.
 pub(super) const DEVIATION: f64 = 0.02;
 /// Added to variances in layer norms.
 const EPS: f64 = 1e-5;
-/// Far below any score, but finite, so that a gradient through it is 0 and not undefined.
-const HIDDEN: f32 = -1e9;
 
 /// Softmax attention with `bias` added to the scores. The bias has shape [B or 1, heads or 1, Q or 1, K]. `q_bqh` [B,
 /// Q, H], `k_bkh` and `v_bkh` [B, K, H] -> [B, Q, H].

@@ -190,11 +190,9 @@ impl Fixture {
         };
         let control = named("controlnet.", flat::layout(&self.control));
         let trajectory = named("traj_encoder.", flat::layout(&self.trajectory));
-        let len = |entries: &[Entry]| entries.iter().map(Entry::len).sum::<usize>();
-        let (mut first, mut second) = (vec![0.0; len(&control)], vec![0.0; len(&trajectory)]);
         let mut gradients = loss.backward();
-        flat::add_gradients(&self.control, &mut gradients, &mut first);
-        flat::add_gradients(&self.trajectory, &mut gradients, &mut second);
+        let first = flat::take_gradients(&self.control, &mut gradients);
+        let second = flat::take_gradients(&self.trajectory, &mut gradients);
         (control.into_iter().chain(trajectory).collect(), [first, second].concat())
     }
 }

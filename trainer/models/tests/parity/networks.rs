@@ -133,9 +133,7 @@ pub(crate) fn load<M: Module>(module: M, weights: &Path, prefix: &str) -> M {
 
 /// Gradients of `loss`, flat.
 pub(crate) fn gradients<M: Module>(module: &M, loss: Tensor<1>) -> Vec<f32> {
-    let mut out = vec![0.0; flat::layout(module).iter().map(Entry::len).sum()];
-    flat::add_gradients(module, &mut loss.backward(), &mut out);
-    out
+    flat::take_gradients(module, &mut loss.backward())
 }
 
 /// Calls `each` with the name and values of every parameter of a flat buffer.

@@ -2,7 +2,7 @@
 
 use burn::module::Module;
 use burn::tensor::Tensor;
-use models::flat::{self, add_gradients};
+use models::flat::{self, take_gradients};
 use motion::Stream;
 use protocol::stage::Training;
 
@@ -26,10 +26,7 @@ pub(crate) fn group<M: Module>(name: &'static str, module: &M, training: &Traini
 
 /// The gradient of a slice's loss for all parameters of `module`, as a flat buffer.
 pub(crate) fn slice_gradient<M: Module>(module: &M, loss: Tensor<1>) -> Vec<f32> {
-    let mut gradients = loss.backward();
-    let mut flat = vec![0.0; module.num_params()];
-    add_gradients(module, &mut gradients, &mut flat);
-    flat
+    take_gradients(module, &mut loss.backward())
 }
 
 /// The result of a slice that trains only `module`, on all of `losses`.

@@ -2,8 +2,8 @@
 
 use super::kernel::{Attend, Packed};
 use super::{HIDDEN, Sizes};
-use crate::kernels::raw::{View, matmul};
-use crate::kernels::simd::{exp, multiversion};
+use crate::kernels::raw::{Start, View, matmul};
+use crate::kernels::simd::{Lanes, multiversion, update};
 
 impl Packed<'_> {
     fn q_view(&self, s: Sizes, b: usize, h: usize) -> View {
@@ -29,7 +29,7 @@ fn weight_view(s: Sizes, b: usize, h: usize) -> View {
 
 multiversion! {
     /// Softmax of the first `valid` columns of each row; the rest becomes 0.
-    fn softmax_rows(scores: &mut [f32], keys: usize, valid: usize) {
+    fn softmax_rows<const SET>(scores: &mut [f32], keys: usize, valid: usize) {
         for row in scores.chunks_exact_mut(keys) {
             let (live, dead) = row.split_at_mut(valid);
             dead.fill(0.0);
@@ -44,9 +44,8 @@ multiversion! {
             for v in chunks.remainder().iter().chain(&top) {
                 most = if *v > most { *v } else { most };
             }
-            for v in live.iter_mut() {
-                *v = exp(*v - most);
-            }
+            let most = Lanes::splat(most);
+            update::<SET, 0>(live, [], |v, []| (v - most).exp());
             let mut lane = [0.0_f32; 16];
             let mut chunks = live.chunks_exact(16);
             for chunk in &mut chunks {
@@ -100,7 +99,17 @@ pub(super) fn forward(attend: &Attend, packed: &Packed<'_>) -> (Vec<f32>, Vec<f3
         for h in 0..s.heads {
             let (at, q, k, v) =
                 (weight_view(s, b, h), packed.q_view(s, b, h), packed.k_view(s, b, h), packed.v_view(s, b, h));
-            matmul((s.queries, valid, s.head()), packed.q, q, packed.kv, k.t(), &mut weights, at, 0.0, s.scale());
+            matmul(
+                (s.queries, valid, s.head()),
+                packed.q,
+                q,
+                packed.kv,
+                k.t(),
+                &mut weights,
+                at,
+                Start::Zero,
+                s.scale(),
+            );
             let range = at.offset..at.offset + s.queries * s.keys;
             if s.causal {
                 for (query, row) in weights[range.clone()].chunks_exact_mut(s.keys).enumerate() {
@@ -117,7 +126,7 @@ pub(super) fn forward(attend: &Attend, packed: &Packed<'_>) -> (Vec<f32>, Vec<f3
                 }
             };
             let to = out_view(s, b, h);
-            matmul((s.queries, s.head(), valid), p, pv, packed.kv, v, &mut out, to, 0.0, 1.0);
+            matmul((s.queries, s.head(), valid), p, pv, packed.kv, v, &mut out, to, Start::Zero, 1.0);
         }
     }
     (out, weights)
@@ -141,7 +150,7 @@ pub(super) fn backward(attend: &Attend, packed: &Packed<'_>, weights: &[f32], do
             let v = packed.v_view(s, b, h);
             let p = &weights[at.offset..at.offset + s.queries * s.keys];
             scores.fill(0.0);
-            matmul((s.queries, valid, s.head()), dout, out, packed.kv, v.t(), &mut scores, by_keys, 0.0, 1.0);
+            matmul((s.queries, valid, s.head()), dout, out, packed.kv, v.t(), &mut scores, by_keys, Start::Zero, 1.0);
             match &attend.dropout {
                 None => dropped.copy_from_slice(p),
                 Some(factors) => {
@@ -153,10 +162,10 @@ pub(super) fn backward(attend: &Attend, packed: &Packed<'_>, weights: &[f32], do
                 }
             }
             softmax_backward_rows(p, &mut scores, s.keys);
-            matmul((s.queries, s.head(), valid), &scores, by_keys, packed.kv, k, &mut dq, q, 0.0, s.scale());
+            matmul((s.queries, s.head(), valid), &scores, by_keys, packed.kv, k, &mut dq, q, Start::Zero, s.scale());
             let to = if packed.is_own() { &mut dq } else { &mut dkv };
-            matmul((valid, s.head(), s.queries), &scores, by_keys.t(), packed.q, q, to, k, 0.0, s.scale());
-            matmul((valid, s.head(), s.queries), &dropped, by_keys.t(), dout, out, to, v, 0.0, 1.0);
+            matmul((valid, s.head(), s.queries), &scores, by_keys.t(), packed.q, q, to, k, Start::Zero, s.scale());
+            matmul((valid, s.head(), s.queries), &dropped, by_keys.t(), dout, out, to, v, Start::Zero, 1.0);
         }
     }
     (dq, dkv)

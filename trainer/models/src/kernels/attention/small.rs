@@ -7,8 +7,8 @@
 use super::kernel::{Attend, Packed};
 use super::{HIDDEN, Sizes};
 use crate::kernels::dropout::Factors;
-use crate::kernels::simd::{exp_by, mul_add, multiversion};
-use crate::kernels::tile::{LANES, Left, multiply, transpose};
+use crate::kernels::simd::{LANES, Lanes, multiversion};
+use crate::kernels::tile::{Left, multiply, transpose};
 
 /// The longest sequence, of queries or of keys.
 const MOST: usize = 64;
@@ -168,25 +168,24 @@ multiversion! {
                 row[..key].fill(HIDDEN);
             }
         }
-        for column in (0..lanes).step_by(LANES) {
-            let mut most = [f32::NEG_INFINITY; LANES];
-            for row in weights.chunks_exact(lanes) {
-                for (most, v) in most.iter_mut().zip(&row[column..column + LANES]) {
-                    *most = if *v > *most { *v } else { *most };
-                }
+        // Cells of one register: those of a row of keys stand side by side.
+        let cells = weights.as_chunks_mut::<LANES>().0;
+        let across = lanes / LANES;
+        for column in 0..across {
+            let cell = |cells: &[[f32; LANES]], row: usize| Lanes::from(cells[row * across + column]);
+            let mut most = Lanes::<SET>::splat(f32::NEG_INFINITY);
+            for row in 0..valid {
+                most = most.max(cell(cells, row));
             }
-            let mut sum = [0.0_f32; LANES];
-            for row in weights.chunks_exact_mut(lanes) {
-                for ((v, most), sum) in row[column..column + LANES].iter_mut().zip(&most).zip(&mut sum) {
-                    *v = exp_by::<SET>(*v - most);
-                    *sum += *v;
-                }
+            let mut sum = Lanes::splat(0.0);
+            for row in 0..valid {
+                let v = (cell(cells, row) - most).exp();
+                sum = sum + v;
+                cells[row * across + column] = v.numbers();
             }
-            let inverse = sum.map(|sum| 1.0 / sum);
-            for row in weights.chunks_exact_mut(lanes) {
-                for (v, inverse) in row[column..column + LANES].iter_mut().zip(&inverse) {
-                    *v *= inverse;
-                }
+            let inverse = Lanes::splat(1.0) / sum;
+            for row in 0..valid {
+                cells[row * across + column] = (cell(cells, row) * inverse).numbers();
             }
         }
     }
@@ -227,21 +226,18 @@ multiversion! {
             }
         }
         let scale = s.scale();
-        for column in (0..lanes).step_by(LANES) {
-            let mut dot = [0.0_f32; LANES];
-            for (p, dp) in weights.chunks_exact(lanes).zip(scores.chunks_exact(lanes)) {
-                let p = &p[column..column + LANES];
-                let dp = &dp[column..column + LANES];
-                for ((dot, p), dp) in dot.iter_mut().zip(p).zip(dp) {
-                    *dot = mul_add::<SET>(*p, *dp, *dot);
-                }
+        let weights = weights.as_chunks::<LANES>().0;
+        let scores = scores.as_chunks_mut::<LANES>().0;
+        let across = lanes / LANES;
+        for column in 0..across {
+            let cell = |cells: &[[f32; LANES]], row: usize| Lanes::<SET>::from(cells[row * across + column]);
+            let mut dot = Lanes::splat(0.0);
+            for row in 0..valid {
+                dot = cell(weights, row).mul_add(cell(scores, row), dot);
             }
-            for (p, dp) in weights.chunks_exact(lanes).zip(scores.chunks_exact_mut(lanes)) {
-                let p = &p[column..column + LANES];
-                let dp = &mut dp[column..column + LANES];
-                for ((dot, p), dp) in dot.iter().zip(p).zip(dp) {
-                    *dp = p * scale * (*dp - dot);
-                }
+            for row in 0..valid {
+                let ds = cell(weights, row) * Lanes::splat(scale) * (cell(scores, row) - dot);
+                scores[row * across + column] = ds.numbers();
             }
         }
     }

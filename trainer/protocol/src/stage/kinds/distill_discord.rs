@@ -73,7 +73,7 @@ impl Default for DistillDiscord {
 
 impl StageSpec for DistillDiscord {
     const KIND: &'static str = "distill.discord";
-    const VERSION: u32 = 3;
+    const VERSION: u32 = 4;
     const SHAPE: Shape = Shape::Gang;
     const OUTPUT: Output = Output { name: "decoder", kind: ArtifactKind::FlowDecoder };
 

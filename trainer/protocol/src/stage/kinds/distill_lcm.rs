@@ -24,7 +24,7 @@ impl Default for DistillLcm {
 impl StageSpec for DistillLcm {
     const KIND: &'static str = "distill.lcm";
     // Version 2 outputs a whole model, with its VAE and text encoder.
-    const VERSION: u32 = 3;
+    const VERSION: u32 = 4;
     const SHAPE: Shape = Shape::Gang;
     const OUTPUT: Output = Output { name: "model", kind: ArtifactKind::Model };
 

@@ -49,7 +49,7 @@ impl Default for DistillPcm {
 impl StageSpec for DistillPcm {
     const KIND: &'static str = "distill.pcm";
     // Version 2 outputs a whole model, with its VAE and text encoder.
-    const VERSION: u32 = 3;
+    const VERSION: u32 = 4;
     const SHAPE: Shape = Shape::Gang;
     const OUTPUT: Output = Output { name: "model", kind: ArtifactKind::Model };
 

@@ -63,7 +63,7 @@ impl Default for DrawMotions {
 impl StageSpec for DrawMotions {
     const KIND: &'static str = "draw.motions";
     // Version 2 adds penetration and bones, version 3 a moving picture.
-    const VERSION: u32 = 3;
+    const VERSION: u32 = 4;
     const SHAPE: Shape = Shape::Plain;
     const OUTPUT: Output = Output { name: "report", kind: ArtifactKind::Report };
 

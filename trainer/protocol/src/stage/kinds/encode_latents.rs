@@ -45,7 +45,7 @@ impl Default for EncodeLatents {
 impl StageSpec for EncodeLatents {
     const KIND: &'static str = "encode.latents";
     // Version 2 stores the start of each crop in its clip, version 3 also the change of its path.
-    const VERSION: u32 = 4;
+    const VERSION: u32 = 5;
     const SHAPE: Shape = Shape::Map;
     const OUTPUT: Output = Output { name: "latents", kind: ArtifactKind::Latents };
 

@@ -32,6 +32,7 @@ impl Default for EncodeTokens {
 
 impl StageSpec for EncodeTokens {
     const KIND: &'static str = "encode.tokens";
+    const VERSION: u32 = 2;
     const SHAPE: Shape = Shape::Map;
     const OUTPUT: Output = Output { name: "tokens", kind: ArtifactKind::Tokens };
 

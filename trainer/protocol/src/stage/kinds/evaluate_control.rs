@@ -82,7 +82,7 @@ impl Default for EvaluateControl {
 
 impl StageSpec for EvaluateControl {
     const KIND: &'static str = "evaluate.control";
-    const VERSION: u32 = 4;
+    const VERSION: u32 = 5;
     const SHAPE: Shape = Shape::Map;
     const OUTPUT: Output = Output { name: "report", kind: ArtifactKind::Report };
 

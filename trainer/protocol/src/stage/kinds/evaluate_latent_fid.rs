@@ -61,7 +61,7 @@ impl StageSpec for EvaluateLatentFid {
     const KIND: &'static str = "evaluate.latent_fid";
     // Version 2 renames retrieval among latents. Version 3 compares captions by their words, not by their vectors.
     // Version 4 adds each split besides `all`, and halves.
-    const VERSION: u32 = 5;
+    const VERSION: u32 = 6;
     const SHAPE: Shape = Shape::Map;
     const OUTPUT: Output = Output { name: "report", kind: ArtifactKind::Report };
 

@@ -80,7 +80,7 @@ impl Default for EvaluateRecognition {
 impl StageSpec for EvaluateRecognition {
     const KIND: &'static str = "evaluate.recognition";
     // Version 4 classifies smoothed paths and positions, and reconstructions too.
-    const VERSION: u32 = 5;
+    const VERSION: u32 = 6;
     const SHAPE: Shape = Shape::Plain;
     const OUTPUT: Output = Output { name: "report", kind: ArtifactKind::Report };
 

@@ -54,7 +54,7 @@ impl StageSpec for EvaluateReconstruction {
     const KIND: &'static str = "evaluate.reconstruction";
     // Version 2 adds PA-MPJPE, accelerations, sJPE, skating. Version 3 adds the length of a unit.
     // Version 5 adds the share of still frames. Version 6 adds jerk, penetration and bones.
-    const VERSION: u32 = 6;
+    const VERSION: u32 = 7;
     const SHAPE: Shape = Shape::Map;
     const OUTPUT: Output = Output { name: "report", kind: ArtifactKind::Report };
 

@@ -44,7 +44,7 @@ impl Default for EvaluateSpectrum {
 
 impl StageSpec for EvaluateSpectrum {
     const KIND: &'static str = "evaluate.spectrum";
-    const VERSION: u32 = 2;
+    const VERSION: u32 = 3;
     const SHAPE: Shape = Shape::Plain;
     const OUTPUT: Output = Output { name: "report", kind: ArtifactKind::Report };
 

@@ -138,7 +138,7 @@ impl StageSpec for EvaluateT2m {
     const KIND: &'static str = "evaluate.t2m";
     // Version 2 reports the measured model and its sampler. Version 3 adds pools, `drop_last`, drawn lengths,
     // reconstructions.
-    const VERSION: u32 = 5;
+    const VERSION: u32 = 6;
     const SHAPE: Shape = Shape::Map;
     const OUTPUT: Output = Output { name: "report", kind: ArtifactKind::Report };
 

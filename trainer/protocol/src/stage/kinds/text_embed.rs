@@ -135,7 +135,7 @@ impl TextEncoder {
 impl StageSpec for TextEmbed {
     const KIND: &'static str = "text.embed";
     // Version 2 stores the encoder, version 3 adds published encoders and shards, version 4 rounds GELU differently.
-    const VERSION: u32 = 4;
+    const VERSION: u32 = 5;
     const SHAPE: Shape = Shape::Map;
     const OUTPUT: Output = Output { name: "embeddings", kind: ArtifactKind::Embeddings };
 

@@ -148,7 +148,7 @@ impl Default for TrainControl {
 impl StageSpec for TrainControl {
     const KIND: &'static str = "train.control";
     // Version 2 has batches of similar length.
-    const VERSION: u32 = 4;
+    const VERSION: u32 = 5;
     const SHAPE: Shape = Shape::Gang;
     const OUTPUT: Output = Output { name: "model", kind: ArtifactKind::Model };
 

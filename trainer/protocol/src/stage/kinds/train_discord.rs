@@ -197,7 +197,7 @@ impl Default for TrainDiscord {
 
 impl StageSpec for TrainDiscord {
     const KIND: &'static str = "train.discord";
-    const VERSION: u32 = 3;
+    const VERSION: u32 = 4;
     const SHAPE: Shape = Shape::Gang;
     const OUTPUT: Output = Output { name: "decoder", kind: ArtifactKind::FlowDecoder };
 

@@ -52,7 +52,7 @@ impl Default for TrainLength {
 impl StageSpec for TrainLength {
     const KIND: &'static str = "train.length";
     // Version 2 stores the encoder that it reads.
-    const VERSION: u32 = 2;
+    const VERSION: u32 = 3;
     const SHAPE: Shape = Shape::Gang;
     const OUTPUT: Output = Output { name: "length", kind: ArtifactKind::Length };
 

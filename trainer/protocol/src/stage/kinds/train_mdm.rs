@@ -120,7 +120,7 @@ impl Default for TrainMdm {
 
 impl StageSpec for TrainMdm {
     const KIND: &'static str = "train.mdm";
-    const VERSION: u32 = 3;
+    const VERSION: u32 = 4;
     const SHAPE: Shape = Shape::Gang;
     const OUTPUT: Output = Output { name: "model", kind: ArtifactKind::Model };
 

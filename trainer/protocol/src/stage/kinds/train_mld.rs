@@ -66,7 +66,7 @@ impl Default for TrainMld {
 impl StageSpec for TrainMld {
     const KIND: &'static str = "train.mld";
     // Version 2 outputs a whole model, with its VAE and text encoder.
-    const VERSION: u32 = 3;
+    const VERSION: u32 = 4;
     const SHAPE: Shape = Shape::Gang;
     const OUTPUT: Output = Output { name: "model", kind: ArtifactKind::Model };
 

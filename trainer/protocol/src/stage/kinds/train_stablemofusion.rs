@@ -179,7 +179,7 @@ impl TrainStableMoFusion {
 
 impl StageSpec for TrainStableMoFusion {
     const KIND: &'static str = "train.stablemofusion";
-    const VERSION: u32 = 4;
+    const VERSION: u32 = 5;
     const SHAPE: Shape = Shape::Gang;
     const OUTPUT: Output = Output { name: "model", kind: ArtifactKind::Model };
 

@@ -159,7 +159,7 @@ impl Default for TrainTokenizer {
 
 impl StageSpec for TrainTokenizer {
     const KIND: &'static str = "train.tokenizer";
-    const VERSION: u32 = 3;
+    const VERSION: u32 = 4;
     const SHAPE: Shape = Shape::Gang;
     const OUTPUT: Output = Output { name: "tokenizer", kind: ArtifactKind::Tokenizer };
 

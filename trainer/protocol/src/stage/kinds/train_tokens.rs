@@ -132,7 +132,7 @@ impl Default for TrainTokens {
 
 impl StageSpec for TrainTokens {
     const KIND: &'static str = "train.tokens";
-    const VERSION: u32 = 3;
+    const VERSION: u32 = 4;
     const SHAPE: Shape = Shape::Gang;
     const OUTPUT: Output = Output { name: "model", kind: ArtifactKind::Model };
 

@@ -133,7 +133,7 @@ impl Default for TrainVae {
 
 impl StageSpec for TrainVae {
     const KIND: &'static str = "train.vae";
-    const VERSION: u32 = 3;
+    const VERSION: u32 = 4;
     const SHAPE: Shape = Shape::Gang;
     const OUTPUT: Output = Output { name: "vae", kind: ArtifactKind::Vae };
 

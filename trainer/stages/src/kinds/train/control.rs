@@ -18,7 +18,6 @@
 
 use std::collections::BTreeMap;
 
-use burn::module::Module;
 use burn::tensor::{Device, Gradients, Tensor};
 use checkpoint::Blobs;
 use checkpoint::model::{self, Model, Parts};
@@ -208,8 +207,11 @@ impl Objective for Controlled {
         }
         let total = all.total().ok_or_else(|| StageError::Fault("every weight of the loss is 0".into()))?;
         let mut gradients = total.backward();
-        let mut of = vec![taken(&self.control, &mut gradients), taken(&self.trajectory, &mut gradients)];
-        of.extend(self.feedback.as_ref().map(|network| taken(network, &mut gradients)));
+        let mut of = vec![
+            flat::take_gradients(&self.control, &mut gradients),
+            flat::take_gradients(&self.trajectory, &mut gradients),
+        ];
+        of.extend(self.feedback.as_ref().map(|network| flat::take_gradients(network, &mut gradients)));
         let terms = all.values(&self.terms());
         Ok(SliceResult { gradients: of, terms, ..SliceResult::default() })
     }
@@ -368,13 +370,6 @@ impl Controlled {
         let model = model::extend(base, None, &BTreeMap::from([(Role::CONTROL, part)])).map_err(model_error)?;
         Ok(cx.put_manifest(&model)?)
     }
-}
-
-/// Removes the gradients of `network`'s parameters from `gradients`, as one flat buffer.
-fn taken<M: Module>(network: &M, gradients: &mut Gradients) -> Vec<f32> {
-    let mut own = vec![0.0; network.num_params()];
-    flat::add_gradients(network, gradients, &mut own);
-    own
 }
 
 /// Checks that the model has a denoiser of these latents, and returns its meta.

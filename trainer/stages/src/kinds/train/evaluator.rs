@@ -157,8 +157,7 @@ impl EvaluatorObjective {
         let loss = loss / global as f32;
         let value = loss.clone().inner().into_scalar::<f32>();
         let mut gradients = loss.backward();
-        let mut flat = vec![0.0; self.movements.num_params()];
-        flat::add_gradients(&self.movements, &mut gradients, &mut flat);
+        let flat = flat::take_gradients(&self.movements, &mut gradients);
         Ok(SliceResult {
             gradients: vec![Vec::new(), Vec::new(), flat],
             terms: vec![value, reconstruction, 0.0, 0.0],
@@ -206,10 +205,8 @@ impl EvaluatorObjective {
         let loss = (positive + negative) / global as f32;
         let value = loss.clone().inner().into_scalar::<f32>();
         let mut gradients = loss.backward();
-        let mut text_flat = vec![0.0; self.text.num_params()];
-        flat::add_gradients(&self.text, &mut gradients, &mut text_flat);
-        let mut motion_flat = vec![0.0; self.motion.num_params()];
-        flat::add_gradients(&self.motion, &mut gradients, &mut motion_flat);
+        let text_flat = flat::take_gradients(&self.text, &mut gradients);
+        let motion_flat = flat::take_gradients(&self.motion, &mut gradients);
         Ok(SliceResult {
             gradients: vec![text_flat, motion_flat, Vec::new()],
             terms: vec![value, 0.0, close, far],

@@ -1,0 +1,254 @@
+//! Matrix products for AVX-512. The right operand is packed in panels of up to 64 columns, which the nearest caches hold;
+//! a block of the result stays in registers. The general product packs the left operand too, which takes longer than it
+//! saves at the sizes of small networks.
+
+use std::arch::x86_64::{
+    __m512, __mmask16, _mm512_add_ps, _mm512_fmadd_ps, _mm512_loadu_ps, _mm512_mask_storeu_ps, _mm512_maskz_loadu_ps,
+    _mm512_mul_ps, _mm512_permutex2var_ps, _mm512_set1_ps, _mm512_setr_epi32, _mm512_setzero_ps, _mm512_storeu_ps,
+};
+use std::cell::RefCell;
+
+use super::{Product, Start, View};
+
+/// Numbers in a register.
+const LANES: usize = 16;
+/// Registers in a row of a panel, at most.
+const ACROSS: usize = 4;
+/// Rows of the left operand from which packing the right one pays.
+const LEAST_ROWS: usize = 8;
+/// Terms that are summed before they are added to the result; their panel stays in the second-level cache. Shorter sums are
+/// more exact too.
+const TERMS: usize = 256;
+
+/// Returns true if the product is faster here than the general one.
+pub(super) fn fits(product: &Product<'_>) -> bool {
+    let (m, n, _) = product.sizes;
+    let right = product.b.1;
+    crate::kernels::simd::has_wide() && m >= LEAST_ROWS && n >= LANES && (right.col == 1 || right.row == 1)
+}
+
+thread_local! {
+    /// The packed panel.
+    static PANEL: RefCell<Vec<f32>> = const { RefCell::new(Vec::new()) };
+}
+
+/// Computes the product into `c`, whose rows are contiguous.
+///
+/// # Safety
+/// [`fits`] holds. The views lie inside their slices and the memory of `c`, which overlaps neither operand. `c` is
+/// initialised if the product keeps some of it.
+#[expect(unsafe_code, reason = "the product works on strided pointers")]
+pub(super) unsafe fn multiply(product: &Product<'_>, c: *mut f32, cv: View) {
+    let (m, n, all) = product.sizes;
+    PANEL.with_borrow_mut(|panel| {
+        panel.resize(all.min(TERMS) * ACROSS * LANES, 0.0);
+        for top in (0..all).step_by(TERMS) {
+            let later = |view: View, by: usize| View { offset: view.offset + top * by, ..view };
+            let part = Product {
+                sizes: (m, n, (all - top).min(TERMS)),
+                a: (product.a.0, later(product.a.1, product.a.1.col)),
+                b: (product.b.0, later(product.b.1, product.b.1.row)),
+                start: if top == 0 { product.start } else { Start::Kept },
+                ..*product
+            };
+            // SAFETY: as promised by the caller; after the first part the result is initialised.
+            unsafe { add(&part, c, cv, panel) };
+        }
+    });
+}
+
+/// One part of the terms.
+///
+/// # Safety
+/// As for [`multiply`].
+#[expect(unsafe_code, reason = "the product works on strided pointers")]
+unsafe fn add(product: &Product<'_>, c: *mut f32, cv: View, panel: &mut [f32]) {
+    let (m, n, k) = product.sizes;
+    let registers = n.div_ceil(LANES);
+    let panels = registers.div_ceil(ACROSS);
+    let mut first = 0;
+    for i in 0..panels {
+        // Panels are as equal as possible.
+        let across = registers / panels + usize::from(i < registers % panels);
+        let from = first * LANES;
+        let columns = (across * LANES).min(n - from);
+        // SAFETY: `fits` detected the features; the panel has room for k rows of `across` registers; columns lie below n,
+        // and the rest is as promised by the caller.
+        unsafe {
+            let (b, view) = product.b;
+            let right = if lies_well(view, columns) {
+                (b.as_ptr().add(view.offset + from), view.row)
+            } else {
+                pack(product.b, (k, columns), from, across * LANES, panel);
+                (panel.as_ptr(), across * LANES)
+            };
+            let to = c.add(cv.offset + from);
+            match across {
+                1 => rows::<12, 1>(product, (m, columns, k), from, right, to, cv.row),
+                2 => rows::<12, 2>(product, (m, columns, k), from, right, to, cv.row),
+                3 => rows::<8, 3>(product, (m, columns, k), from, right, to, cv.row),
+                _ => rows::<6, 4>(product, (m, columns, k), from, right, to, cv.row),
+            }
+        }
+        first += across;
+    }
+}
+
+/// Returns true if columns of the right operand may be read where they lie: whole registers, whose rows do not fall on the
+/// same few lines of a cache.
+fn lies_well(view: View, columns: usize) -> bool {
+    /// Distances of rows that are multiples of it share the lines of a cache.
+    const CONFLICT: usize = 256;
+    view.col == 1 && columns.is_multiple_of(LANES) && !view.row.is_multiple_of(CONFLICT)
+}
+
+/// Copies `columns` columns of the right operand from column `from` on into rows of `width`, with zeros behind them.
+///
+/// # Safety
+/// The processor has AVX-512, and the view lies inside the slice.
+#[expect(unsafe_code, reason = "loads go through pointers")]
+#[target_feature(enable = "avx512f,avx512vl,avx512bw,avx512dq,avx2,fma")]
+unsafe fn pack((b, view): (&[f32], View), (k, columns): (usize, usize), from: usize, width: usize, panel: &mut [f32]) {
+    let panel = &mut panel[..k * width];
+    if view.col == 1 {
+        for (p, row) in panel.chunks_exact_mut(width).enumerate() {
+            let at = view.offset + p * view.row + from;
+            let (live, rest) = row.split_at_mut(columns);
+            live.copy_from_slice(&b[at..at + columns]);
+            rest.fill(0.0);
+        }
+        return;
+    }
+    // The columns are contiguous: squares of 16 x 16 are transposed.
+    for left in (0..width).step_by(LANES) {
+        for top in (0..k).step_by(LANES) {
+            let high = (k - top).min(LANES);
+            let mask = __mmask16::MAX >> (LANES - high);
+            let mut square = [_mm512_setzero_ps(); LANES];
+            for (j, column) in square.iter_mut().enumerate().take(columns.saturating_sub(left)) {
+                let at = view.offset + (from + left + j) * view.col + top;
+                debug_assert!(at + high <= b.len(), "inside the operand");
+                // SAFETY: the column has `high` more elements, and the mask leaves out the rest.
+                *column = unsafe { _mm512_maskz_loadu_ps(mask, b.as_ptr().add(at)) };
+            }
+            transpose(&mut square);
+            for (i, row) in square.iter().take(high).enumerate() {
+                let to = &mut panel[(top + i) * width + left..][..LANES];
+                // SAFETY: there are 16 elements.
+                unsafe { _mm512_storeu_ps(to.as_mut_ptr(), *row) };
+            }
+        }
+    }
+}
+
+/// Transposes a square of 16 registers: each of four rounds interleaves the rows of one half with those of the other.
+#[inline]
+#[target_feature(enable = "avx512f,avx512vl,avx512bw,avx512dq,avx2,fma")]
+fn transpose(square: &mut [__m512; LANES]) {
+    let low = _mm512_setr_epi32(0, 16, 1, 17, 2, 18, 3, 19, 4, 20, 5, 21, 6, 22, 7, 23);
+    let high = _mm512_setr_epi32(8, 24, 9, 25, 10, 26, 11, 27, 12, 28, 13, 29, 14, 30, 15, 31);
+    for _ in 0..LANES.ilog2() {
+        let from = *square;
+        for (i, pair) in square.chunks_exact_mut(2).enumerate() {
+            pair[0] = _mm512_permutex2var_ps(from[i], low, from[i + LANES / 2]);
+            pair[1] = _mm512_permutex2var_ps(from[i], high, from[i + LANES / 2]);
+        }
+    }
+}
+
+/// All rows of `columns` columns of the result: R at once, then the rest.
+///
+/// # Safety
+/// As for [`block`], for all m rows.
+#[expect(unsafe_code, reason = "the callers check the extents")]
+#[target_feature(enable = "avx512f,avx512vl,avx512bw,avx512dq,avx2,fma")]
+unsafe fn rows<const R: usize, const V: usize>(
+    product: &Product<'_>,
+    (m, columns, k): (usize, usize, usize),
+    from: usize,
+    (b, b_row): (*const f32, usize),
+    c: *mut f32,
+    c_row: usize,
+) {
+    let (a, view) = product.a;
+    let mut i = 0;
+    while i < m {
+        // SAFETY: as promised by the caller; the block's rows are among the m.
+        unsafe {
+            let a = a.as_ptr().add(view.offset + i * view.row);
+            let c = c.add(i * c_row);
+            let place = Place { a, a_row: view.row, a_col: view.col, b, b_row, c, c_row };
+            i += match m - i {
+                left if left >= R => block::<R, V>(product, (columns, k), from, place),
+                4.. => block::<4, V>(product, (columns, k), from, place),
+                2.. => block::<2, V>(product, (columns, k), from, place),
+                _ => block::<1, V>(product, (columns, k), from, place),
+            };
+        }
+    }
+}
+
+/// Where the operands and the result of a block begin.
+#[derive(Clone, Copy)]
+struct Place {
+    a: *const f32,
+    a_row: usize,
+    a_col: usize,
+    b: *const f32,
+    b_row: usize,
+    c: *mut f32,
+    c_row: usize,
+}
+
+/// R rows of the result, V registers wide, of which `columns` columns exist. Returns R.
+///
+/// # Safety
+/// The processor has AVX-512. `a` has the elements `r a_row + p a_col` for r below R and p below k, `b` k rows of V
+/// registers from each `p b_row` on, and `c` `columns` elements from each `r c_row` on.
+#[expect(unsafe_code, reason = "the callers check the extents")]
+#[inline]
+#[target_feature(enable = "avx512f,avx512vl,avx512bw,avx512dq,avx2,fma")]
+unsafe fn block<const R: usize, const V: usize>(
+    product: &Product<'_>,
+    (columns, k): (usize, usize),
+    from: usize,
+    at: Place,
+) -> usize {
+    let live = |v: usize| __mmask16::MAX >> (LANES - (columns - v * LANES).min(LANES));
+    let mut sums = [[_mm512_setzero_ps(); V]; R];
+    // SAFETY: as promised by the caller; masks leave out the columns that do not exist.
+    unsafe {
+        for p in 0..k {
+            let mut right = [_mm512_setzero_ps(); V];
+            for (v, right) in right.iter_mut().enumerate() {
+                *right = _mm512_loadu_ps(at.b.add(p * at.b_row + v * LANES));
+            }
+            for (r, sum) in sums.iter_mut().enumerate() {
+                let left = _mm512_set1_ps(*at.a.add(r * at.a_row + p * at.a_col));
+                for v in 0..V {
+                    sum[v] = _mm512_fmadd_ps(left, right[v], sum[v]);
+                }
+            }
+        }
+        let scale = _mm512_set1_ps(product.scale);
+        for (r, sum) in sums.iter().enumerate() {
+            for (v, sum) in sum.iter().enumerate() {
+                let to = at.c.add(r * at.c_row + v * LANES);
+                let mut sum = *sum;
+                if product.scale != 1.0 {
+                    sum = _mm512_mul_ps(sum, scale);
+                }
+                match product.start {
+                    Start::Zero => {}
+                    Start::Kept => sum = _mm512_add_ps(sum, _mm512_maskz_loadu_ps(live(v), to)),
+                    Start::Row(row) => {
+                        let of = row.as_ptr().add(from + v * LANES);
+                        sum = _mm512_add_ps(sum, _mm512_maskz_loadu_ps(live(v), of));
+                    }
+                }
+                _mm512_mask_storeu_ps(to, live(v), sum);
+            }
+        }
+    }
+    R
+}
