@@ -27,6 +27,11 @@ impl View {
     }
 }
 
+/// Terms that are summed before they are added to the result. The general product would divide longer sums than 512 by the
+/// sizes of the processor's caches, so that the bits depended on them. A panel of so many rows stays in the second-level
+/// cache, and shorter sums are more exact.
+const TERMS: usize = 256;
+
 /// A product to which something may be added: `scale a b`, with `a` m x k and `b` k x n.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Product<'a> {
@@ -100,20 +105,34 @@ impl Product<'_> {
         }
     }
 
+    /// Adds up [`TERMS`] terms at a time.
+    ///
     /// # Safety
     /// The views lie inside the operands and the memory of `c`, which overlaps neither. `c` is initialised if it is kept.
     #[expect(unsafe_code, reason = "the product works on strided pointers")]
     unsafe fn multiply(self, c: *mut f32, cv: View) {
-        #[cfg(target_arch = "x86_64")]
-        if cv.col == 1 && wide::fits(&self) {
-            // SAFETY: as promised by the caller.
-            return unsafe { wide::multiply(&self, c, cv) };
+        let (m, n, k) = self.sizes;
+        for top in (0..k).step_by(TERMS) {
+            let later = |view: View, by: usize| View { offset: view.offset + top * by, ..view };
+            let part = Product {
+                sizes: (m, n, (k - top).min(TERMS)),
+                a: (self.a.0, later(self.a.1, self.a.1.col)),
+                b: (self.b.0, later(self.b.1, self.b.1.row)),
+                start: if top == 0 { self.start } else { Start::Kept },
+                ..self
+            };
+            #[cfg(target_arch = "x86_64")]
+            if cv.col == 1 && wide::fits(&part) {
+                // SAFETY: as promised by the caller; after the first part the result is initialised.
+                unsafe { wide::multiply(&part, c, cv) };
+                continue;
+            }
+            // SAFETY: as above.
+            unsafe { part.general(c, cv) };
         }
-        // SAFETY: as promised by the caller.
-        unsafe { self.general(c, cv) }
     }
 
-    /// [`multiply`](Self::multiply) for all instruction sets and layouts.
+    /// One part of the terms, for all instruction sets and layouts.
     ///
     /// # Safety
     /// As for [`multiply`](Self::multiply).

@@ -16,9 +16,6 @@ const LANES: usize = 16;
 const ACROSS: usize = 4;
 /// Rows of the left operand from which packing the right one pays.
 const LEAST_ROWS: usize = 8;
-/// Terms that are summed before they are added to the result; their panel stays in the second-level cache. Shorter sums are
-/// more exact too.
-const TERMS: usize = 256;
 
 /// Returns true if the product is faster here than the general one.
 pub(super) fn fits(product: &Product<'_>) -> bool {
@@ -39,30 +36,17 @@ thread_local! {
 /// initialised if the product keeps some of it.
 #[expect(unsafe_code, reason = "the product works on strided pointers")]
 pub(super) unsafe fn multiply(product: &Product<'_>, c: *mut f32, cv: View) {
-    let (m, n, all) = product.sizes;
     PANEL.with_borrow_mut(|panel| {
-        panel.resize(all.min(TERMS) * ACROSS * LANES, 0.0);
-        for top in (0..all).step_by(TERMS) {
-            let later = |view: View, by: usize| View { offset: view.offset + top * by, ..view };
-            let part = Product {
-                sizes: (m, n, (all - top).min(TERMS)),
-                a: (product.a.0, later(product.a.1, product.a.1.col)),
-                b: (product.b.0, later(product.b.1, product.b.1.row)),
-                start: if top == 0 { product.start } else { Start::Kept },
-                ..*product
-            };
-            // SAFETY: as promised by the caller; after the first part the result is initialised.
-            unsafe { add(&part, c, cv, panel) };
-        }
+        panel.resize(product.sizes.2 * ACROSS * LANES, 0.0);
+        // SAFETY: as promised by the caller.
+        unsafe { by_panels(product, c, cv, panel) };
     });
 }
 
-/// One part of the terms.
-///
 /// # Safety
-/// As for [`multiply`].
+/// As for [`multiply`]; the panel has room for k rows of [`ACROSS`] registers.
 #[expect(unsafe_code, reason = "the product works on strided pointers")]
-unsafe fn add(product: &Product<'_>, c: *mut f32, cv: View, panel: &mut [f32]) {
+unsafe fn by_panels(product: &Product<'_>, c: *mut f32, cv: View, panel: &mut [f32]) {
     let (m, n, k) = product.sizes;
     let registers = n.div_ceil(LANES);
     let panels = registers.div_ceil(ACROSS);

@@ -18,7 +18,7 @@
 
 use std::collections::BTreeMap;
 
-use burn::tensor::{Device, Gradients, Tensor};
+use burn::tensor::{Device, Tensor};
 use checkpoint::Blobs;
 use checkpoint::model::{self, Model, Parts};
 use models::diffusion::{Grid, Schedule, TIMESTEPS, affine, unzip};
