@@ -3,6 +3,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::sync::Mutex;
 
 use cluster_tests::Bench;
 
@@ -26,6 +27,9 @@ fn succeeds(command: &mut Command) -> Result<(), String> {
 
 /// A program made available by pip in an environment of the target folder.
 fn validator() -> Option<PathBuf> {
+    /// Tests run side by side, and only one of them makes the environment.
+    static MAKING: Mutex<()> = Mutex::new(());
+    let _making = MAKING.lock();
     let target = std::env::var_os("CARGO_TARGET_DIR").map_or_else(|| Bench::repository().join("target"), PathBuf::from);
     let environment = target.join("kubernetes-python");
     let program = environment.join("bin/kubernetes-validate");

@@ -1,71 +1,18 @@
 //! Matrix products on slices.
 
+mod matrix;
 #[cfg(target_arch = "x86_64")]
 mod wide;
 
-/// A matrix inside a slice: element (i, j) is at `offset + i * row + j * col`.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct View {
-    pub(super) offset: usize,
-    pub(super) row: usize,
-    pub(super) col: usize,
-}
-
-impl View {
-    /// Rows of `width` elements, one after the other.
-    pub(super) fn rows(width: usize) -> Self {
-        Self { offset: 0, row: width, col: 1 }
-    }
-
-    /// The transpose, as a view with row and column strides swapped.
-    pub(super) fn t(self) -> Self {
-        Self { offset: self.offset, row: self.col, col: self.row }
-    }
-
-    fn last(self, rows: usize, cols: usize) -> usize {
-        self.offset + (rows - 1) * self.row + (cols - 1) * self.col
-    }
-}
+use matrix::Product;
+pub(super) use matrix::{Start, View};
 
 /// Terms that are summed before they are added to the result. The general product would divide longer sums than 512 by the
 /// sizes of the processor's caches, so that the bits depended on them. A panel of so many rows stays in the second-level
 /// cache, and shorter sums are more exact.
 const TERMS: usize = 256;
 
-/// A product to which something may be added: `scale a b`, with `a` m x k and `b` k x n.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Product<'a> {
-    /// m, n and k.
-    pub(super) sizes: (usize, usize, usize),
-    pub(super) a: (&'a [f32], View),
-    pub(super) b: (&'a [f32], View),
-    pub(super) scale: f32,
-    pub(super) start: Start<'a>,
-}
-
-/// What a product is added to.
-#[derive(Debug, Clone, Copy)]
-pub(super) enum Start<'a> {
-    /// Nothing; the result's old values are not read.
-    Zero,
-    /// The result's old values.
-    Kept,
-    /// The same row for each row of the result. The product is not scaled.
-    Row(&'a [f32]),
-}
-
 impl Product<'_> {
-    /// # Panics
-    /// If an operand is shorter than its view.
-    fn check(&self) {
-        let (m, n, k) = self.sizes;
-        let [(a, av), (b, bv)] = [self.a, self.b];
-        assert!(k > 0 && av.last(m, k) < a.len() && bv.last(k, n) < b.len(), "matrix out of bounds");
-        if let Start::Row(row) = self.start {
-            assert!(row.len() == n && self.scale == 1.0, "a row for each column");
-        }
-    }
-
     /// The result as rows of n elements.
     ///
     /// # Panics

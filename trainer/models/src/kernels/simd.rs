@@ -297,7 +297,7 @@ impl<const SET: u8> Lanes<SET> {
     /// Splits x into n ln 2 + r and takes a polynomial of degree 7 in r (Taylor, |r| <= ln 2 / 2).
     #[inline(always)]
     pub(super) fn exp(self) -> Self {
-        // 1.5 * 2^23: a number that is added to it is rounded to an integer, which then stands in its lowest bits.
+        // 1.5 * 2^23: a number that is added to it is rounded to an integer. Its lowest bits then hold it.
         const ROUND: f32 = 12_582_912.0;
         const LEAST: f32 = -87.0;
         let by = Self::splat;

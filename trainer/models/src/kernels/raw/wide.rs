@@ -8,7 +8,7 @@ use std::arch::x86_64::{
 };
 use std::cell::RefCell;
 
-use super::{Product, Start, View};
+use super::matrix::{Product, Start, View};
 
 /// Numbers in a register.
 const LANES: usize = 16;
