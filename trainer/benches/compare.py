@@ -385,10 +385,10 @@ def main() -> None:
     parts = []
     if asked.sizes != "published":
         parts.append(
-            f"## The quickstart's size\n\nBy the wall, medians of {asked.rounds} rounds of {asked.seconds:.0f} s; the programs alternate. "
+            f"## The quickstart's size\n\nBy the wall, the median of {asked.rounds} x {asked.seconds:.0f} s; the programs alternate. "
             '"Tuned" is PyTorch with the fastest kernels of MKL and settings of glibc, "stock" as pip installs it. '
             "With two workers PyTorch has the better of two threads and two processes (gloo). "
-            '"Scaling" is the share of what two runs of one worker give together at the same time.\n\n' + small(asked)
+            '"Scaling" compares two workers with two runs of one worker at the same time.\n\n' + small(asked)
         )
         show(*parts)
     if asked.sizes != "quickstart":

@@ -184,7 +184,7 @@ struct Place {
     c_row: usize,
 }
 
-/// R rows of the result, V registers wide, of which `columns` columns exist. Returns R.
+/// R rows of the result, V registers wide; only `columns` columns exist. Returns R.
 ///
 /// # Safety
 /// The processor has AVX-512. `a` has the elements `r a_row + p a_col` for r below R and p below k, `b` k rows of V
