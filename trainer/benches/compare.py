@@ -120,7 +120,7 @@ PUBLISHED = [
     Published("MLD teacher", "configs/motionpcm.yaml", "mld", "denoiser", BENCH),
     Published("LCM", "configs/motionlcm-v2.yaml", "lcm", "lcm", BENCH),
     Published("PCM with discriminator", "configs/motionpcm.yaml", "pcm1", "pcm", BENCH),
-    Published("control", "configs/motionlcm-control.yaml", "control", "control"),
+    Published("control", "configs/motionlcm-control-temporal.yaml", "control", "control"),
     Published("evaluator, movements", "configs/momask-discord.yaml", "evaluator", "movements", KINDS, ["stages.evaluator.movement.until={all_but_one}"]),
     Published("evaluator, matching", "configs/momask-discord.yaml", "evaluator", "matching", KINDS, ["stages.evaluator.movement.until={one}"]),
     Published("MDM", "configs/free-mdm.yaml", "mdm", "mdm"),

@@ -13,7 +13,6 @@
 //! | `{{... :N}}` | with N decimals, 3 otherwise |
 //! | `{{set STAGE PATH}}` | a setting |
 //! | `{{... METRIC}}` | a space in the metric's name is written `_` |
-//! | `{{core minutes}}` | the total time of all stages, one after the other |
 
 use registry::leaderboard::Measure;
 use serde_json::Value;
@@ -95,7 +94,6 @@ fn fill(place: &str, source: &Source) -> Result<String, String> {
     words.drain(..usize::from(form.is_some()));
     let number = match words[..] {
         ["set", stage, path] => return setting(source, stage, path),
-        ["core", "minutes"] => Number::once(core_minutes(source), None),
         [stage, metric] => value(source, stage, metric)?,
         [a, of_a, "/", b, of_b] => paired(source, (a, of_a), (b, of_b), |a, b| a / b)?,
         [a, of_a, "-", b, of_b] => paired(source, (a, of_a), (b, of_b), |a, b| a - b)?,
@@ -127,11 +125,6 @@ fn setting(source: &Source, stage: &str, path: &str) -> Result<String, String> {
         Some(value) => Ok(value.to_string()),
         None => Err(format!("`{stage}` has no setting `{path}`")),
     }
-}
-
-fn core_minutes(source: &Source) -> f64 {
-    let stages = source.run["stages"].as_array().into_iter().flatten();
-    stages.filter_map(|stage| stage["wall_s"].as_f64()).sum::<f64>() / 60.0
 }
 
 /// The metrics of the stages that match `name`, each with the part that its `*` matches.
@@ -206,10 +199,10 @@ mod tests {
 
     fn source() -> Source {
         let run = json!({"stages": [
-            {"name": "a_1", "wall_s": 60.0, "metrics": {"fid": 1.0, "fid.lower": 0.5, "fid.upper": 1.5, "x": 4.3448}},
-            {"name": "a_2", "wall_s": 60.0, "metrics": {"fid": 3.0, "x": 1.0, "x_sd": 0.25}},
-            {"name": "b_1", "wall_s": 30.0, "metrics": {"fid": 2.0}},
-            {"name": "b_2", "wall_s": 0.0, "metrics": {"fid": 3.0}},
+            {"name": "a_1", "metrics": {"fid": 1.0, "fid.lower": 0.5, "fid.upper": 1.5, "x": 4.3448}},
+            {"name": "a_2", "metrics": {"fid": 3.0, "x": 1.0, "x_sd": 0.25}},
+            {"name": "b_1", "metrics": {"fid": 2.0}},
+            {"name": "b_2", "metrics": {"fid": 3.0}},
             {"name": "other", "metrics": {"fid": 9.0, "share/left hand": 0.75}},
             {"name": "far_1", "metrics": {"fid": 9.0}},
             {"name": "far_2", "metrics": {"fid": 11.25}},
@@ -233,7 +226,6 @@ mod tests {
         assert_eq!(filled("{{verdict a_* fid - far_* fid}}").unwrap(), "lower");
         assert_eq!(filled("{{verdict a_* fid - b_* fid}}").unwrap(), "no difference shown");
         assert_eq!(filled("{{set a_1 steps}} of {{set a_1 batch.global}}").unwrap(), "12 of 8");
-        assert_eq!(filled("{{core minutes :1}}").unwrap(), "2.5");
         for (place, part) in [
             ("one\n{{c fid}}", "line 2: `{{c fid}}`: `{{c fid}}`: no stage `c`"),
             ("{{a_1 fdi}}", "`a_1` has no `fdi`"),
