@@ -374,30 +374,33 @@ def main() -> None:
         f"The load before was {before:.1f}.\n\n"
     )
 
-    def show(*parts: str) -> None:
+    def page(*parts: str) -> str:
+        return head + "\n\n".join(parts) + "\n"
+
+    def save(*parts: str) -> None:
         """Writes what is known so far, since all of it takes hours."""
-        text = head + "\n\n".join(parts) + "\n"
         if asked.write:
-            asked.write.write_text(text)
-        else:
-            print(text)
+            asked.write.write_text(page(*parts))
 
     parts = []
     if asked.sizes != "published":
         parts.append(
             f"## The quickstart's size\n\nBy the wall, the median of {asked.rounds} x {asked.seconds:.0f} s; the programs alternate. "
             '"Tuned" is PyTorch with the fastest kernels of MKL and settings of glibc, "stock" as pip installs it. '
-            "With two workers PyTorch has the better of two threads and two processes (gloo). "
+            "Beside two workers, PyTorch has the better of two threads and two processes (gloo). "
             '"Scaling" compares two workers with two runs of one worker at the same time.\n\n' + small(asked)
         )
-        show(*parts)
+        save(*parts)
     if asked.sizes != "quickstart":
         what = (
             "## Published widths\n\nOne worker and one thread, an update of eight examples in one slice. "
             "Memory is the largest resident set of a process.\n\n"
         )
+        rows = ""
         for rows in published(asked.rounds):
-            show(*parts, what + rows)
+            save(*parts, what + rows)
+        parts.append(what + rows)
+    print(page(*parts))
 
 
 if __name__ == "__main__":

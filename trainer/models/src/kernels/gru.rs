@@ -1,7 +1,7 @@
 //! One direction of a layer of gated recurrent units over ragged sequences (Cho et al., arXiv:1406.1078, in PyTorch's
 //! form).
 //!
-//! `r = s(a_r + u_r)`, `z = s(a_z + u_z)`, `n = tanh::<SET>(a_n + r u_n)`, `h' = (1 - z) n + z h`. `a` is the input's part of
+//! `r = s(a_r + u_r)`, `z = s(a_z + u_z)`, `n = tanh(a_n + r u_n)`, `h' = (1 - z) n + z h`. `a` is the input's part of
 //! the gates and `u = h U^T + c` the state's part. A token past a sequence's end leaves the state unchanged. So the
 //! forward direction stops at a sequence's own last token and the backward direction starts there.
 //!

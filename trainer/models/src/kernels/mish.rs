@@ -53,7 +53,7 @@ multiversion! {
 /// tanh(softplus(x)) is `top / (top + rest)`, without overflow.
 #[cfg(feature = "flex")]
 struct Parts<const SET: u8> {
-    /// e^-|x|.
+    /// The exponential of `-|x|`.
     e: Lanes<SET>,
     top: Lanes<SET>,
     rest: Lanes<SET>,

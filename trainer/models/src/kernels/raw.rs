@@ -37,7 +37,7 @@ impl Product<'_> {
     ///
     /// # Panics
     /// If an operand or `c` is shorter than its view.
-    pub(super) fn into(self, c: &mut [f32], cv: View) {
+    pub(super) fn write_to(self, c: &mut [f32], cv: View) {
         let (m, n, _) = self.sizes;
         if m == 0 || n == 0 {
             return;
@@ -143,7 +143,7 @@ pub(super) fn matmul(
     start: Start<'_>,
     scale: f32,
 ) {
-    Product { sizes, a: (a, av), b: (b, bv), scale, start }.into(c, cv);
+    Product { sizes, a: (a, av), b: (b, bv), scale, start }.write_to(c, cv);
 }
 
 /// `a b` with `row` added to each row of the result, as rows of n elements.
@@ -188,7 +188,7 @@ mod tests {
                         let at = cv.offset + i * cv.row + j;
                         near(kept[at], 0.5 * exact(i, j) + f64::from(old[at]), "added");
                     }
-                    // What lies between the rows of the result stays.
+                    // Values between the rows of the result stay.
                     for at in cv.offset + i * cv.row + n..((i + 1) * cv.row).min(old.len()) {
                         assert_eq!(kept[at], old[at], "{sizes:?}: beside row {i}");
                     }

@@ -1,7 +1,7 @@
 //! Loops compiled for several instruction sets; the best one of the processor is selected at run time.
 //!
-//! The bodies are plain loops that the compiler vectorises. The choice never changes on one machine, and neither do the
-//! bits. Another instruction set may contract multiply-adds differently, so all workers of a gang must have the same
+//! Bodies use [`Lanes`], or plain loops over slices, which the compiler vectorises. The choice never changes on one machine,
+//! and neither do the bits. Another instruction set may contract multiply-adds differently, so all workers of a gang must have the same
 //! one (`crate::instruction_set`).
 
 /// Instruction sets for which the bodies are compiled, as numbers so that a body can have one as a parameter.
@@ -262,16 +262,17 @@ impl<const SET: u8> Lanes<SET> {
         lanewise!(_mm256_fmadd_ps, |x, y, z| mul_add::<SET>(x, y, z), self, b, c)
     }
 
-    /// The smaller number of each lane.
+    /// The smaller number of each lane. NaN stays NaN in `self`; in `other` it is left out.
     #[inline(always)]
     pub(super) fn min(self, other: Self) -> Self {
-        lanewise!(_mm256_min_ps, |x, y| if x < y { x } else { y }, self, other)
+        // The instruction returns its second operand if one of them is NaN.
+        lanewise!((|x, y| _mm256_min_ps(y, x)), |x, y| if y < x { y } else { x }, self, other)
     }
 
-    /// The larger number of each lane.
+    /// The larger number of each lane. NaN stays NaN in `self`; in `other` it is left out.
     #[inline(always)]
     pub(super) fn max(self, other: Self) -> Self {
-        lanewise!(_mm256_max_ps, |x, y| if x > y { x } else { y }, self, other)
+        lanewise!((|x, y| _mm256_max_ps(y, x)), |x, y| if y > x { y } else { x }, self, other)
     }
 
     /// The numbers without their signs.
@@ -280,19 +281,19 @@ impl<const SET: u8> Lanes<SET> {
         self.max(Self::splat(0.0) - self)
     }
 
-    /// `negative` where the sign is that of a negative number, `positive` elsewhere.
+    /// `negative` where the number is below 0, `other` elsewhere and for NaN.
     #[inline(always)]
-    pub(super) fn by_sign(self, negative: Self, positive: Self) -> Self {
+    pub(super) fn by_sign(self, negative: Self, other: Self) -> Self {
         lanewise!(
-            (|sign, a, b| _mm256_blendv_ps(b, a, sign)),
-            |sign, a, b| if sign.is_sign_negative() { a } else { b },
+            (|x, a, b| _mm256_blendv_ps(b, a, _mm256_cmp_ps::<_CMP_LT_OQ>(x, _mm256_setzero_ps()))),
+            |x, a, b| if x < 0.0 { a } else { b },
             self,
             negative,
-            positive
+            other
         )
     }
 
-    /// e^x for x <= 0, within 2 units in the last place; 0 below -87.
+    /// e^x for x <= 0, within 2 units in the last place; 0 below -87, NaN for NaN.
     ///
     /// Splits x into n ln 2 + r and takes a polynomial of degree 7 in r (Taylor, |r| <= ln 2 / 2).
     #[inline(always)]
@@ -436,6 +437,13 @@ mod tests {
                 assert!((f64::from(found) - exact).abs() <= 4e-7 * exact, "exp({x})");
             }
             assert_eq!(one::<SET>(-200.0, Lanes::exp), 0.0);
+            assert_eq!(one::<SET>(f32::NEG_INFINITY, Lanes::exp), 0.0);
+            // A hidden NaN would let a broken training continue.
+            for nan in [f32::NAN, -f32::NAN] {
+                for function in [Lanes::exp, Lanes::logistic, Lanes::erf, Lanes::abs] {
+                    assert!(one::<SET>(nan, function).is_nan());
+                }
+            }
             // Abramowitz and Stegun, table 7.1.
             for (x, y) in [
                 (0.0, 0.0),

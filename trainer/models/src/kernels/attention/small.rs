@@ -168,7 +168,7 @@ multiversion! {
                 row[..key].fill(HIDDEN);
             }
         }
-        // Cells of one register: those of a row of keys stand side by side.
+        // Cells of one register; those of one key are side by side.
         let cells = weights.as_chunks_mut::<LANES>().0;
         let across = lanes / LANES;
         for column in 0..across {

@@ -1,4 +1,4 @@
-//! What a matrix product is of.
+//! The operands of a matrix product, and where they lie in memory. Not its job: computing it.
 
 /// A matrix inside a slice: element (i, j) is at `offset + i * row + j * col`.
 #[derive(Debug, Clone, Copy)]
@@ -35,7 +35,7 @@ pub(in crate::kernels) struct Product<'a> {
     pub(in crate::kernels) start: Start<'a>,
 }
 
-/// What a product is added to.
+/// The values to which a product is added.
 #[derive(Debug, Clone, Copy)]
 pub(in crate::kernels) enum Start<'a> {
     /// Nothing; the result's old values are not read.

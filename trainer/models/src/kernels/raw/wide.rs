@@ -187,8 +187,8 @@ struct Place {
 /// R rows of the result, V registers wide; only `columns` columns exist. Returns R.
 ///
 /// # Safety
-/// The processor has AVX-512. `a` has the elements `r a_row + p a_col` for r below R and p below k, `b` k rows of V
-/// registers from each `p b_row` on, and `c` `columns` elements from each `r c_row` on.
+/// The processor has AVX-512. `a` has the elements `r a_row + p a_col` for r below R and p below k. `b` has V registers
+/// from each `p b_row` on. `c` has `columns` elements from each `r c_row` on.
 #[expect(unsafe_code, reason = "the callers check the extents")]
 #[inline]
 #[target_feature(enable = "avx512f,avx512vl,avx512bw,avx512dq,avx2,fma")]
