@@ -290,7 +290,7 @@ fn report(view: &RunView, whys: &Whys, pipeline: &Pipeline, end: &End, options: 
         }
         End::Interrupted { .. } if !view.state.is_final() => {
             let killed = matches!(end, End::Interrupted { killed: true });
-            let saved = if killed { "Ended; the latest checkpoints are kept." } else { "Stopped; all work is saved." };
+            let saved = if killed { "Ended; the latest checkpoints are kept." } else { "Stopped; saved work is kept." };
             print::note(&format!("\n{saved} To continue:\n  {}", options.command));
             return exit::INTERRUPTED;
         }

@@ -25,84 +25,77 @@ pub(super) fn forward(attend: &Attend, packed: &Packed<'_>, keep: bool) -> (Vec<
     let lanes = s.queries.next_multiple_of(LANES);
     let mut out = Vec::with_capacity(s.batch * s.queries * s.width);
     let kept = (0..s.batch).map(|b| attend.valid(b)).sum::<usize>() * s.heads * lanes;
-    let mut weights = Vec::with_capacity(if keep { kept } else { 0 });
+    let mut weights = Vec::with_capacity(if keep { kept } else { s.keys * lanes });
     let mut scratch = Scratch::new(s);
     for b in 0..s.batch {
+        let valid = attend.valid(b);
+        let to = grow(&mut out, s.queries * s.width);
         for h in 0..s.heads {
-            let valid = attend.valid(b);
-            head_forward(s, packed, (b, h), valid, &mut scratch);
-            if keep {
-                weights.extend_from_slice(&scratch.weights[..valid * lanes]);
+            if !keep {
+                weights.clear();
             }
-            let dropped = dropped(attend, (b, h), valid, &mut scratch);
-            head_out(s, packed, (b, h), valid, dropped, &mut scratch);
+            let weights = grow(&mut weights, valid * lanes);
+            head_forward(s, packed, (b, h), valid, weights, &mut scratch);
+            let dropped = dropped(attend, (b, h), valid, weights, &mut scratch);
+            let values = if dropped { scratch.dropped.as_slice() } else { &*weights };
+            head_out(s, packed, (b, h), valid, values, to);
         }
-        out.extend_from_slice(&scratch.out);
     }
-    (out, weights)
+    (out, if keep { weights } else { Vec::new() })
 }
 
-/// The gradients of queries, and of keys and values. The first holds all of them if they lie in one tensor.
+/// Appends `count` zeros and returns them.
+fn grow(to: &mut Vec<f32>, count: usize) -> &mut [f32] {
+    let from = to.len();
+    to.resize(from + count, 0.0);
+    &mut to[from..]
+}
+
+/// The gradients of queries, and of keys and values. The first holds all of them if they lie in one tensor. Keys of
+/// padding have the gradient 0.
 pub(super) fn backward(attend: &Attend, packed: &Packed<'_>, weights: &[f32], dout: &[f32]) -> (Vec<f32>, Vec<f32>) {
     let s = attend.sizes;
     let lanes = s.queries.next_multiple_of(LANES);
     let mut dq = Vec::with_capacity(packed.q.len());
     let mut dkv = Vec::with_capacity(if packed.is_own() { 0 } else { packed.kv.len() });
     let mut scratch = Scratch::new(s);
-    // Gradients of one sequence.
-    let mut own_q = vec![0.0; s.queries * packed.q_row];
-    let mut own_kv = vec![0.0; if packed.is_own() { 0 } else { s.keys * packed.kv_row }];
-    let mut at = 0;
+    let mut rest = weights;
     for b in 0..s.batch {
         let valid = attend.valid(b);
-        if valid < s.keys {
-            // Keys of padding have no gradient, and a longer sequence may have left one.
-            if packed.is_own() { &mut own_q } else { &mut own_kv }.fill(0.0);
-        }
+        let to_q = grow(&mut dq, s.queries * packed.q_row);
+        let to_kv = grow(&mut dkv, if packed.is_own() { 0 } else { s.keys * packed.kv_row });
         for h in 0..s.heads {
-            scratch.weights[..valid * lanes].copy_from_slice(&weights[at..at + valid * lanes]);
-            at += valid * lanes;
+            let (weights, later) = rest.split_at(valid * lanes);
+            rest = later;
             head_scores(s, packed, (b, h), valid, dout, &mut scratch);
-            let has_dropout = dropped(attend, (b, h), valid, &mut scratch);
-            head_softmax(s, valid, has_dropout, &mut scratch);
-            head_queries(s, packed, (b, h), valid, &scratch, &mut own_q);
-            let to = if packed.is_own() { &mut own_q } else { &mut own_kv };
-            head_keys_values(s, packed, (b, h), valid, dout, has_dropout, &scratch, to);
+            let has_dropout = dropped(attend, (b, h), valid, weights, &mut scratch);
+            head_softmax(s, valid, weights, has_dropout, &mut scratch);
+            head_queries(s, packed, (b, h), valid, &scratch, to_q);
+            let to = if packed.is_own() { &mut *to_q } else { &mut *to_kv };
+            let weights = if has_dropout { scratch.dropped.as_slice() } else { weights };
+            head_keys_values(s, packed, (b, h), valid, dout, weights, &scratch, to);
         }
-        dq.extend_from_slice(&own_q);
-        dkv.extend_from_slice(&own_kv);
     }
     (dq, dkv)
 }
 
-/// Memory of one head at a time, and the output of one sequence.
+/// Memory of one head at a time. Tables are [K, Q rounded up].
 struct Scratch {
     /// Queries, or gradients of the output, by column.
     turned: Vec<f32>,
-    /// Softmax weights [K, Q rounded up].
-    weights: Vec<f32>,
-    /// Weights after dropout.
+    /// Softmax weights after dropout.
     dropped: Vec<f32>,
     /// Factors of dropout.
     factors: Vec<f32>,
     /// Gradients of the scores.
     scores: Vec<f32>,
-    /// [Q, H].
-    out: Vec<f32>,
 }
 
 impl Scratch {
     fn new(s: Sizes) -> Self {
         let lanes = s.queries.next_multiple_of(LANES);
         let table = || vec![0.0; s.keys * lanes];
-        Self {
-            turned: vec![0.0; s.head() * lanes],
-            weights: table(),
-            dropped: table(),
-            factors: table(),
-            scores: table(),
-            out: vec![0.0; s.queries * s.width],
-        }
+        Self { turned: vec![0.0; s.head() * lanes], dropped: table(), factors: table(), scores: table() }
     }
 }
 
@@ -129,20 +122,20 @@ impl Places {
 }
 
 /// Fills the factors and the dropped weights of a head if there is dropout.
-fn dropped(attend: &Attend, (b, h): (usize, usize), valid: usize, scratch: &mut Scratch) -> bool {
+fn dropped(attend: &Attend, (b, h): (usize, usize), valid: usize, weights: &[f32], scratch: &mut Scratch) -> bool {
     let Some(factors) = attend.dropout else { return false };
     let s = attend.sizes;
     // The place of a weight is that in [B, heads, Q, K].
-    drop_weights(s, factors, (b * s.heads + h) * s.queries * s.keys, valid, scratch);
+    drop_weights(s, factors, (b * s.heads + h) * s.queries * s.keys, valid, weights, scratch);
     true
 }
 
 multiversion! {
-    fn drop_weights(s: Sizes, factors: Factors, base: usize, valid: usize, scratch: &mut Scratch) {
+    fn drop_weights(s: Sizes, factors: Factors, base: usize, valid: usize, weights: &[f32], scratch: &mut Scratch) {
         let lanes = s.queries.next_multiple_of(LANES);
         for j in 0..valid {
             let row = j * lanes..j * lanes + s.queries;
-            let weights = &scratch.weights[row.clone()];
+            let weights = &weights[row.clone()];
             let dropped = &mut scratch.dropped[row.clone()];
             let kept = &mut scratch.factors[row];
             for i in 0..s.queries {
@@ -156,13 +149,12 @@ multiversion! {
 
 multiversion! {
     /// The softmax weights of a head.
-    fn head_forward<const SET>(s: Sizes, packed: &Packed<'_>, place: (usize, usize), valid: usize, scratch: &mut Scratch) {
+    fn head_forward<const SET>(s: Sizes, packed: &Packed<'_>, place: (usize, usize), valid: usize, weights: &mut [f32], scratch: &mut Scratch) {
         let at = Places::of(s, packed, place);
         let lanes = s.queries.next_multiple_of(LANES);
         transpose(&packed.q[at.q..], packed.q_row, (s.queries, s.head()), s.scale(), &mut scratch.turned);
         let keys = Left { values: &packed.kv[at.k..], row: packed.kv_row, col: 1 };
-        let weights = &mut scratch.weights[..valid * lanes];
-        multiply::<SET>((valid, lanes, s.head()), keys, (&scratch.turned, lanes), (weights, lanes));
+        multiply::<SET>((valid, lanes, s.head()), keys, (&scratch.turned, lanes), (&mut *weights, lanes));
         if s.causal {
             for (key, row) in weights.chunks_exact_mut(lanes).enumerate() {
                 row[..key].fill(HIDDEN);
@@ -192,13 +184,12 @@ multiversion! {
 }
 
 multiversion! {
-    /// The output of a head.
-    fn head_out<const SET>(s: Sizes, packed: &Packed<'_>, place: (usize, usize), valid: usize, dropped: bool, scratch: &mut Scratch) {
+    /// The output of a head, into that of its sequence.
+    fn head_out<const SET>(s: Sizes, packed: &Packed<'_>, place: (usize, usize), valid: usize, weights: &[f32], to: &mut [f32]) {
         let at = Places::of(s, packed, place);
         let lanes = s.queries.next_multiple_of(LANES);
-        let values = if dropped { &scratch.dropped } else { &scratch.weights };
-        let weights = Left { values, row: 1, col: lanes };
-        let to = &mut scratch.out[place.1 * s.head()..];
+        let weights = Left { values: weights, row: 1, col: lanes };
+        let to = &mut to[place.1 * s.head()..];
         multiply::<SET>((s.queries, s.head(), valid), weights, (&packed.kv[at.v..], packed.kv_row), (to, s.width));
     }
 }
@@ -216,9 +207,8 @@ multiversion! {
 
 multiversion! {
     /// `ds = scale p (dp - sum(dp p))`, in place of the gradients of the weights.
-    fn head_softmax<const SET>(s: Sizes, valid: usize, dropped: bool, scratch: &mut Scratch) {
+    fn head_softmax<const SET>(s: Sizes, valid: usize, weights: &[f32], dropped: bool, scratch: &mut Scratch) {
         let lanes = s.queries.next_multiple_of(LANES);
-        let weights = &scratch.weights[..valid * lanes];
         let scores = &mut scratch.scores[..valid * lanes];
         if dropped {
             for (score, factor) in scores.iter_mut().zip(&scratch.factors) {
@@ -255,7 +245,7 @@ multiversion! {
 
 multiversion! {
     /// The gradients of a head's keys and values.
-    fn head_keys_values<const SET>(s: Sizes, packed: &Packed<'_>, place: (usize, usize), valid: usize, dout: &[f32], dropped: bool, scratch: &Scratch, to: &mut [f32]) {
+    fn head_keys_values<const SET>(s: Sizes, packed: &Packed<'_>, place: (usize, usize), valid: usize, dout: &[f32], weights: &[f32], scratch: &Scratch, to: &mut [f32]) {
         let at = Places::of(s, packed, place);
         let lanes = s.queries.next_multiple_of(LANES);
         let by_key = |values| Left { values, row: lanes, col: 1 };
@@ -263,7 +253,6 @@ multiversion! {
         let column = place.1 * s.head();
         let keys = &mut to[packed.k_at + column..];
         multiply::<SET>(sizes, by_key(&scratch.scores), (&packed.q[at.q..], packed.q_row), (keys, packed.kv_row));
-        let weights = if dropped { &scratch.dropped } else { &scratch.weights };
         let values = &mut to[packed.v_at + column..];
         multiply::<SET>(sizes, by_key(weights), (&dout[at.out..], s.width), (values, packed.kv_row));
     }

@@ -24,9 +24,14 @@ pub(super) fn fits(product: &Product<'_>) -> bool {
     crate::kernels::simd::has_wide() && m >= LEAST_ROWS && n >= LANES && (right.col == 1 || right.row == 1)
 }
 
+/// A register's numbers in one line of the caches.
+#[derive(Clone, Copy)]
+#[repr(C, align(64))]
+struct Line([f32; LANES]);
+
 thread_local! {
     /// The packed panel.
-    static PANEL: RefCell<Vec<f32>> = const { RefCell::new(Vec::new()) };
+    static PANEL: RefCell<Vec<Line>> = const { RefCell::new(Vec::new()) };
 }
 
 /// Computes the product into `c`, whose rows are contiguous.
@@ -37,9 +42,13 @@ thread_local! {
 #[expect(unsafe_code, reason = "the product works on strided pointers")]
 pub(super) unsafe fn multiply(product: &Product<'_>, c: *mut f32, cv: View) {
     PANEL.with_borrow_mut(|panel| {
-        panel.resize(product.sizes.2 * ACROSS * LANES, 0.0);
-        // SAFETY: as promised by the caller.
-        unsafe { by_panels(product, c, cv, panel) };
+        panel.resize(product.sizes.2 * ACROSS, Line([0.0; LANES]));
+        let count = panel.len() * LANES;
+        // SAFETY: a line is nothing but its numbers; the rest is as promised by the caller.
+        unsafe {
+            let panel = std::slice::from_raw_parts_mut(panel.as_mut_ptr().cast::<f32>(), count);
+            by_panels(product, c, cv, panel);
+        }
     });
 }
 
@@ -60,7 +69,7 @@ unsafe fn by_panels(product: &Product<'_>, c: *mut f32, cv: View, panel: &mut [f
         // and the rest is as promised by the caller.
         unsafe {
             let (b, view) = product.b;
-            let right = if lies_well(view, columns) {
+            let right = if lies_well(b, view, from, columns) {
                 (b.as_ptr().add(view.offset + from), view.row)
             } else {
                 pack(product.b, (k, columns), from, across * LANES, panel);
@@ -78,12 +87,14 @@ unsafe fn by_panels(product: &Product<'_>, c: *mut f32, cv: View, panel: &mut [f
     }
 }
 
-/// Returns true if columns of the right operand may be read where they lie: whole registers, whose rows do not fall on the
-/// same few lines of a cache.
-fn lies_well(view: View, columns: usize) -> bool {
+/// Returns true if columns of the right operand from column `from` on may be read where they lie: whole lines of the cache,
+/// in rows that do not fall on the same few lines.
+fn lies_well(b: &[f32], view: View, from: usize, columns: usize) -> bool {
     /// Distances of rows that are multiples of it share the lines of a cache.
     const CONFLICT: usize = 256;
-    view.col == 1 && columns.is_multiple_of(LANES) && !view.row.is_multiple_of(CONFLICT)
+    let is_whole = |elements: usize| elements.is_multiple_of(LANES);
+    let begins_line = b.as_ptr().wrapping_add(view.offset + from).cast::<Line>().is_aligned();
+    view.col == 1 && begins_line && is_whole(columns) && is_whole(view.row) && !view.row.is_multiple_of(CONFLICT)
 }
 
 /// Copies `columns` columns of the right operand from column `from` on into rows of `width`, with zeros behind them.
