@@ -209,6 +209,19 @@ mod tests {
     }
 
     #[test]
+    fn bits_do_not_depend_on_the_place_in_memory() {
+        let sizes @ (_, n, k) = (20, 96, 40);
+        let (a, b) = (wave(20 * k), wave(n * k));
+        let bits = |ahead: usize| {
+            let padded: Vec<f32> = std::iter::repeat_n(0.0, ahead).chain(b.iter().copied()).collect();
+            let view = View { offset: ahead, ..View::rows(n) };
+            product(sizes, &a, View::rows(k), &padded, view)
+        };
+        // One of sixteen places in a row begins a line of the cache.
+        assert!((1..16).all(|ahead| bits(ahead) == bits(0)));
+    }
+
+    #[test]
     #[should_panic(expected = "matrix out of bounds")]
     fn an_operand_that_is_too_short_is_refused() {
         product((8, 16, 4), &wave(8 * 4), View::rows(4), &wave(4 * 16 - 1), View::rows(16));

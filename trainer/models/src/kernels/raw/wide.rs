@@ -87,8 +87,8 @@ unsafe fn by_panels(product: &Product<'_>, c: *mut f32, cv: View, panel: &mut [f
     }
 }
 
-/// Returns true if columns of the right operand from column `from` on may be read where they lie: whole lines of the cache,
-/// in rows that do not fall on the same few lines.
+/// Returns true if `columns` columns of the right operand from `from` on may be read where they lie. They are then whole
+/// lines of the cache, and their rows do not share a few lines.
 fn lies_well(b: &[f32], view: View, from: usize, columns: usize) -> bool {
     /// Distances of rows that are multiples of it share the lines of a cache.
     const CONFLICT: usize = 256;
