@@ -18,9 +18,10 @@ fn other() -> String {
     std::env::var("STRIDE_TEST_BACKEND").unwrap_or_else(|_| "ndarray".to_owned())
 }
 
-/// Time limit of a run. Software Vulkan compiles and tunes kernels for minutes before a kind's first step.
+/// Time limit of a run. Software Vulkan compiles and tunes kernels for minutes before a kind's first step. The ndarray
+/// backend is not optimised in test builds, and a slow machine needs minutes for it.
 fn patience() -> Duration {
-    PATIENCE * if std::env::var_os("STRIDE_TEST_BACKEND").is_some() { 24 } else { 1 }
+    PATIENCE * if std::env::var_os("STRIDE_TEST_BACKEND").is_some() { 24 } else { 3 }
 }
 
 fn config() -> std::path::PathBuf {
@@ -46,8 +47,10 @@ fn kinds(view: &Value) -> Vec<(String, String)> {
 
 #[test]
 fn every_kind_trains_on_another_backend_as_on_flex() {
-    let (flex, run_on_flex, view) = run("flex", &[]);
-    let (there, run_there, _) = run(&other(), &[]);
+    // Half of the batch of kinds.yaml. The convolutions of this kind are most of the time on ndarray.
+    let sets = ["--set", "stages.stablemofusion.batch.global=3"];
+    let (flex, run_on_flex, view) = run("flex", &sets);
+    let (there, run_there, _) = run(&other(), &sets);
     let mut tried = BTreeSet::new();
     let mut all_off = Vec::new();
     for (stage, kind) in kinds(&view) {
