@@ -33,6 +33,16 @@ pub(crate) fn until_ended<T>(
     until(held, what, |_| false, call)
 }
 
+/// Like [`until_ended`], and gives up a call that fails once `is_over`.
+pub(crate) fn until_over<T>(
+    held: &ActiveAssignment,
+    what: &str,
+    is_over: impl Fn() -> bool,
+    call: impl FnMut(&Credential) -> Result<T, CallError>,
+) -> Result<T, GaveUp> {
+    until(held, what, |_| is_over(), call)
+}
+
 /// Like [`until_ended`], for a part of a checkpoint. If the checkpoint may be saved later, a part that cannot be stored
 /// now is put off.
 pub(crate) fn until_put_off<T>(

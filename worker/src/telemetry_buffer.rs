@@ -192,6 +192,7 @@ impl TelemetryBuffer {
                 Ok(true) => continue,
                 Ok(false) => {}
                 Err(GaveUp::Ended(_)) => return,
+                Err(GaveUp::Answer(_)) if self.closing.load(Ordering::SeqCst) => return,
                 Err(GaveUp::Answer(error)) => {
                     tracing::error!("metrics or logs were refused: {error}");
                     lock(&self.state).failed = Some(error);
@@ -219,6 +220,7 @@ impl TelemetryBuffer {
 
     /// Sends one batch of rows and one of lines. Returns true if there may be more.
     fn send(&self) -> Result<bool, GaveUp> {
+        let closing = || self.closing.load(Ordering::SeqCst);
         let (rows, lines) = {
             let state = lock(&self.state);
             let rows: Vec<_> = match self.held.leads() {
@@ -240,7 +242,7 @@ impl TelemetryBuffer {
             (rows, lines)
         };
         if !rows.is_empty() {
-            let sent = retry::until_ended(&self.held, "sending metrics", |credential| {
+            let sent = retry::until_over(&self.held, "sending metrics", closing, |credential| {
                 let batch = MetricBatch { grant: credential.grant.clone(), rows: rows.clone() };
                 self.client.wait(self.client.tell("/v1/metrics", credential, &batch))
             });
@@ -254,7 +256,7 @@ impl TelemetryBuffer {
             }
         }
         if let Some((first, _)) = lines.first() {
-            let sent = retry::until_ended(&self.held, "sending logs", |credential| {
+            let sent = retry::until_over(&self.held, "sending logs", closing, |credential| {
                 let lines = lines.iter().map(|(_, line)| line.clone()).collect();
                 let batch = LogBatch { grant: credential.grant.clone(), first: *first, lines };
                 self.client.wait(self.client.tell("/v1/logs", credential, &batch))

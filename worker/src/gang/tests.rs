@@ -16,7 +16,7 @@ use std::time::{Duration, Instant};
 use proptest::prelude::*;
 use protocol::message::{LossCause, LostPeer, Member};
 use protocol::{Generation, Incarnation, TaskId, WorkerId};
-use stages::context::{Adopted, ContextError, Exchange, GangContext, Rendezvous};
+use stages::context::{Adopted, AttemptContext as _, ContextError, Exchange, GangContext, Rendezvous};
 use tokio::runtime::Runtime;
 
 use super::endpoint::Endpoint;
@@ -349,6 +349,23 @@ fn joiners_take_the_state_of_a_peer() {
         }
     });
     assert!(adopted.load(Ordering::SeqCst) >= 10, "joiners began where the first member was");
+}
+
+/// No coordinator answers here, so a line is never stored.
+#[test]
+fn a_context_ends_though_its_lines_cannot_be_stored() {
+    let gang = Gang::new(1, QUICK);
+    gang.regroup(&[0], false);
+    let mut context = gang.context(0);
+    context.log("a line");
+    // Longer than the sender waits before its first try.
+    thread::sleep(Duration::from_secs(1));
+    let (ended, ends) = std::sync::mpsc::channel();
+    thread::spawn(move || {
+        drop(context);
+        let _ = ended.send(());
+    });
+    ends.recv_timeout(Duration::from_secs(10)).expect("the context ends");
 }
 
 #[test]

@@ -165,10 +165,10 @@ fn members_at_different_steps_or_with_other_slices_add_nothing_up() {
                 .collect();
             threads.into_iter().map(|thread| thread.join().expect("no panic")).collect()
         });
-        for sum in sums {
-            // At the first frame, before anything is added.
-            assert!(matches!(&sum, Err(Halt::Disagree(why)) if why.contains("is at step")), "{sum:?}");
-        }
+        // At the first frame, before anything is added. A member whose peer finds out first may lose it before that frame.
+        let disagrees = |sum: &_| matches!(sum, Err(Halt::Disagree(why)) if why.contains("is at step"));
+        assert!(sums.iter().all(|sum| disagrees(sum) || matches!(sum, Err(Halt::Peer))), "{sums:?}");
+        assert!(sums.iter().any(disagrees), "{sums:?}");
         for mesh in meshes {
             mesh.close(None);
         }
