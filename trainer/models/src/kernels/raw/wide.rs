@@ -183,7 +183,7 @@ unsafe fn rows<const R: usize, const V: usize>(
     }
 }
 
-/// Where the operands and the result of a block begin.
+/// Addresses of the operands and of the result of a block.
 #[derive(Clone, Copy)]
 struct Place {
     a: *const f32,
