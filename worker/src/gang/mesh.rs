@@ -279,8 +279,7 @@ impl Mesh {
         Ok(link.is_local && !self.uses_no_memory.load(Ordering::SeqCst))
     }
 
-    /// Waits for a link to `rank` and sends over it. `interrupt` returns a reason to give up, and is asked before each
-    /// frame: what is sent after an order to regroup only delays the next generation.
+    /// Waits for a link to `rank` and sends over it. `interrupt` returns a reason to give up.
     pub(crate) fn send(
         &self,
         rank: usize,
@@ -289,9 +288,6 @@ impl Mesh {
         payload: &[u8],
         interrupt: &dyn Fn() -> Option<Halt>,
     ) -> Result<(), Halt> {
-        if let Some(halt) = interrupt() {
-            return Err(halt);
-        }
         let link = self.wait(rank, barrier, interrupt, |peer| {
             let link = peer.link.clone()?;
             // Nothing else is sent before the peer has come to this generation.
