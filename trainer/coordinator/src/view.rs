@@ -308,7 +308,10 @@ impl State {
                 let idle = execution.state == ExecutionState::Open && !execution.is_busy();
                 match of(task) {
                     // Work continues at its checkpoint, which can be before or after the last report.
-                    Some(heard) if idle && saved.total > 0 => Progress { metrics: heard.metrics, ..saved },
+                    // So it does while a worker has reported nothing of it.
+                    Some(heard) if (idle || heard.total == 0) && saved.total > 0 => {
+                        Progress { metrics: heard.metrics, ..saved }
+                    }
                     Some(heard) => heard,
                     None => saved,
                 }

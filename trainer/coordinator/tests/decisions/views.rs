@@ -117,6 +117,23 @@ fn an_interrupted_run_says_where_it_stopped() {
 }
 
 #[test]
+fn resumed_work_is_shown_at_its_checkpoint_until_its_worker_reports() {
+    let (mut coordinator, run) = training();
+    saves(&mut coordinator, 240);
+    let assignment = coordinator.assignment("a").expect("it trains");
+    let poll =
+        |doing| Poll { incarnation: assignment.grant.incarnation, doing, ready: vec![], version: 0, leaving: false };
+    // A worker that has just begun knows neither the steps done nor their number.
+    let begins = poll(vec![Doing::new(assignment.grant.clone(), Progress::default())]);
+    coordinator.hear(Observation::Poll { worker: "a".into(), poll: begins });
+    let progress = stage(&coordinator, &run, "vae").progress;
+    let steps = assignment.stage.settings.steps().expect("it trains").0;
+    assert_eq!((progress.done, progress.total, &*progress.unit), (240, steps, "steps"));
+    reports(&mut coordinator, assignment.grant.incarnation, 241);
+    assert_eq!(stage(&coordinator, &run, "vae").progress.done, 241);
+}
+
+#[test]
 fn a_pipeline_that_was_interrupted_goes_on_as_the_same_run() {
     let (mut coordinator, run) = training();
     saves(&mut coordinator, 240);
