@@ -121,6 +121,7 @@ impl Mesh {
             // Keep-alives arrive far more often than this; the timeout only bounds the life of a reader.
             reader.set_read_timeout(Some(self.timing.patience * 3))?;
             stream.set_write_timeout(Some(BLINK))?;
+            Link::limit_unsent(&stream, self.size() - 1)?;
             let socket = stream.try_clone()?;
             Ok((
                 reader,

@@ -78,17 +78,7 @@ pub(crate) fn exchange(mesh: &Mesh, contribution: &Contribution<'_>, interrupt: 
     // Reduce-scatter, sending: each peer's chunk of our nodes. All sends run at once, so that a slow peer does not
     // delay the others.
     let nodes = tree::cover(contribution.slices, &own_slices);
-    let peers: Vec<usize> = mesh.others().collect();
-    let send = |peer: usize| send_parts(mesh, &barrier, contribution, peer, &nodes, interrupt);
-    if let [peer] = peers[..] {
-        send(peer)?;
-    } else {
-        std::thread::scope(|scope| {
-            let sends: Vec<_> = peers.iter().map(|peer| scope.spawn(|| send(*peer))).collect();
-            let sent = sends.into_iter().map(|thread| thread.join().expect("sending does not panic"));
-            sent.collect::<Vec<_>>().into_iter().collect::<Result<(), Halt>>()
-        })?;
-    }
+    at_once(mesh.others(), &|peer| send_parts(mesh, &barrier, contribution, peer, &nodes, interrupt))?;
 
     let received = receive_parts(mesh, &barrier, contribution, interrupt)?;
     let length = received.length.ok_or_else(|| Halt::Fault(format!("{barrier}: no member has a slice")))?;
@@ -106,6 +96,19 @@ pub(crate) fn exchange(mesh: &Mesh, contribution: &Contribution<'_>, interrupt: 
         mesh.complain(slow);
     }
     Ok(Total { sum, drain: received.drain, durable: received.durable })
+}
+
+/// Sends to all peers at once.
+fn at_once(peers: impl Iterator<Item = usize>, send: &(dyn Fn(usize) -> Result<(), Halt> + Sync)) -> Result<(), Halt> {
+    let peers: Vec<usize> = peers.collect();
+    if let [peer] = peers[..] {
+        return send(peer);
+    }
+    std::thread::scope(|scope| {
+        let sends: Vec<_> = peers.into_iter().map(|peer| scope.spawn(move || send(peer))).collect();
+        let sent = sends.into_iter().map(|thread| thread.join().expect("sending does not panic"));
+        sent.collect::<Vec<_>>().into_iter().collect()
+    })
 }
 
 /// Parts and flags of a step from all peers.
@@ -220,17 +223,17 @@ fn gather(
     let size = mesh.size();
     let length = sum.len();
     let chunk = tree::chunk(length, own, size);
-    for peer in mesh.others() {
+    let own_sum = &sum[chunk.clone()];
+    at_once(mesh.others(), &|peer| {
         if let Some(memory) = mesh.memory(peer).outgoing().filter(|_| !chunk.is_empty()) {
-            memory.sum(chunk.len()).copy_from_slice(&sum[chunk.clone()]);
-            mesh.send(peer, barrier, Head::new(Kind::SharedSum, step, 0, 0), &[], interrupt)?;
-            continue;
+            memory.sum(chunk.len()).copy_from_slice(own_sum);
+            return mesh.send(peer, barrier, Head::new(Kind::SharedSum, step, 0, 0), &[], interrupt);
         }
-        for (p, range) in pieces(&chunk).enumerate() {
+        own_sum.chunks(PIECE).enumerate().try_for_each(|(p, piece)| {
             let head = Head::new(Kind::Sum, step, 0, number(p));
-            mesh.send(peer, barrier, head, cast_slice(&sum[range]), interrupt)?;
-        }
-    }
+            mesh.send(peer, barrier, head, cast_slice(piece), interrupt)
+        })
+    })?;
     for peer in mesh.others() {
         let chunk = tree::chunk(length, peer, size);
         for (p, range) in pieces(&chunk).enumerate() {

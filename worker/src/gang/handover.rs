@@ -85,7 +85,8 @@ impl Mesh {
     /// Continues a connection of the generation before. Returns false if that fails.
     fn inherit(&self, rank: usize, link: &Arc<Link>) -> bool {
         let Ok(mut writer) = link.writer.try_lock() else { return false };
-        if writer.say_goodbye(Some(self.config.generation)).is_err() {
+        let is_said = writer.say_goodbye(Some(self.config.generation)).is_ok();
+        if !is_said || Link::limit_unsent(&link.socket, self.size() - 1).is_err() {
             return false;
         }
         let MeshConfig { secret, generation, rank: own, .. } = &self.config;

@@ -18,6 +18,11 @@ use crate::event_count::lock;
 
 /// The write timeout of a link's socket.
 pub(super) const BLINK: Duration = Duration::from_millis(200);
+/// Limit of the unsent bytes in the kernel of all links of a member together. TCP takes nothing back: what an exchange
+/// that was broken off has left there passes the line before the first frame of the next generation.
+const UNSENT: usize = 256 << 10;
+/// Least limit of one link, so that a fast line never waits for the sender.
+const LEAST_UNSENT: usize = 32 << 10;
 
 /// The outgoing direction of a connection. Frames of the stage and keep-alives take turns.
 #[derive(Debug)]
@@ -59,6 +64,17 @@ impl Link {
 }
 
 impl Link {
+    /// Limits the unsent bytes of the socket of one of `links` links.
+    pub(super) fn limit_unsent(socket: &TcpStream, links: usize) -> io::Result<()> {
+        #[cfg(target_os = "linux")]
+        {
+            let limit = (UNSENT / links.max(1)).max(LEAST_UNSENT);
+            socket2::SockRef::from(socket).set_tcp_notsent_lowat(u32::try_from(limit).expect("below the limit"))
+        }
+        #[cfg(not(target_os = "linux"))]
+        Ok(())
+    }
+
     /// Says goodbye and closes the outgoing direction. The goodbye names the next generation, if there is one, and is
     /// optional: a peer that does not receive it sees the connection close.
     pub(super) fn part(&self, next: Option<Generation>) {

@@ -279,7 +279,8 @@ impl Mesh {
         Ok(link.is_local && !self.uses_no_memory.load(Ordering::SeqCst))
     }
 
-    /// Waits for a link to `rank` and sends over it. `interrupt` returns a reason to give up.
+    /// Waits for a link to `rank` and sends over it. `interrupt` returns a reason to give up, and is asked before each
+    /// frame: what is sent after an order to regroup only delays the next generation.
     pub(crate) fn send(
         &self,
         rank: usize,
@@ -288,6 +289,9 @@ impl Mesh {
         payload: &[u8],
         interrupt: &dyn Fn() -> Option<Halt>,
     ) -> Result<(), Halt> {
+        if let Some(halt) = interrupt() {
+            return Err(halt);
+        }
         let link = self.wait(rank, barrier, interrupt, |peer| {
             let link = peer.link.clone()?;
             // Nothing else is sent before the peer has come to this generation.
