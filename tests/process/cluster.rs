@@ -378,8 +378,8 @@ fn p14_pause_resume_cancel_and_sigterm_end_with_saved_work() {
 
     assert_eq!(verb(&cluster, "resume", &run), "running");
     let at = |cluster: &Cluster| cluster.stage(&run, "vae")["progress"]["done"].as_u64().unwrap_or_default();
-    assert!(at(&cluster) >= 60, "from the checkpoint, not from nothing");
     let saved = at(&cluster);
+    assert!(saved >= 60, "from the checkpoint, not from nothing");
     cluster.wait_step(&run, "vae", saved + 1);
 
     // One worker leaves in good order with exit code 0; the other continues with its state.

@@ -308,7 +308,7 @@ impl State {
                 let idle = execution.state == ExecutionState::Open && !execution.is_busy();
                 match of(task) {
                     // Work continues at its checkpoint, which can be before or after the last report.
-                    // So it does while a worker has reported nothing of it.
+                    // A worker that has just begun has nothing to report yet.
                     Some(heard) if (idle || heard.total == 0) && saved.total > 0 => {
                         Progress { metrics: heard.metrics, ..saved }
                     }
