@@ -45,8 +45,12 @@ fn kinds(view: &Value) -> Vec<(String, String)> {
     stages.iter().map(|stage| (text(&stage["name"]), text(&stage["kind"]))).collect()
 }
 
+/// Sampled: nothing on ndarray, which takes three minutes; everything with `STRIDE_LONG_TESTS=1`.
 #[test]
 fn every_kind_trains_on_another_backend_as_on_flex() {
+    if std::env::var_os("STRIDE_TEST_BACKEND").is_none() && !fixtures::long("every kind of training on ndarray") {
+        return;
+    }
     // Less than kinds.yaml says, where convolutions take most of the time on ndarray.
     let less = ["stages.stablemofusion.batch.global=3", "stages.stablemofusion.steps=1", "dataset.clips=20"];
     let sets = less.map(|less| ["--set", less]).concat();

@@ -82,8 +82,7 @@ fn workers_pass_blobs_by_the_server() {
 /// names, if it is set.
 #[test]
 fn the_quickstart_on_a_bucket_gives_the_digests_of_a_folder() {
-    if std::env::var_os("STRIDE_LONG_TESTS").is_none() {
-        fixtures::skip("the quickstart on a bucket (set STRIDE_LONG_TESTS=1)");
+    if !fixtures::long("the quickstart on a bucket") {
         return;
     }
     let trainer = std::env::var("TRAINER").unwrap_or_else(|_| TRAINER.to_owned());

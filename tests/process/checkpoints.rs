@@ -132,10 +132,8 @@ fn a_checkpoint_of(network: &str) {
 #[test]
 fn a_checkpoint_is_in_memory_once() {
     a_checkpoint_of("512, layers: 3, feed_forward: 1024");
-    if std::env::var_os("STRIDE_LONG_TESTS").is_some() {
+    if fixtures::long("the memory of a checkpoint of 1.6 GB") {
         a_checkpoint_of("1024, layers: 5, feed_forward: 2048");
-    } else {
-        fixtures::skip("the memory of a checkpoint of 1.6 GB (set STRIDE_LONG_TESTS=1)");
     }
 }
 

@@ -116,10 +116,8 @@ fn p4_the_coordinator_is_killed_and_back_at_once() {
 #[test]
 fn p4_the_coordinator_is_killed_and_away_for_a_while() {
     coordinator_away(Duration::from_secs(5));
-    if std::env::var_os("STRIDE_LONG_TESTS").is_some() {
+    if fixtures::long("60 s without a coordinator") {
         coordinator_away(Duration::from_secs(60));
-    } else {
-        fixtures::skip("60 s without a coordinator (set STRIDE_LONG_TESTS=1)");
     }
 }
 
@@ -207,8 +205,7 @@ fn network_cut(how_long: Duration, sets: &[&str], expected: &(Value, Curves), ou
 #[test]
 fn p4_a_worker_that_is_cut_off_is_gone_without_and_comes_back_by_itself() {
     network_cut(Duration::from_secs(19), &VAE, reference(), false);
-    if std::env::var_os("STRIDE_LONG_TESTS").is_none() {
-        fixtures::skip("a network cut of 30 s (set STRIDE_LONG_TESTS=1)");
+    if !fixtures::long("a network cut of 30 s") {
         return;
     }
     // Enough steps for a gang of three on any machine.

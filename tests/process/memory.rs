@@ -119,11 +119,8 @@ fn memory(pid: u32) -> Option<(u64, u64)> {
 /// `STRIDE_LONG_TESTS=1`, sixteen workers and 4 GB, the size of HumanML3D.
 #[test]
 fn p15_workers_of_a_machine_share_a_dataset() {
-    let is_long = std::env::var_os("STRIDE_LONG_TESTS").is_some();
+    let is_long = fixtures::long("sixteen workers on a dataset of 4 GB");
     let (clips, workers, own_mb) = if is_long { (42_000, 16, 400) } else { (550, 3, 40) };
-    if !is_long {
-        fixtures::skip("sixteen workers on a dataset of 4 GB (set STRIDE_LONG_TESTS=1)");
-    }
     let bench = Bench::new(TRAINER);
     let pipeline = format!(
         "name: shared\nseed: 7\ndataset: {{format: synthetic, clips: {clips}, val: 0.02, test: 0.02}}\nstages:\n  \

@@ -4,7 +4,7 @@
 //! two events or during a commit, with or without a loss of power, and recovers by replay. [`INJECTED`] lists all
 //! faults. Invariants are checked after every event, and in the end every submitted task is done exactly once.
 //!
-//! `SIM_SEED=n` replays one seed. `SIM_SEEDS=n` sets the number of seeds; the default is 500, or 2,000 with
+//! `SIM_SEED=n` replays one seed. `SIM_SEEDS=n` sets the number of seeds; the default is 200, or 2,000 with
 //! `STRIDE_LONG_TESTS=1`. Failed seeds are added to `seeds.txt` beside this file, which always runs first.
 
 mod pipelines;
@@ -27,7 +27,7 @@ use protocol::stage::WorkerRange;
 use crate::world::{CHAOS_MS, INJECTED, World};
 
 /// Number of new seeds in every run of the tests; permanent seeds run as well.
-const SEEDS: u64 = 500;
+const SEEDS: u64 = 200;
 /// Number of seeds in long tests.
 const MANY_SEEDS: u64 = 2_000;
 /// Number of seeds among which every kind of fault must occur.
@@ -70,7 +70,7 @@ fn seeds() -> Vec<u64> {
     if let Ok(seed) = std::env::var("SIM_SEED") {
         return vec![number(seed)];
     }
-    let usual = if std::env::var_os("STRIDE_LONG_TESTS").is_some() { MANY_SEEDS } else { SEEDS };
+    let usual = if fixtures::long("2,000 seeds of the simulation") { MANY_SEEDS } else { SEEDS };
     let count = std::env::var("SIM_SEEDS").map_or(usual, number);
     let kept = std::fs::read_to_string(seeds_file()).expect("the kept seeds");
     let kept = kept.lines().filter(|line| !line.starts_with('#') && !line.trim().is_empty());
