@@ -258,8 +258,8 @@ async fn a_bucket_of_30_ms_slows_no_more_than_what_asks_it() -> TestResult {
     eprintln!("{outcomes} outcomes, {rate:.0} a second; heartbeats: p99 {:.1?} of {}", p99(&times), times.len());
     assert!(outcomes as usize >= SHARDS / 2, "{outcomes}");
     // Sequential requests would take 240 ms per outcome, 4 a second. A debug build is bound by its processor: two slow cores,
-    // beside other tests, did 24.
-    assert!(rate > 16.0, "{rate}");
+    // beside other work, did 12.
+    assert!(rate > 7.0, "{rate}");
     assert!(p99(&times) < Duration::from_millis(500), "{:?}", p99(&times));
     slow.handle.shutdown().await;
     Ok(())

@@ -4,7 +4,7 @@
 //! two events or during a commit, with or without a loss of power, and recovers by replay. [`INJECTED`] lists all
 //! faults. Invariants are checked after every event, and in the end every submitted task is done exactly once.
 //!
-//! `SIM_SEED=n` replays one seed. `SIM_SEEDS=n` sets the number of seeds; the default is 200, or 2,000 with
+//! `SIM_SEED=n` replays one seed. `SIM_SEEDS=n` sets the number of seeds; the default is 120, or 2,000 with
 //! `STRIDE_LONG_TESTS=1`. Failed seeds are added to `seeds.txt` beside this file, which always runs first.
 
 mod pipelines;
@@ -27,7 +27,7 @@ use protocol::stage::WorkerRange;
 use crate::world::{CHAOS_MS, INJECTED, World};
 
 /// Number of new seeds in every run of the tests; permanent seeds run as well.
-const SEEDS: u64 = 200;
+const SEEDS: u64 = 120;
 /// Number of seeds in long tests.
 const MANY_SEEDS: u64 = 2_000;
 /// Number of seeds among which every kind of fault must occur.
