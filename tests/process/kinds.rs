@@ -73,12 +73,14 @@ fn reference() -> &'static Value {
     })
 }
 
+/// Sampled: three workers; also two with `STRIDE_LONG_TESTS=1`.
 #[test]
 fn p6_every_kind_has_the_same_digests_with_1_2_and_3_workers() {
-    for workers in ["2", "3"] {
+    let counts: &[&str] = if fixtures::long("every kind with two workers") { &["2", "3"] } else { &["3"] };
+    for workers in counts {
         let bench = Bench::new(TRAINER);
         assert_eq!(digests(&run(&bench, workers)), digests(reference()), "{workers} workers against 1");
-        if workers == "2" {
+        if *workers == "3" {
             draws_the_spectrum(&bench);
         }
     }
@@ -150,9 +152,13 @@ fn p5_every_kind_that_trains_is_killed_after_each_of_its_steps() {
     }
 }
 
-/// Every task of a worker, shards and merges included, is computed and lost before it is reported.
+/// Every task of a worker, shards and merges included, is computed and lost before it is reported. Sampled: nothing; all
+/// kinds with `STRIDE_LONG_TESTS=1`.
 #[test]
 fn p5_every_kind_is_killed_before_it_reports() {
+    if !fixtures::long("a worker's death before each of its reports") {
+        return;
+    }
     // The first task of each worker is the one that its predecessor lost.
     let (_, deaths) = dies_at("outcome::before_report", 2);
     let stages = reference()["stages"].as_array().expect("stages");

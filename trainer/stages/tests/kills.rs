@@ -64,7 +64,7 @@ fn p5_a_kill_at_every_step_changes_no_byte() {
     for name in ["vae", "mld", "lcm", "pcm"] {
         let mut case = case(name, [steps; 4]);
         let whole: BTreeMap<u64, _> = case.bench.forget_after(name, 0).into_iter().collect();
-        let saves = (1..=steps).filter(|step| step % 7 == 0 || *step == steps);
+        let saves = (1..=steps).filter(|step: &u64| step.is_multiple_of(7) || *step == steps);
         assert_eq!(whole.keys().copied().collect::<Vec<_>>(), saves.collect::<Vec<_>>(), "{name}");
         for step in 0..steps {
             case.bench.script = Script { lost: vec![(0, step)], ..Script::default() };
