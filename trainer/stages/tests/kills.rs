@@ -55,9 +55,9 @@ impl Case {
     }
 }
 
-/// All steps of the stages of a latent model, one after the other. Sampled: 20 steps; 60 with `STRIDE_LONG_TESTS=1`. A kill at a step loses everything after the last
+/// All steps of the stages of a latent model, one after the other. A kill at a step loses everything after the last
 /// checkpoint before it. The next checkpoint is then reached again and must be the same object. The last run continues
-/// to the end.
+/// to the end. Sampled: 20 steps; 60 with `STRIDE_LONG_TESTS=1`.
 #[test]
 fn p5_a_kill_at_every_step_changes_no_byte() {
     let steps = if fixtures::long("a kill at each of 60 steps") { 60 } else { 20 };

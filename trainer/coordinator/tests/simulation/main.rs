@@ -70,8 +70,8 @@ fn seeds() -> Vec<u64> {
     if let Ok(seed) = std::env::var("SIM_SEED") {
         return vec![number(seed)];
     }
-    let usual = if fixtures::long("2,000 seeds of the simulation") { MANY_SEEDS } else { SEEDS };
-    let count = std::env::var("SIM_SEEDS").map_or(usual, number);
+    let usual = || if fixtures::long("2,000 seeds of the simulation") { MANY_SEEDS } else { SEEDS };
+    let count = std::env::var("SIM_SEEDS").map_or_else(|_| usual(), number);
     let kept = std::fs::read_to_string(seeds_file()).expect("the kept seeds");
     let kept = kept.lines().filter(|line| !line.starts_with('#') && !line.trim().is_empty());
     kept.map(|line| number(line.to_owned())).chain(1000..1000 + count).collect()
