@@ -26,9 +26,13 @@ pub fn run(name: &str, bytes: &[u8]) -> bool {
 /// A word that no error may repeat.
 pub const CANARY: &str = "qzcanaryzq";
 
-/// A folder of this process.
+thread_local! {
+    static SCRATCH: tempfile::TempDir = tempfile::tempdir().expect("a folder for temporary files");
+}
+
+/// A folder of this thread. Tests run beside each other and write files of the same names.
 pub(super) fn folder(name: &str) -> PathBuf {
-    let folder = std::env::temp_dir().join(format!("stride-hostile-{}", std::process::id())).join(name);
+    let folder = SCRATCH.with(|scratch| scratch.path().join(name));
     fs::create_dir_all(&folder).expect("a folder of ours");
     folder
 }

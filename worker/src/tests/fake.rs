@@ -41,6 +41,7 @@ pub(super) struct FakeState {
     pub(super) version: u64,
     pub(super) leave: bool,
     pub(super) joins: u64,
+    /// Does not know the worker until it joins again. The answer to a poll can be lost, so one such answer is not enough.
     pub(super) forget: bool,
     pub(super) polls: Vec<Instant>,
     pub(super) last_poll: Option<Poll>,
@@ -180,6 +181,7 @@ async fn join(State(fake): State<Arc<Fake>>, headers: HeaderMap, Json(join): Jso
     }
     let mut coordinator = lock(&fake.coordinator);
     coordinator.joins += 1;
+    coordinator.forget = false;
     Json(Joined { incarnation: Incarnation(coordinator.joins), lease_ms: LEASE_MS, poll_ms: 100 }).into_response()
 }
 
@@ -191,7 +193,7 @@ async fn poll(State(fake): State<Arc<Fake>>, Path(worker): Path<String>, Json(po
     let version = poll.version;
     {
         let mut coordinator = lock(&fake.coordinator);
-        if std::mem::take(&mut coordinator.forget) {
+        if coordinator.forget {
             return refuse(StatusCode::NOT_FOUND, "not-found");
         }
         coordinator.polls.push(Instant::now());
