@@ -14,7 +14,7 @@ use tokio::sync::Notify;
 use super::endpoint::{Endpoint, Gang};
 use super::frame::{self, FrameError, Kind, MAX_PAYLOAD};
 use super::handover::{Follow, Reading};
-use super::handshake::{self, HandshakeError, Session};
+use super::handshake::{self, HandshakeError, Hurried, Session};
 use super::link::{BLINK, Heard, Link, Pulse, Writer};
 use super::member::{MeshConfig, Timing, spawn};
 use super::mesh::Mesh;
@@ -79,63 +79,71 @@ impl Mesh {
         let mut refused: Option<Instant> = None;
         let mut pause = Duration::from_millis(10);
         while !self.is_closed() {
-            match self.connect(rank) {
-                Ok((stream, session)) => {
-                    self.attach(rank, stream, session);
-                    return;
-                }
-                Err(error) => {
-                    let since =
-                        if error.is_refused() { *refused.get_or_insert_with(Instant::now) } else { Instant::now() };
-                    if since.elapsed() > self.timing.refused {
-                        let reason = format!("nothing listens at {}", self.config.members[rank].peer_address);
-                        self.lose(rank, LossCause::Unreachable, reason);
-                        return;
-                    }
-                    if !error.is_refused() {
-                        refused = None;
-                    }
-                    if let Standing::Unmet(last) = &mut lock(&self.peers)[rank].standing {
-                        *last = Some(error.to_string());
-                    }
-                }
+            let Err(error) = self.connect(rank) else { return };
+            let since = if error.is_refused() { *refused.get_or_insert_with(Instant::now) } else { Instant::now() };
+            if since.elapsed() > self.timing.refused {
+                let reason = format!("nothing listens at {}", self.config.members[rank].peer_address);
+                self.lose(rank, LossCause::Unreachable, reason);
+                return;
+            }
+            if !error.is_refused() {
+                refused = None;
+            }
+            if let Standing::Unmet(last) = &mut lock(&self.peers)[rank].standing {
+                *last = Some(error.to_string());
             }
             thread::sleep(pause);
             pause = (pause * 2).min(Duration::from_millis(200));
         }
     }
 
-    fn connect(&self, rank: usize) -> Result<(TcpStream, Session), HandshakeError> {
+    /// Dials a rank once. The stage sends to it before its welcome is here, which saves a crossing of the line in both
+    /// directions.
+    fn connect(self: &Arc<Self>, rank: usize) -> Result<(), HandshakeError> {
         let stream = handshake::connect(&self.config.members[rank].peer_address)?;
+        let hurried = &mut Hurried::new(&stream, Instant::now())?;
         let MeshConfig { task, generation, rank: from, secret, .. } = &self.config;
-        let session = handshake::dial(&stream, task, *generation, *from, rank, secret)?;
-        Ok((stream, session))
+        let session = handshake::dial(hurried, task, *generation, *from, rank, secret)?;
+        let Some(incoming) = self.add(rank, &stream, session, true) else { return Ok(()) };
+        match handshake::welcomed(hurried) {
+            Ok(()) => {
+                self.confirm(rank, &incoming.link);
+                incoming.read(self, rank);
+                Ok(())
+            }
+            Err(error) => {
+                self.withdraw(rank, &incoming.link, &error.to_string());
+                Err(error)
+            }
+        }
     }
 
     /// Adds a connection whose other side has authenticated as `rank`.
-    fn attach(self: &Arc<Self>, rank: usize, stream: TcpStream, session: Session) {
+    fn attach(self: &Arc<Self>, rank: usize, stream: &TcpStream, session: Session) {
+        if let Some(incoming) = self.add(rank, stream, session, false) {
+            incoming.read(self, rank);
+        }
+    }
+
+    /// Lets the stage send over a connection. Returns its other direction, or `None` if the connection is not wanted.
+    fn add(self: &Arc<Self>, rank: usize, stream: &TcpStream, session: Session, is_unproven: bool) -> Option<Incoming> {
         let Session { opening, sends, receives } = session;
         let is_local = !sends.is_encrypted();
         let pulse = lock(&self.peers)[rank].pulse.clone();
         let both = stream.try_clone().and_then(|reader| {
-            // Keep-alives arrive far more often than this; the timeout only bounds the life of a reader.
-            reader.set_read_timeout(Some(self.timing.patience * 3))?;
-            stream.set_write_timeout(Some(BLINK))?;
-            Link::limit_unsent(&stream, self.size() - 1)?;
+            let writer = stream.try_clone()?;
+            writer.set_write_timeout(Some(BLINK))?;
+            Link::limit_unsent(&writer, self.size() - 1)?;
             let socket = stream.try_clone()?;
-            Ok((
-                reader,
-                Link {
-                    socket,
-                    writer: Mutex::new(Writer { stream, seal: sends, pulse: pulse.clone(), signed: Instant::now() }),
-                    is_local,
-                    opening,
-                },
-            ))
+            let writer = Writer { stream: writer, seal: sends, pulse: pulse.clone(), signed: Instant::now() };
+            Ok((reader, Link { socket, writer: Mutex::new(writer), is_local, opening }))
         });
         let (reader, link) = match both {
             Ok((reader, link)) => (reader, Arc::new(link)),
-            Err(error) => return self.lose(rank, LossCause::Unreachable, error.to_string()),
+            Err(error) => {
+                self.lose(rank, LossCause::Unreachable, error.to_string());
+                return None;
+            }
         };
         let first;
         {
@@ -144,12 +152,12 @@ impl Mesh {
             // A peer that dials does not continue its connection of the generation before.
             let may_attach = matches!(peer.standing, Standing::Unmet(_)) || peer.is_unproven;
             if self.is_closed() || !may_attach {
-                return;
+                return None;
             }
             if let Some(old) = peer.link.replace(link.clone()) {
                 let _ = old.socket.shutdown(Shutdown::Both);
             }
-            peer.is_unproven = false;
+            peer.is_unproven = is_unproven;
             // The peer repeats its first frame too.
             peer.inbox.clear();
             first = peer.first;
@@ -162,8 +170,53 @@ impl Mesh {
             let _ = link.send(first, &[], &self.sign(), self.timing.patience, &|| self.is_closed());
         }
         self.event_count.notify();
-        let reading = Reading::new(self, rank, &link);
-        spawn("gang-read", move || read(reading, &reader, receives, pulse));
+        Some(Incoming { stream: reader, link, seal: receives, pulse })
+    }
+
+    /// The peer has welcomed this member: from now on the end of the connection is the loss of the peer.
+    fn confirm(&self, rank: usize, link: &Arc<Link>) {
+        let peer = &mut lock(&self.peers)[rank];
+        if peer.link.as_ref().is_some_and(|own| Arc::ptr_eq(own, link)) {
+            peer.is_unproven = false;
+        }
+    }
+
+    /// Takes back a connection that was added and never welcomed.
+    fn withdraw(&self, rank: usize, link: &Arc<Link>, reason: &str) {
+        let _ = link.socket.shutdown(Shutdown::Both);
+        {
+            let peer = &mut lock(&self.peers)[rank];
+            if peer.link.as_ref().is_some_and(|own| Arc::ptr_eq(own, link)) && peer.standing == Standing::Up {
+                peer.link = None;
+                peer.standing = Standing::Unmet(Some(reason.to_owned()));
+                peer.is_unproven = false;
+            }
+            // The thread that dials tries again itself.
+            peer.inherits = false;
+        }
+        self.disinherit_successors(rank, link, reason);
+    }
+}
+
+/// The incoming direction of a connection that nobody reads yet.
+struct Incoming {
+    stream: TcpStream,
+    link: Arc<Link>,
+    seal: Seal,
+    pulse: Pulse,
+}
+
+impl Incoming {
+    /// Starts the thread that reads it.
+    fn read(self, mesh: &Arc<Mesh>, rank: usize) {
+        let Self { stream, link, seal, pulse } = self;
+        // Keep-alives arrive far more often than this; the timeout only bounds the life of a reader.
+        if let Err(error) = stream.set_read_timeout(Some(mesh.timing.patience * 3)) {
+            return mesh.lose(rank, LossCause::Unreachable, error.to_string());
+        }
+        mesh.event_count.notify();
+        let reading = Reading::new(mesh, rank, &link);
+        spawn("gang-read", move || read(reading, &stream, seal, pulse));
     }
 }
 
@@ -231,6 +284,6 @@ impl Gang for Mesh {
     }
 
     fn attach(self: Arc<Self>, rank: usize, stream: TcpStream, session: Session) {
-        Self::attach(&self, rank, stream, session);
+        Self::attach(&self, rank, &stream, session);
     }
 }

@@ -107,6 +107,7 @@ impl Endpoint {
         if !lock(&self.strangers).dismiss(number) {
             return Err(HandshakeError::Crowded);
         }
+        handshake::welcome(hurried)?;
         gang.attach(dial.from, stream, session);
         Ok(())
     }

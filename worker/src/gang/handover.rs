@@ -151,6 +151,11 @@ impl Mesh {
         lock(&self.peers)[rank].link.as_ref().is_some_and(|own| std::ptr::eq(Arc::as_ptr(own), link.as_ptr()))
     }
 
+    /// A connection that later generations may have taken over was never welcomed.
+    pub(super) fn disinherit_successors(&self, rank: usize, link: &Arc<Link>, reason: &str) {
+        disinherit(&self.successor, &self.config.members[rank], &Arc::downgrade(link), reason);
+    }
+
     /// A connection of the generation before has ended before its peer came to this one.
     fn disinherit(self: &Arc<Self>, rank: usize, link: &Weak<Link>, reason: &str) {
         if self.has(rank, link) {
@@ -163,6 +168,15 @@ impl Mesh {
             }
         }
         self.miss(rank);
+    }
+}
+
+/// Reports the end of the connection to `member` to all later generations.
+fn disinherit(successor: &Successor<Mesh>, member: &Member, link: &Weak<Link>, reason: &str) {
+    for next in successor.all() {
+        if let Some(rank) = next.rank_of(member) {
+            next.disinherit(rank, link, reason);
+        }
     }
 }
 
@@ -244,11 +258,7 @@ impl Reading {
 
     /// Reports the end of the connection to each generation that uses it.
     pub(super) fn end(&self, reason: &str) {
-        for next in self.successor.all() {
-            if let Some(rank) = next.rank_of(&self.member) {
-                next.disinherit(rank, &self.link, reason);
-            }
-        }
+        disinherit(&self.successor, &self.member, &self.link, reason);
         let Some(mesh) = self.mesh.upgrade() else { return };
         let has_it = mesh.has(self.rank, &self.link);
         if self.is_new || !has_it {

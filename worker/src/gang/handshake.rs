@@ -7,6 +7,8 @@
 //! 3. The dialer checks it and answers with the same under `"dial"`.
 //! 4. The dialled side checks that and welcomes the dialer.
 //!
+//! The dialer knows the other side after the second frame, so its first frame as a member follows the third one at once.
+//!
 //! Both nonces are fresh, so a recorded proof is useless. The two words differ, so a proof cannot be reflected to its
 //! author. The secret itself is never sent. The frames that follow are encrypted if one of the two sees the connection
 //! leave its machine. The HMAC covers the dialer's view of this, so an attacker on the path cannot change it.
@@ -204,16 +206,16 @@ fn receive<T: DeserializeOwned>(stream: &mut Hurried<'_>, expected: Kind) -> Res
     Ok(serde_json::from_slice(frame.bytes())?)
 }
 
-/// Performs the dialer's side of a handshake.
-pub(crate) fn dial(
-    stream: &TcpStream,
+/// Performs the dialer's side of a handshake up to its proof. The dialled side is authenticated then; its welcome is
+/// still on its way ([`welcomed`]).
+pub(super) fn dial(
+    stream: &mut Hurried<'_>,
     task: &TaskId,
     generation: Generation,
     from: usize,
     to: usize,
     secret: &str,
 ) -> Result<Session, HandshakeError> {
-    let stream = &mut Hurried::new(stream, Instant::now())?;
     let leaves = leaves_the_machine(stream.stream)?;
     let dial = Dial { task: task.clone(), generation, from, to, leaves, nonce: nonce()? };
     send(stream, Kind::Dial, &dial)?;
@@ -221,8 +223,12 @@ pub(crate) fn dial(
     let answer = Answer { encrypts, nonce };
     check(secret, "accept", &dial, &answer, &theirs)?;
     send(stream, Kind::Proof, &Proof { proof: proof(secret, "dial", &dial, &answer) })?;
-    receive::<()>(stream, Kind::Welcome)?;
     Ok(session(secret, &dial, &answer, true))
+}
+
+/// Waits for the welcome after [`dial`].
+pub(super) fn welcomed(stream: &mut Hurried<'_>) -> Result<(), HandshakeError> {
+    receive(stream, Kind::Welcome)
 }
 
 /// Reads the first frame on the dialled side and returns the dialer's request. Answers a [`probe`] and returns `None`.
@@ -258,15 +264,20 @@ pub(crate) fn connect(address: &str) -> Result<TcpStream, HandshakeError> {
     Err(last.into())
 }
 
-/// Performs the rest of the dialled side. On success the dialer is authenticated as a member of the generation.
+/// Performs the dialled side up to the dialer's proof. On success the dialer is authenticated as a member of the
+/// generation; [`welcome`] is the rest.
 pub(super) fn accept(stream: &mut Hurried<'_>, dial: &Dial, secret: &str) -> Result<Session, HandshakeError> {
     let answer = Answer { encrypts: dial.leaves || leaves_the_machine(stream.stream)?, nonce: nonce()? };
     let Answer { encrypts, nonce } = answer;
     send(stream, Kind::Challenge, &Challenge { encrypts, nonce, proof: proof(secret, "accept", dial, &answer) })?;
     let theirs: Proof = receive(stream, Kind::Proof)?;
     check(secret, "dial", dial, &answer, &theirs.proof)?;
-    send(stream, Kind::Welcome, &())?;
     Ok(session(secret, dial, &answer, false))
+}
+
+/// Welcomes the dialer.
+pub(super) fn welcome(stream: &mut Hurried<'_>) -> Result<(), HandshakeError> {
+    send(stream, Kind::Welcome, &())
 }
 
 #[cfg(test)]
@@ -284,16 +295,23 @@ mod tests {
         let secret = dialled.to_owned();
         let server = thread::spawn(move || answer(&listener, &secret));
         let stream = TcpStream::connect(address).expect("listening");
-        let here = dial(&stream, &TaskId::from("run/stage"), Generation(3), 1, 0, dialer);
+        let here = join(&stream, dialer);
         drop(stream);
         (here, server.join().expect("no panic"))
+    }
+
+    fn join(stream: &TcpStream, secret: &str) -> Met {
+        let stream = &mut Hurried::new(stream, Instant::now())?;
+        let session = dial(stream, &TaskId::from("run/stage"), Generation(3), 1, 0, secret)?;
+        welcomed(stream).map(|()| session)
     }
 
     fn answer(listener: &TcpListener, secret: &str) -> Met {
         let (stream, _) = listener.accept()?;
         let stream = &mut Hurried::new(&stream, Instant::now())?;
         let dial = wanted(stream)?;
-        accept(stream, &dial.expect("a dialer"), secret)
+        let session = accept(stream, &dial.expect("a dialer"), secret)?;
+        welcome(stream).map(|()| session)
     }
 
     /// Returns true if the receiver accepts the sender's frames.

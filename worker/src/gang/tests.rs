@@ -6,8 +6,10 @@ mod relay;
 mod silence;
 mod states;
 mod strangers;
+mod welcome;
 
 use std::collections::BTreeMap;
+use std::net::TcpStream;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 use std::thread;
@@ -24,7 +26,7 @@ use super::frame::{self, Head, Kind};
 use super::member::{Busy, MeshConfig, Phase, Timing};
 use super::mesh::{Halt, Mesh};
 use super::tree;
-use super::{exchange, rendezvous};
+use super::{exchange, handshake, rendezvous};
 use crate::active_assignment::ActiveAssignment;
 use crate::context::HttpContext;
 use crate::event_count::{EventCount, lock};
@@ -420,6 +422,19 @@ fn mesh(gang: &Gang, seats: &[usize], own: usize, secret: &str) -> (Arc<Mesh>, A
     };
     let event_count: Arc<EventCount> = Arc::default();
     (Mesh::open(config, &gang.seats[seats[own]].endpoint, event_count.clone(), Arc::default(), None), event_count)
+}
+
+/// Dials as a peer that knows the secret, and waits for the welcome.
+fn dial(
+    stream: &TcpStream,
+    of: &TaskId,
+    generation: u64,
+    from: usize,
+    to: usize,
+) -> Result<handshake::Session, handshake::HandshakeError> {
+    let hurried = &mut handshake::Hurried::new(stream, Instant::now())?;
+    let session = handshake::dial(hurried, of, Generation(generation), from, to, "s")?;
+    handshake::welcomed(hurried).map(|()| session)
 }
 
 fn unreachable(worker: &str) -> LostPeer {

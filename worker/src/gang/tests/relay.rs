@@ -7,7 +7,6 @@ use std::sync::mpsc;
 use super::*;
 use crate::gang::exchange::{Contribution, Interrupt};
 use crate::gang::frame::MAX_PAYLOAD;
-use crate::gang::handshake;
 use crate::gang::rendezvous::{Line, Met};
 
 const BARRIER: &str = "barrier `test`";
@@ -151,8 +150,7 @@ fn signs_of_life_go_out_between_the_frames_of_a_long_payload() {
     let gang = Gang::new(2, QUICK);
     let (mesh, _) = mesh(&gang, &[0, 1], 0, "s");
     let stream = TcpStream::connect(gang.seats[0].endpoint.address()).expect("listening");
-    let handshake::Session { mut receives, .. } =
-        handshake::dial(&stream, &task(), Generation(7), 1, 0, "s").expect("welcome");
+    let handshake::Session { mut receives, .. } = dial(&stream, &task(), 7, 1, 0).expect("welcome");
     let over = AtomicBool::new(false);
     let mut large = 0;
     let mut signs = 0;

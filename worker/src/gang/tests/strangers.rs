@@ -1,10 +1,10 @@
 //! Peers that do not belong to the gang, or misbehave.
 
 use std::io::Write as _;
-use std::net::{SocketAddr, TcpStream};
+use std::net::SocketAddr;
 
 use super::*;
-use crate::gang::handshake::{self, Session};
+use crate::gang::handshake::Session;
 use crate::gang::seal::Seal;
 
 #[test]
@@ -24,7 +24,7 @@ fn misbehave(bytes: impl FnOnce(&mut Seal) -> Vec<u8>) -> Arc<Mesh> {
     let gang = Gang::new(2, QUICK);
     let (mesh, _) = mesh(&gang, &[0, 1], 0, "s");
     let mut stream = TcpStream::connect(gang.seats[0].endpoint.address()).expect("listening");
-    let Session { mut sends, .. } = handshake::dial(&stream, &task(), Generation(7), 1, 0, "s").expect("welcome");
+    let Session { mut sends, .. } = dial(&stream, &task(), 7, 1, 0).expect("welcome");
     stream.write_all(&bytes(&mut sends)).expect("sent");
     wait_until("the peer is given up", || !mesh.lost().is_empty());
     mesh
@@ -113,26 +113,24 @@ fn slow_strangers_keep_no_peer_out() {
     });
 }
 
-/// Dials the first of two members of generation 7.
-fn dial(gang: &Gang, of: &TaskId, generation: u64, from: usize, to: usize) -> Result<(), handshake::HandshakeError> {
-    let stream = TcpStream::connect(gang.seats[0].endpoint.address()).expect("listening");
-    handshake::dial(&stream, of, Generation(generation), from, to, "s").map(drop)
-}
-
 /// Uses the right secret, so that only the tested check can refuse it.
 #[test]
 fn a_peer_of_another_generation_task_or_rank_never_gets_in() {
     let gang = Gang::new(2, QUICK);
     let (mesh, _) = mesh(&gang, &[0, 1], 0, "s");
+    let dial = |of: &TaskId, generation, from, to| {
+        let stream = TcpStream::connect(gang.seats[0].endpoint.address()).expect("listening");
+        dial(&stream, of, generation, from, to)
+    };
     for generation in [6, 8] {
-        assert!(dial(&gang, &task(), generation, 1, 0).is_err(), "of generation {generation}");
+        assert!(dial(&task(), generation, 1, 0).is_err(), "of generation {generation}");
     }
-    assert!(dial(&gang, &TaskId::from("run/other"), 7, 1, 0).is_err(), "of another task");
+    assert!(dial(&TaskId::from("run/other"), 7, 1, 0).is_err(), "of another task");
     for (from, to) in [(0, 0), (1, 1), (2, 0), (2, 1)] {
-        assert!(dial(&gang, &task(), 7, from, to).is_err(), "from {from} to {to}");
+        assert!(dial(&task(), 7, from, to).is_err(), "from {from} to {to}");
     }
     assert!(mesh.lost().is_empty(), "strangers end nothing");
-    dial(&gang, &task(), 7, 1, 0).expect("the right one is welcome");
+    dial(&task(), 7, 1, 0).expect("the right one is welcome");
     mesh.close(None);
 }
 
