@@ -205,10 +205,11 @@ async fn join(client: &Client, join: &Join, shared: &Shared) -> Result<Joined, E
     }
 }
 
-/// Timeout of a poll: the longest wait of the coordinator plus a third of a lease. If a connection hangs, another one
-/// fits within the lease.
-fn patience(joined: &Joined) -> Duration {
-    Duration::from_millis(joined.poll_ms + joined.lease_ms / 3)
+/// Timeout of a poll. If a connection hangs, another one fits within the lease. Without work to report, it is the longest
+/// wait of the coordinator plus a third of a lease. With work the coordinator waits less.
+fn patience(joined: &Joined, poll: &Poll) -> Duration {
+    let longest = joined.poll_ms + joined.lease_ms / 3;
+    Duration::from_millis(if poll.doing.is_empty() { longest } else { longest.min(joined.lease_ms / 2) })
 }
 
 /// Joins and polls until the worker may leave.
@@ -237,7 +238,7 @@ async fn poll_on(client: &Client, offer: &Join, shared: &Shared) -> Result<Infal
                 sleep(SHORTEST).await;
                 continue;
             }
-            answer = client.poll(&path, &poll, patience(&joined)) => answer,
+            answer = client.poll(&path, &poll, patience(&joined, &poll)) => answer,
         };
         let answered = !answer.as_ref().is_err_and(CallError::may_pass);
         shared.flags.away.store(!answered, Ordering::SeqCst);

@@ -23,7 +23,7 @@ pub struct Policy {
     pub lease_ms: u64,
     /// Period of the timer; a dead worker's task is free after at most one lease and one tick. Milliseconds.
     pub tick_ms: u64,
-    /// Longest wait of a poll for changes. Milliseconds.
+    /// Longest wait for changes of a worker that has work. Milliseconds.
     pub poll_ms: u64,
     /// Time for a draining worker to finish before its task is released. Milliseconds.
     pub grace_ms: u64,
@@ -100,6 +100,13 @@ impl Default for Policy {
 }
 
 impl Policy {
+    /// Longest wait for changes of a worker without work, and so of any worker. It has nothing to report, and each poll
+    /// costs the server a third of a millisecond. A worker gives up an answer that is a third of a lease late; its next poll
+    /// still comes within the lease. Milliseconds.
+    pub fn idle_poll_ms(&self) -> u64 {
+        (self.poll_ms * 5).min(self.lease_ms * 3 / 5).max(self.poll_ms)
+    }
+
     /// The limits of a group.
     pub fn limits_of(&self, group: &Group) -> GroupLimits {
         self.limits.get(group).copied().unwrap_or_default()

@@ -103,6 +103,8 @@ pub(crate) struct Worker {
     pub(crate) joins_gangs: bool,
     /// Gang tasks of the last answer whose inputs it would fetch. It fetches nothing, so it is ready at once.
     ready: Vec<TaskId>,
+    /// Of the orders that it has waited for.
+    version: u64,
     /// Receipts by task and blob.
     uploaded: HashMap<(TaskId, Digest), String>,
 }
@@ -131,24 +133,29 @@ impl Worker {
             connection,
             joins_gangs: true,
             ready: Vec::new(),
+            version: 0,
             uploaded: HashMap::new(),
         })
     }
 
     /// Sends a heartbeat that is answered at once.
     pub(crate) async fn poll(&mut self) -> Result<Option<Assignment>> {
-        let poll = Poll {
-            incarnation: self.incarnation,
-            doing: vec![],
-            ready: self.ready.clone(),
-            version: 0,
-            leaving: false,
-        };
-        let desired: DesiredAssignments =
-            self.connection.post(&format!("/v1/workers/{}/poll", self.name), SECRET, &poll).await?;
+        let desired = self.ask(0).await?;
         let joins_gangs = self.joins_gangs;
         self.ready = desired.prepare.into_iter().filter(|_| joins_gangs).map(|prepare| prepare.task).collect();
         Ok(desired.assignments.into_iter().next())
+    }
+
+    /// Sends a poll that is held until there are new orders, or for as long as the server holds one.
+    pub(crate) async fn wait(&mut self) -> Result {
+        self.version = self.ask(self.version).await?.version;
+        Ok(())
+    }
+
+    async fn ask(&mut self, version: u64) -> Result<DesiredAssignments> {
+        let (incarnation, ready) = (self.incarnation, self.ready.clone());
+        let poll = Poll { incarnation, doing: vec![], ready, version, leaving: false };
+        self.connection.post(&format!("/v1/workers/{}/poll", self.name), SECRET, &poll).await
     }
 
     /// An empty manifest of the required kind, uploaded once by each worker.

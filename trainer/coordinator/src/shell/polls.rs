@@ -49,7 +49,7 @@ pub(crate) async fn join(
     });
     let policy = actor_handle.state().policy.clone();
     let incarnation = incarnation.expect("a join gives an incarnation");
-    Ok(Json(Joined { incarnation, lease_ms: policy.lease_ms, poll_ms: policy.poll_ms }))
+    Ok(Json(Joined { incarnation, lease_ms: policy.lease_ms, poll_ms: policy.idle_poll_ms() }))
 }
 
 /// Most kinds that a refusal names.
@@ -66,7 +66,7 @@ fn other_code(found: &BTreeMap<String, u32>, expected: &BTreeMap<String, u32>) -
     other.take(NAMED).map(says).collect()
 }
 
-/// Answers at once if the worker's assignments have changed, otherwise after `poll_ms`.
+/// Answers at once if the worker's orders have changed, otherwise after `poll_ms`, or later if there is nothing to report.
 pub(crate) async fn poll(
     State(actor_handle): State<Arc<ActorHandle>>,
     Path(worker): Path<WorkerId>,
@@ -87,20 +87,25 @@ async fn desired(
     Process { worker, incarnation }: Process,
     poll: Poll,
 ) -> Result<Json<DesiredAssignments>, Failure> {
-    let version = poll.version;
+    let (version, has_work) = (poll.version, !poll.doing.is_empty());
     let mut changes = actor_handle.changes();
     let mut stopped = actor_handle.stopped();
-    let deadline = tokio::time::Instant::now() + Duration::from_millis(actor_handle.state().policy.poll_ms);
+    let begun = tokio::time::Instant::now();
     actor_handle.poll(worker.clone(), poll).await?;
     loop {
         changes.mark_unchanged();
-        let mut desired = actor_handle.state().desired(&worker, incarnation)?;
+        let state = actor_handle.state();
+        let mut desired = state.desired(&worker, incarnation)?;
         for assignment in &mut desired.assignments {
             assignment.secret = actor_handle.secrets.of_grant(&proof.caller.name, &assignment.grant);
         }
         if desired.version != version {
             return Ok(Json(desired));
         }
+        let is_idle = !has_work && desired.assignments.is_empty() && desired.prepare.is_empty();
+        let wait = if is_idle { state.policy.idle_poll_ms() } else { state.policy.poll_ms };
+        let deadline = begun + Duration::from_millis(wait);
+        drop(state);
         tokio::select! {
             changed = tokio::time::timeout_at(deadline, changes.changed()) => {
                 if !matches!(changed, Ok(Ok(()))) {

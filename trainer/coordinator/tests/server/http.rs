@@ -1,7 +1,7 @@
 //! The server over a real socket with a real store, and a worker that does not compute.
 
 use std::collections::BTreeMap;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use axum::body::Body;
 use axum::http::{Request, StatusCode};
@@ -193,6 +193,41 @@ async fn until_over(handle: &Handle, run: &RunId) -> TestResult<protocol::messag
         }
         tokio::time::timeout(Duration::from_secs(20), changes.changed()).await??;
     }
+}
+
+/// Polls of workers without work are the most frequent calls of a large fleet.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_worker_without_work_is_answered_later_than_one_with_work() -> TestResult {
+    let dir = tempfile::tempdir()?;
+    let store = Store::open(dir.path(), Holder::this_process("a test")).await?;
+    let policy = Policy { poll_ms: 300, ..Policy::default() };
+    let idle = Duration::from_millis(policy.idle_poll_ms());
+    let handle = Coordinator::start(store, Config { policy, alone: false, park: false, ..Config::embedded() }).await?;
+    let client = Client::of(&handle);
+    let joined = join(&client, "w").await?;
+    assert_eq!(Duration::from_millis(joined.poll_ms), idle);
+    let poll = |doing: Vec<Doing>, version| {
+        let poll = Poll { incarnation: joined.incarnation, doing, ready: vec![], version, leaving: false };
+        client.call::<DesiredAssignments>("POST", "/v1/workers/w/poll", poll)
+    };
+    let version = poll(vec![], u64::MAX).await?.version;
+    let begun = Instant::now();
+    assert_eq!(poll(vec![], version).await?.version, version);
+    assert!(begun.elapsed() >= idle, "{:?}", begun.elapsed());
+
+    handle.submit(submission(None)?).await?;
+    let grant = assignment(&client, "w", &joined, "dataset").await?.grant;
+    let doing = || vec![Doing::new(grant.clone(), Default::default())];
+    let version = poll(doing(), u64::MAX).await?.version;
+    let mut fastest = Duration::MAX;
+    for _ in 0..3 {
+        let begun = Instant::now();
+        assert_eq!(poll(doing(), version).await?.version, version);
+        fastest = fastest.min(begun.elapsed());
+    }
+    assert!(fastest >= Duration::from_millis(300) && fastest < idle, "{fastest:?}");
+    handle.shutdown().await;
+    Ok(())
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
