@@ -119,14 +119,16 @@ async fn main() -> Result {
     let [p50, p99, max] = [50, 99, 100].map(|percent| percentile(&times, percent));
     writeln!(out, "{} heartbeats, 1,000 a second: median {p50:.1?}, p99 {p99:.1?}, longest {max:.1?}", times.len())?;
 
-    // First the datasets of all runs, so that every worker has work; then their VAEs.
-    for _ in 0..2 {
+    // First the datasets of all runs and their VAEs, so that every worker has a shard.
+    let mut prepares = true;
+    while std::mem::take(&mut prepares) {
         for worker in &mut workers {
             if let Some(assignment) = worker.poll().await?
                 && assignment.stage.name.as_str() != "latents"
             {
                 let output = worker.output(&assignment).await?;
                 worker.finish(assignment, output).await?;
+                prepares = true;
             }
         }
     }
