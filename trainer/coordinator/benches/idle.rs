@@ -6,6 +6,7 @@
 mod common;
 
 use std::fs;
+use std::io::Write as _;
 use std::time::{Duration, Instant};
 
 use coordinator::{Config, Coordinator};
@@ -58,7 +59,7 @@ async fn main() -> Result {
     let (begun, before) = (Instant::now(), server_time()?);
     tokio::time::sleep(MEASURED).await;
     let share = (server_time()? - before) / begun.elapsed().as_secs_f64();
-    println!("{WORKERS} idle workers cost the server {:.1} % of a core", share * 100.0);
+    writeln!(std::io::stdout(), "{WORKERS} idle workers cost the server {:.1} % of a core", share * 100.0)?;
     clients.shutdown_background();
     handle.shutdown().await;
     Ok(())
