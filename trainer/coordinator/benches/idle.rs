@@ -54,7 +54,7 @@ async fn main() -> Result {
         Result::Ok(())
     });
     joining.await??;
-    // Until the polls of those that joined together have spread.
+    // The first polls end together; later ones are spread.
     tokio::time::sleep(Duration::from_secs(5)).await;
     let (begun, before) = (Instant::now(), server_time()?);
     tokio::time::sleep(MEASURED).await;

@@ -198,7 +198,7 @@ impl Mesh {
     }
 }
 
-/// The incoming direction of a connection that nobody reads yet.
+/// The incoming direction of a connection before it has a thread that reads it.
 struct Incoming {
     stream: TcpStream,
     link: Arc<Link>,
@@ -214,7 +214,6 @@ impl Incoming {
         if let Err(error) = stream.set_read_timeout(Some(mesh.timing.patience * 3)) {
             return mesh.lose(rank, LossCause::Unreachable, error.to_string());
         }
-        mesh.event_count.notify();
         let reading = Reading::new(mesh, rank, &link);
         spawn("gang-read", move || read(reading, &stream, seal, pulse));
     }

@@ -264,8 +264,8 @@ pub(crate) fn connect(address: &str) -> Result<TcpStream, HandshakeError> {
     Err(last.into())
 }
 
-/// Performs the dialled side up to the dialer's proof. On success the dialer is authenticated as a member of the
-/// generation; [`welcome`] is the rest.
+/// Performs the dialled side up to the dialer's proof, which authenticates the dialer as a member of the generation. The
+/// rest is [`welcome`].
 pub(super) fn accept(stream: &mut Hurried<'_>, dial: &Dial, secret: &str) -> Result<Session, HandshakeError> {
     let answer = Answer { encrypts: dial.leaves || leaves_the_machine(stream.stream)?, nonce: nonce()? };
     let Answer { encrypts, nonce } = answer;

@@ -35,7 +35,8 @@ pub(super) struct Peer {
     pub(super) phase: Phase,
     /// True while the connection of the generation before is expected to continue here.
     pub(super) inherits: bool,
-    /// True while the link is one of the generation before over which the peer has not sent anything in this one.
+    /// True while the peer has not used the link in this generation: it has sent nothing over one of the generation before,
+    /// or has not welcomed this member over a new one.
     pub(super) is_unproven: bool,
     /// The frame that was sent first in this generation. A connection that replaces an inherited one begins with it.
     pub(super) first: Option<Head>,

@@ -103,7 +103,7 @@ pub(crate) struct Worker {
     pub(crate) joins_gangs: bool,
     /// Gang tasks of the last answer whose inputs it would fetch. It fetches nothing, so it is ready at once.
     ready: Vec<TaskId>,
-    /// Of the orders that it has waited for.
+    /// The version of its orders that [`Self::wait`] has last received.
     version: u64,
     /// Receipts by task and blob.
     uploaded: HashMap<(TaskId, Digest), String>,
