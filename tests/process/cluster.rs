@@ -321,7 +321,7 @@ fn p9_values_are_stored_once_though_rank_0_is_killed() {
     equals_reference(&cluster, &run, &view);
 }
 
-/// Sampled: the lines of a training stage of two workers; one of them is killed.
+/// Sampled: the lines of a training stage whose worker is killed and replaced.
 #[test]
 fn p13_lines_are_kept_in_order_though_their_worker_is_killed() {
     let mut cluster = Cluster::start(TRAINER);
@@ -612,8 +612,9 @@ fn p4_a_slow_joiner_holds_nobody_up() {
         assert!(cluster.stage(&run, "vae")["state"] == "running", "the stage was over too early to tell");
         cluster.said("w2").contains("adopts=true").then_some(())
     });
-    let view = cluster.wait_end(&run);
-    assert_eq!(stage_of(&view, "vae")["attempt"], 1);
+    cluster.wait_step(&run, "vae", done(&cluster) + 20);
+    assert_eq!(cluster.stage(&run, "vae")["attempt"], 1);
+    cluster.cancel(&run);
     cluster.fsck();
 }
 
@@ -667,7 +668,6 @@ fn p20_a_worker_that_refuses_its_peers_keeps_its_steps_and_its_rate() {
     eprintln!("{alone:.1} steps a second alone, {beside:.1} beside a worker that cannot reach it");
     assert!(beside >= 0.8 * alone, "{beside:.1} steps a second, {alone:.1} alone\n{}", cluster.everything());
     assert_eq!(at(&cluster).2, json!(["w1"]));
-    let view = cluster.wait_end(&run);
-    assert_eq!(stage_of(&view, "vae")["attempt"], 1);
+    cluster.cancel(&run);
     cluster.fsck();
 }

@@ -10,7 +10,7 @@ use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
 use nix::sys::signal::Signal;
-use serde_json::Value;
+use serde_json::{Value, json};
 
 use crate::bucket::Bucket;
 use crate::{Bench, PATIENCE, Running, signal, wait_for, wait_within};
@@ -368,6 +368,14 @@ impl Cluster {
         });
         assert!(view["state"] != "failed", "{view:#}\n{}", self.everything());
         view
+    }
+
+    /// Cancels a run that has shown what it should.
+    #[track_caller]
+    pub fn cancel(&self, run: &str) {
+        let reply = self.post(&format!("/v1/runs/{run}/cancel"), &json!({})).expect("answered");
+        assert_eq!(reply.status, 200, "{:#}", reply.body);
+        self.wait_end(run);
     }
 
     /// All current values of a stage: key -> (step, value).

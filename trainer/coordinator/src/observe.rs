@@ -120,22 +120,25 @@ fn tick(state: &mut State, at: Millis, overslept: u64) -> Vec<Event> {
         }
     }
     let mut events = Vec::new();
-    let unheard: Vec<WorkerId> =
-        state.workers.keys().filter(|name| !state.heard.workers.contains_key(*name)).cloned().collect();
-    for name in unheard {
-        state.heard.workers.insert_mut(name, at);
-    }
+    let mut unheard = Vec::new();
     for (name, worker) in state.workers.iter() {
-        let (worker, incarnation, silent) = (name.clone(), worker.incarnation, at.since(state.heard.workers[name]));
-        match state.workers[name].presence {
+        let Some(heard) = state.heard.workers.get(name) else {
+            unheard.push(name.clone());
+            continue;
+        };
+        let (silent, incarnation) = (at.since(*heard), worker.incarnation);
+        match worker.presence {
             Presence::Here | Presence::Suspect { .. } if silent > state.policy.lease_ms => {
-                events.push(Event::LeaseExpired { worker, incarnation });
+                events.push(Event::LeaseExpired { worker: name.clone(), incarnation });
             }
             Presence::Silent | Presence::Gone if silent > state.policy.forget_ms => {
-                events.push(Event::WorkerForgotten { worker, incarnation });
+                events.push(Event::WorkerForgotten { worker: name.clone(), incarnation });
             }
             Presence::Here | Presence::Suspect { .. } | Presence::Silent | Presence::Gone => {}
         }
+    }
+    for name in unheard {
+        state.heard.workers.insert_mut(name, at);
     }
     let due = state.queue.due(now).filter_map(|key| state.executions.get(&key));
     let due = due.flat_map(|execution| execution.tasks.due(now).map(|i| &execution.tasks[i]));
