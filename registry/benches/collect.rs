@@ -1,15 +1,18 @@
 //! A collection (`registry gc`) in a store with 1,000,000 results, of whose blobs 1 % are garbage: time and peak memory of
-//! the process. `cargo bench -p registry --bench collect`.
+//! the process. `cargo bench -p registry --bench collect`; with `STRIDE_TEST_CATALOG=durable` the catalog is in PostgreSQL,
+//! moved there by `registry migrate`.
 //!
 //! Each result has a manifest of its own, with one file out of 10,000 and two parents. The files of the store take 4 GB,
 //! written without waiting for the disk. Their put times are two hours ago, outside the grace period.
 
+use std::ffi::OsStr;
 use std::fs::{self, File};
 use std::io::Write as _;
 use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant, SystemTime};
 
+use cluster_tests::postgres::Postgres;
 use protocol::artifact::FileEntry;
 use protocol::{ArtifactKind, Digest, Manifest};
 use registry::{Holder, Store};
@@ -92,19 +95,23 @@ async fn fill(dir: &Path) -> Result {
     Ok(())
 }
 
-/// Runs the program, and returns its time and peak memory in bytes.
-fn run(dir: &Path) -> Result<(Duration, u64)> {
+/// Runs a command of the program, and returns its time and peak memory in bytes.
+fn run(arguments: &[&OsStr]) -> Result<(Duration, u64)> {
     let mut program = Command::new(env!("CARGO_BIN_EXE_registry"));
     let begun = Instant::now();
-    let mut child = program.arg("gc").arg("--store").arg(dir).stdout(Stdio::inherit()).spawn()?;
+    let mut child = program.args(arguments).stdout(Stdio::inherit()).spawn()?;
     let mut peak = 0;
-    while child.try_wait()?.is_none() {
+    let ended = loop {
+        if let Some(ended) = child.try_wait()? {
+            break ended;
+        }
         let status = fs::read_to_string(format!("/proc/{}/status", child.id())).unwrap_or_default();
         let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"));
         let kib = line.and_then(|line| line.trim().trim_end_matches(" kB").parse::<u64>().ok());
         peak = kib.map_or(peak, |kib| kib * 1024);
         std::thread::sleep(Duration::from_millis(20));
-    }
+    };
+    assert!(ended.success(), "{arguments:?}: {ended}");
     Ok((begun.elapsed(), peak))
 }
 
@@ -114,7 +121,14 @@ async fn main() -> Result {
     let begun = Instant::now();
     fill(dir.path()).await?;
     writeln!(std::io::stdout(), "{RESULTS} results written in {:.0?}", begun.elapsed())?;
-    let (took, peak) = run(dir.path())?;
+    let folder = dir.path().as_os_str();
+    if std::env::var("STRIDE_TEST_CATALOG").is_ok_and(|catalog| catalog == "durable") {
+        let server = Postgres::shared().ok_or("PostgreSQL is not installed")?;
+        let address = server.address(&server.create());
+        let (took, _) = run(&["migrate".as_ref(), "--from".as_ref(), folder, "--to".as_ref(), address.as_ref()])?;
+        writeln!(std::io::stdout(), "moved to PostgreSQL in {took:.0?}")?;
+    }
+    let (took, peak) = run(&["gc".as_ref(), "--store".as_ref(), folder])?;
     writeln!(std::io::stdout(), "collected in {took:.1?} with {} MB at most", peak / 1_000_000)?;
     let left = fs::read_dir(dir.path().join("blobs/sha256"))?
         .map(|shard| Ok(fs::read_dir(shard?.path())?.count() as u64))
