@@ -583,7 +583,7 @@ fn a_worker_leaves_in_time_though_the_coordinator_is_gone() {
 fn p4_a_slow_joiner_holds_nobody_up() {
     let sets = [
         "--set",
-        "stages.vae.steps=800",
+        "stages.vae.steps=4000",
         "--set",
         "stages.vae.windows.until=1",
         "--set",
@@ -624,7 +624,7 @@ fn p4_a_slow_joiner_holds_nobody_up() {
 fn p20_a_worker_that_refuses_its_peers_keeps_its_steps_and_its_rate() {
     let sets = [
         "--set",
-        "stages.vae.steps=1500",
+        "stages.vae.steps=8000",
         "--set",
         "stages.vae.windows.until=1",
         "--set",
