@@ -50,7 +50,7 @@ impl Shared {
         Arc::new(Self {
             held: Mutex::default(),
             work: EventCount::default(),
-            preparation: Preparation::new(wake.clone()),
+            preparation: Preparation::new(endpoint.clone(), wake.clone()),
             wake,
             flags: Arc::default(),
             over: AtomicBool::new(false),

@@ -21,7 +21,8 @@ use tokio::sync::{Notify, watch};
 use crate::cache::{Arriving, Cache, Cached};
 use crate::client::{CallError, Client};
 use crate::event_count::lock;
-use crate::gang::handshake::{self, HandshakeError};
+use crate::gang::endpoint::Endpoint;
+use crate::gang::handshake::HandshakeError;
 
 /// Pause between two tries to fetch a blob.
 const PAUSE: Duration = Duration::from_secs(1);
@@ -35,6 +36,7 @@ pub(crate) struct Preparation {
     wanted: watch::Sender<Option<Vec<Prepare>>>,
     /// Tasks that are ready, with the digests of all their inputs.
     ready: Mutex<Vec<(Prepare, Vec<Digest>)>>,
+    endpoint: Arc<Endpoint>,
     /// Wakes the poll, which reports the ready tasks.
     wake: Arc<Notify>,
 }
@@ -61,8 +63,8 @@ enum Stopped {
 type News = watch::Receiver<Option<Vec<Prepare>>>;
 
 impl Preparation {
-    pub(crate) fn new(wake: Arc<Notify>) -> Self {
-        Self { wanted: watch::Sender::new(Some(Vec::new())), ready: Mutex::default(), wake }
+    pub(crate) fn new(endpoint: Arc<Endpoint>, wake: Arc<Notify>) -> Self {
+        Self { wanted: watch::Sender::new(Some(Vec::new())), ready: Mutex::default(), endpoint, wake }
     }
 
     /// Sets the tasks to prepare; forgets ready tasks that are not among them.
@@ -148,7 +150,7 @@ impl Preparation {
         *missed = if matches!(prepared, Err(Stopped::Call(CallError::NotFound(_)))) { *missed + 1 } else { 0 };
         let all = prepared?;
         for Member { worker, peer_address, .. } in &task.peers {
-            let answers = handshake::probe(peer_address);
+            let answers = self.endpoint.probe(peer_address);
             answers.map_err(|error| Stopped::Peer(worker.clone(), peer_address.clone(), error))?;
         }
         Ok(all)

@@ -80,6 +80,14 @@ impl Seat {
         Ok(Self { worker: WorkerId::new(name), endpoint, held: Mutex::default(), wake: Arc::default(), runtime })
     }
 
+    /// Checks that a member that this one will join answers, as a worker does before it is ready for a gang.
+    ///
+    /// # Errors
+    /// If it does not answer.
+    pub fn probe(&self, address: &str) -> io::Result<()> {
+        self.endpoint.probe(address).map_err(io::Error::other)
+    }
+
     /// Gives this worker its place in a generation: names and addresses of all members, in the order of their ranks.
     pub fn order(&self, generation: u64, members: &[(&str, &str)]) {
         let member = |(name, address): &(&str, &str)| Member {

@@ -1,5 +1,6 @@
 //! A member's process. Orders come as lines by its standard input, and answers go out as lines.
 //!
+//! - `probe ADDRESS...` asks if the members of the gang answer, before this one joins. The answer is `ready`.
 //! - `gang GENERATION NAME=ADDRESS...` names the members of the next generation.
 //! - `run N` asks for N exchanges. The answer is `done MICROSECONDS,... DIGEST` of the last sum.
 //! - `go` asks for exchanges without end. Each one gives a line `step MICROSECONDS GENERATION`, since 1970.
@@ -126,6 +127,10 @@ fn follow(seat: &Arc<Seat>) -> mpsc::Receiver<String> {
                     let members: Vec<_> = words.filter_map(|word| word.split_once('=')).collect();
                     seat.order(generation, &members);
                 }
+                Some("probe") => match words.try_for_each(|address| seat.probe(address)) {
+                    Ok(()) => say("ready"),
+                    Err(error) => say(&format!("failed {error}")),
+                },
                 Some("end") => seat.dismiss(),
                 _ => {
                     let _ = sender.send(line);

@@ -93,6 +93,13 @@ impl<'a> Processes<'a> {
         self.await_from("listens", &[who]).map(drop)
     }
 
+    /// Waits until member `who` has an answer of each of `members`, as a worker does before it joins.
+    pub(crate) fn prepare(&mut self, who: usize, members: &[usize]) -> Result {
+        let addresses: Vec<String> = members.iter().map(|who| self.address(*who)).collect();
+        self.tell(who, &format!("probe {}", addresses.join(" ")));
+        self.await_from("ready", &[who]).map(drop)
+    }
+
     /// Sends a member a line. One that has ended misses it.
     pub(crate) fn tell(&mut self, who: usize, line: &str) {
         if let Some((_, stdin)) = self.running.get_mut(who).and_then(Option::as_mut) {

@@ -70,13 +70,28 @@ impl Gang<'_> {
     /// Listens until all `members` have made `count` steps of a generation.
     fn await_steps(&mut self, members: &[usize], generation: u64, count: usize) -> Result {
         while !self.steps.have(members, generation, count) {
-            let said = self.processes.next()?;
-            if said.words[0] == "failed" {
-                return Err(said.words.join(" ").into());
-            }
-            self.steps.hear(said.who, &said.words)?;
+            self.listen()?;
         }
         Ok(())
+    }
+
+    /// Listens until all `members` have made another step of a generation. Steps during the start of a process are not
+    /// heard.
+    fn await_another_step(&mut self, members: &[usize], generation: u64) -> Result {
+        let heard = |steps: &Steps| members.iter().map(|who| steps.of(*who, generation).count()).collect::<Vec<_>>();
+        let before = heard(&self.steps);
+        while heard(&self.steps).iter().zip(&before).any(|(now, before)| now <= before) {
+            self.listen()?;
+        }
+        Ok(())
+    }
+
+    fn listen(&mut self) -> Result {
+        let said = self.processes.next()?;
+        if said.words[0] == "failed" {
+            return Err(said.words.join(" ").into());
+        }
+        self.steps.hear(said.who, &said.words)
     }
 
     /// Seconds from the last step of a generation to the first one of the next: the longest of these members.
@@ -119,6 +134,8 @@ fn rows(name: &'static str, line: Line, members: usize, parameters: usize) -> Re
     for round in 0..2 * ROUNDS {
         let dies = round % 2 == 1;
         gang.processes.start(last)?;
+        gang.processes.prepare(last, &stay)?;
+        gang.await_another_step(&stay, few)?;
         let many = gang.processes.regroup(&all);
         gang.processes.tell(last, "go");
         gang.await_steps(&all, many, STEPS)?;

@@ -34,15 +34,16 @@ impl Mesh {
         before: Option<&Arc<Self>>,
     ) -> Arc<Self> {
         let peers = Mutex::new(config.members.iter().map(|_| Peer::new()).collect());
-        let timing = endpoint.timing;
         let waits_for = AtomicUsize::new(0);
         let closed = AtomicBool::new(false);
+        let timing = endpoint.timing;
         let pace = Pace::new(config.members.len(), timing.slow);
         let memory = config.members.iter().map(|_| Mutex::default()).collect();
         let uses_no_memory = AtomicBool::new(false);
         let successor = Arc::default();
         let mesh = Self {
             config,
+            endpoint: endpoint.clone(),
             timing,
             peers,
             event_count,
@@ -100,7 +101,7 @@ impl Mesh {
     /// Dials a rank once. The stage sends to it before its welcome is here, which saves a crossing of the line in both
     /// directions.
     fn connect(self: &Arc<Self>, rank: usize) -> Result<(), HandshakeError> {
-        let stream = handshake::connect(&self.config.members[rank].peer_address)?;
+        let stream = self.endpoint.connect(&self.config.members[rank].peer_address)?;
         let hurried = &mut Hurried::new(&stream, Instant::now())?;
         let MeshConfig { task, generation, rank: from, secret, .. } = &self.config;
         let session = handshake::dial(hurried, task, *generation, *from, rank, secret)?;

@@ -17,6 +17,10 @@ use super::handshake::{self, HandshakeError, Hurried, Session};
 use super::member::{MeshConfig, Timing, spawn};
 use crate::event_count::lock;
 
+/// Longest use of a connection after its probe. The other side ends it after [`PATIENCE`](handshake::PATIENCE), which
+/// includes the handshake.
+const KEPT: Duration = Duration::from_secs(3);
+
 /// A gang of this process, from the view of an incoming connection.
 pub(super) trait Gang: std::fmt::Debug + Send + Sync {
     /// Identity and members of the gang.
@@ -34,6 +38,8 @@ pub(crate) struct Endpoint {
     pub(super) timing: Timing,
     gangs: Mutex<HashMap<(TaskId, Generation), Weak<dyn Gang>>>,
     strangers: Mutex<Strangers>,
+    /// Connections of [`probe`](Self::probe) by address, with the time of each.
+    probed: Mutex<HashMap<String, (Instant, TcpStream)>>,
 }
 
 /// Connections before the end of their handshake, oldest first.
@@ -74,7 +80,8 @@ impl Endpoint {
     pub(crate) fn open(address: SocketAddr, timing: Timing) -> io::Result<Arc<Self>> {
         let listener = TcpListener::bind(address)?;
         let address = listener.local_addr()?;
-        let endpoint = Arc::new(Self { address, timing, gangs: Mutex::default(), strangers: Mutex::default() });
+        let (gangs, strangers, probed) = Default::default();
+        let endpoint = Arc::new(Self { address, timing, gangs, strangers, probed });
         let weak = Arc::downgrade(&endpoint);
         spawn("gang-accept", move || accept(&weak, &listener));
         Ok(endpoint)
@@ -85,6 +92,25 @@ impl Endpoint {
         self.address
     }
 
+    /// Checks that a worker listens at `address` and its answers arrive. Does not authenticate it.
+    ///
+    /// The handshake may follow over the same connection. So a joiner does not need to connect while its gang waits.
+    pub(crate) fn probe(&self, address: &str) -> Result<(), HandshakeError> {
+        let stream = handshake::probe(address)?;
+        let mut probed = lock(&self.probed);
+        probed.retain(|_, (since, _)| since.elapsed() < KEPT);
+        probed.insert(address.to_owned(), (Instant::now(), stream));
+        Ok(())
+    }
+
+    /// Returns the connection of the last probe of `address`, or a new one.
+    pub(super) fn connect(&self, address: &str) -> Result<TcpStream, HandshakeError> {
+        match lock(&self.probed).remove(address) {
+            Some((since, stream)) if since.elapsed() < KEPT => Ok(stream),
+            _ => handshake::connect(address),
+        }
+    }
+
     pub(super) fn announce(&self, config: &MeshConfig, gang: Weak<dyn Gang>) {
         let mut gangs = lock(&self.gangs);
         gangs.retain(|_, gang| gang.strong_count() > 0);
@@ -93,7 +119,7 @@ impl Endpoint {
 
     fn welcome(&self, number: u64, stream: TcpStream, since: Instant) -> Result<(), HandshakeError> {
         let hurried = &mut Hurried::new(&stream, since)?;
-        let Some(dial) = handshake::wanted(hurried)? else { return Ok(()) };
+        let dial = handshake::wanted(hurried)?;
         let unknown = || HandshakeError::Unknown { task: dial.task.clone(), generation: dial.generation };
         let key = (dial.task.clone(), dial.generation);
         let gang = lock(&self.gangs).get(&key).and_then(Weak::upgrade);

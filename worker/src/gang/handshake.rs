@@ -231,29 +231,29 @@ pub(super) fn welcomed(stream: &mut Hurried<'_>) -> Result<(), HandshakeError> {
     receive(stream, Kind::Welcome)
 }
 
-/// Reads the first frame on the dialled side and returns the dialer's request. Answers a [`probe`] and returns `None`.
-pub(super) fn wanted(stream: &mut Hurried<'_>) -> Result<Option<Dial>, HandshakeError> {
-    let frame = frame::read(stream)?;
-    match frame.kind {
-        Kind::Dial => Ok(Some(serde_json::from_slice(frame.bytes())?)),
-        Kind::Probe => {
-            send(stream, Kind::Probe, &())?;
-            Ok(None)
+/// Reads the dialer's request on the dialled side. Answers each [`probe`] before it.
+pub(super) fn wanted(stream: &mut Hurried<'_>) -> Result<Dial, HandshakeError> {
+    loop {
+        let frame = frame::read(stream)?;
+        match frame.kind {
+            Kind::Dial => return Ok(serde_json::from_slice(frame.bytes())?),
+            Kind::Probe => send(stream, Kind::Probe, &())?,
+            found => return Err(HandshakeError::Unexpected { expected: Kind::Dial, found }),
         }
-        found => Err(HandshakeError::Unexpected { expected: Kind::Dial, found }),
     }
 }
 
-/// Checks that a worker listens at `address` and its answers arrive. Does not authenticate it.
-pub(crate) fn probe(address: &str) -> Result<(), HandshakeError> {
+/// Connects to a worker that listens at `address` and answers. Does not authenticate it.
+pub(super) fn probe(address: &str) -> Result<TcpStream, HandshakeError> {
     let stream = connect(address)?;
-    let stream = &mut Hurried::new(&stream, Instant::now())?;
-    send(stream, Kind::Probe, &())?;
-    receive::<()>(stream, Kind::Probe)
+    let hurried = &mut Hurried::new(&stream, Instant::now())?;
+    send(hurried, Kind::Probe, &())?;
+    receive::<()>(hurried, Kind::Probe)?;
+    Ok(stream)
 }
 
 /// Connects to the first IP address of `address` that accepts.
-pub(crate) fn connect(address: &str) -> Result<TcpStream, HandshakeError> {
+pub(super) fn connect(address: &str) -> Result<TcpStream, HandshakeError> {
     let mut last = io::Error::new(io::ErrorKind::AddrNotAvailable, format!("cannot resolve `{address}` to an address"));
     for socket in address.to_socket_addrs()? {
         match TcpStream::connect_timeout(&socket, PATIENCE) {
@@ -310,7 +310,7 @@ mod tests {
         let (stream, _) = listener.accept()?;
         let stream = &mut Hurried::new(&stream, Instant::now())?;
         let dial = wanted(stream)?;
-        let session = accept(stream, &dial.expect("a dialer"), secret)?;
+        let session = accept(stream, &dial, secret)?;
         welcome(stream).map(|()| session)
     }
 

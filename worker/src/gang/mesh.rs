@@ -17,6 +17,7 @@ use protocol::message::{LossCause, LostPeer};
 use protocol::{Generation, WorkerId};
 use tokio::sync::Notify;
 
+use super::endpoint::Endpoint;
 use super::frame::{Frame, Head, Kind, MAX_PAYLOAD};
 use super::link::{BLINK, Link, Sign};
 use super::member::{MeshConfig, Phase, Timing};
@@ -48,6 +49,7 @@ pub(crate) enum Halt {
 #[derive(Debug)]
 pub(crate) struct Mesh {
     pub(crate) config: MeshConfig,
+    pub(super) endpoint: Arc<Endpoint>,
     pub(super) timing: Timing,
     pub(super) peers: Mutex<Vec<Peer>>,
     pub(super) event_count: Arc<EventCount>,
@@ -76,6 +78,14 @@ impl Mesh {
         let rank = self.config.rank;
         let size = self.size();
         (1..size).map(move |i| (rank + i) % size)
+    }
+
+    /// The same ranks, connected ones first, so that they do not wait for the connection of another one.
+    pub(super) fn others_connected_first(&self) -> Vec<usize> {
+        let peers = lock(&self.peers);
+        let (mut connected, unmet): (Vec<_>, Vec<_>) = self.others().partition(|rank| peers[*rank].link.is_some());
+        connected.extend(unmet);
+        connected
     }
 
     /// The members with which this one cannot continue in this generation.

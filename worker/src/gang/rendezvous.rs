@@ -64,7 +64,7 @@ pub(crate) fn rendezvous(
     let barrier = rendezvous_barrier(mesh);
     let own = mesh.config.rank;
     let head = Head::new(Kind::Applied, applied.unwrap_or(0), u32::from(applied.is_some()), 0);
-    for peer in mesh.others() {
+    for peer in mesh.others_connected_first() {
         mesh.send(peer, &barrier, head, &[], interrupt)?;
     }
     let mut at = vec![None; mesh.size()];

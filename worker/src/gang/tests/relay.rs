@@ -26,17 +26,18 @@ struct Relay {
     /// From the dialer to the dialled member.
     there: Arc<Direction>,
     back: Arc<Direction>,
+    connections: Arc<AtomicU64>,
 }
 
 impl Relay {
     fn to(server: SocketAddr) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").expect("a free port");
         let address = listener.local_addr().expect("bound");
-        let relay = Self { address, there: Arc::default(), back: Arc::default() };
-        let there = relay.there.clone();
-        let back = relay.back.clone();
+        let relay = Self { address, there: Arc::default(), back: Arc::default(), connections: Arc::default() };
+        let Self { there, back, connections, .. } = relay.clone();
         thread::spawn(move || {
             for client in listener.incoming().flatten() {
+                connections.fetch_add(1, Ordering::SeqCst);
                 let Ok(server) = TcpStream::connect(server) else { continue };
                 let twice = |stream: &TcpStream| stream.try_clone().expect("a socket twice");
                 pass(twice(&client), twice(&server), there.clone());
@@ -85,12 +86,23 @@ fn pass(mut from: TcpStream, mut to: TcpStream, direction: Arc<Direction>) {
     });
 }
 
-/// Two members; the second dials the first through a relay.
-fn pair(timing: Timing) -> (Relay, [Arc<Mesh>; 2]) {
+/// Two seats; the second reaches the first through a relay.
+fn apart(timing: Timing) -> (Relay, Arc<Gang>) {
     let mut gang = Gang::new(2, timing);
     let relay = Relay::to(gang.seats[0].endpoint.address());
     Arc::get_mut(&mut gang).expect("not shared yet").seats[0].member.peer_address = relay.address.to_string();
-    let meshes = [0, 1].map(|own| mesh(&gang, &[0, 1], own, "s").0);
+    (relay, gang)
+}
+
+/// Two members that have met through a relay.
+fn pair(timing: Timing) -> (Relay, [Arc<Mesh>; 2]) {
+    let (relay, gang) = apart(timing);
+    let meshes = met(&gang);
+    (relay, meshes)
+}
+
+fn met(gang: &Gang) -> [Arc<Mesh>; 2] {
+    let meshes = [0, 1].map(|own| mesh(gang, &[0, 1], own, "s").0);
     meshes.iter().for_each(|mesh| mesh.use_no_memory());
     thread::scope(|scope| {
         for mesh in &meshes {
@@ -99,7 +111,25 @@ fn pair(timing: Timing) -> (Relay, [Arc<Mesh>; 2]) {
     });
     // As a stage does once its members have met; no peer is named while one of them starts or saves.
     meshes.iter().for_each(|mesh| mesh.config.busy.set(Phase::Working));
-    (relay, meshes)
+    meshes
+}
+
+/// A joiner has asked its peer before. The second time, strangers have taken the place of that connection.
+#[test]
+fn a_handshake_follows_over_the_connection_of_the_probe() {
+    for has_ended in [false, true] {
+        let (relay, gang) = apart(QUICK);
+        let [peer, joiner] = [0, 1].map(|seat| gang.seats[seat].endpoint.clone());
+        joiner.probe(&relay.address.to_string()).expect("an answer");
+        let strangers = if has_ended { Endpoint::STRANGERS } else { 0 };
+        let _strangers: Vec<_> =
+            (0..strangers).map(|_| TcpStream::connect(peer.address()).expect("listening")).collect();
+        // Connections are accepted in their order.
+        joiner.probe(&peer.address().to_string()).expect("an answer");
+        let meshes = met(&gang);
+        assert_eq!(relay.connections.load(Ordering::SeqCst), 1 + u64::from(has_ended));
+        meshes.into_iter().for_each(|mesh| mesh.close(None));
+    }
 }
 
 fn slow(worker: &str) -> LostPeer {

@@ -11,7 +11,7 @@ use crate::gang::rendezvous::Met;
 fn proved(listener: &TcpListener) -> (TcpStream, Session) {
     let (stream, _) = listener.accept().expect("a dialer");
     let hurried = &mut Hurried::new(&stream, Instant::now()).expect("connected");
-    let wanted = handshake::wanted(hurried).expect("a request").expect("a dialer");
+    let wanted = handshake::wanted(hurried).expect("a request");
     let session = handshake::accept(hurried, &wanted, "s").expect("proved");
     (stream, session)
 }
