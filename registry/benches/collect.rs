@@ -50,20 +50,35 @@ fn put(blobs: &Path, bytes: &[u8], at: SystemTime) -> Result<Digest> {
     Ok(digest)
 }
 
+/// Records blobs as stored, as the naming of an artifact does, with the references of each by its place.
+async fn present(
+    database: &mut SqliteConnection,
+    blobs: &[Digest],
+    refers: impl Fn(usize) -> Option<String>,
+) -> Result {
+    let mut rows = QueryBuilder::new("INSERT INTO blobs (digest, bytes, verified_ms, refers) ");
+    rows.push_values(blobs.iter().enumerate(), |mut row, (place, blob)| {
+        row.push_bind(blob.to_string()).push("1").push("0").push_bind(refers(place));
+    });
+    rows.build().execute(database).await?;
+    Ok(())
+}
+
 /// Fills an empty store.
 async fn fill(dir: &Path) -> Result {
     drop(Store::open(dir, Holder::this_process("a bench")).await?);
     let blobs = dir.join("blobs/sha256");
     (0..=255).try_for_each(|shard| fs::create_dir_all(blobs.join(format!("{shard:02x}"))))?;
     let at = SystemTime::now() - Duration::from_secs(7200);
-    for number in 0..FILES {
-        put(&blobs, &file(number), at)?;
-    }
+    let files: Vec<Digest> = (0..FILES).map(|number| put(&blobs, &file(number), at)).collect::<Result<_>>()?;
     for number in 0..GARBAGE {
         put(&blobs, format!("garbage {number}").as_bytes(), at)?;
     }
     let options = SqliteConnectOptions::new().filename(dir.join("stride.db")).synchronous(SqliteSynchronous::Off);
     let mut database = SqliteConnection::connect_with(&options).await?;
+    for files in files.chunks(BATCH as usize) {
+        present(&mut database, files, |_| None).await?;
+    }
     let mut before = [Digest::of(b"a"); 2];
     for first in (0..RESULTS).step_by(BATCH as usize) {
         let results: Vec<_> =
@@ -90,6 +105,12 @@ async fn fill(dir: &Path) -> Result {
             row.push_bind(parent.to_string()).push_bind(child.to_string()).push_bind(["dataset", "model"][i % 2]);
         });
         rows.build().execute(&mut database).await?;
+        let digests: Vec<Digest> = results.iter().map(|(_, digest)| *digest).collect();
+        let refers = |place: usize| {
+            let file = files[((first + place as u64) % FILES) as usize];
+            Some(json!({"blobs": [file], "mentioned": []}).to_string())
+        };
+        present(&mut database, &digests, refers).await?;
     }
     database.close().await?;
     Ok(())

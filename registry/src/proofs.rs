@@ -15,10 +15,10 @@
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use protocol::artifact::mentioned;
 use protocol::{ArtifactKind, Digest, Manifest};
 
 use crate::WriteError;
+use crate::catalog::References;
 use crate::lease::{LeaseCheck, NoLease};
 
 /// Facts about an artifact that rows need.
@@ -29,21 +29,18 @@ pub(crate) struct Artifact {
     pub(crate) blobs: BTreeMap<Digest, u64>,
     /// Total bytes of its files.
     pub(crate) bytes: u64,
-    /// Digests in the manifest's `meta`.
-    pub(crate) mentioned: Vec<Digest>,
+    pub(crate) references: References,
 }
 
 impl Artifact {
     /// Reads the facts from a manifest with digest `digest` and length `own`.
     pub(crate) fn of(digest: Digest, own: u64, manifest: &Manifest) -> Self {
-        let mut found = Vec::new();
-        mentioned(&manifest.meta, &mut found);
         let files = manifest.blobs().map(|blob| (blob.digest, blob.bytes));
         Self {
             kind: manifest.kind,
             bytes: manifest.files.values().map(|file| file.bytes).sum(),
             blobs: files.chain([(digest, own)]).collect(),
-            mentioned: found,
+            references: References::of(manifest),
         }
     }
 }
@@ -124,8 +121,8 @@ impl Proofs {
             return Err(WriteError::Unproven { artifact: digest });
         }
         if let Some(names) = &mut inner.named {
-            names.blobs.extend(artifact.blobs.keys().chain(&artifact.mentioned));
-            names.to_follow.extend(&artifact.mentioned);
+            names.blobs.extend(artifact.blobs.keys().chain(&artifact.references.mentioned));
+            names.to_follow.extend(&artifact.references.mentioned);
         }
         Ok(artifact)
     }
@@ -237,7 +234,7 @@ mod tests {
 
     fn artifact(digest: Digest, file: Digest) -> Artifact {
         let blobs = [(digest, 1), (file, 2)].into();
-        Artifact { kind: ArtifactKind::Vae, blobs, bytes: 2, mentioned: Vec::new() }
+        Artifact { kind: ArtifactKind::Vae, blobs, bytes: 2, references: References::default() }
     }
 
     fn is_unproven(proofs: &Proofs, digest: Digest) -> bool {

@@ -3,7 +3,7 @@
 //! Roots with a row are every version (and thus every alias), every stage result, every checkpoint that was not pruned,
 //! every shard of a run that may need it, and every pin. Further roots are uploads of held tasks ([`Store::hold`]) and
 //! blobs about to be named ([`BlobStore::held`]). From a root the mark follows the manifest's files, the digests in its
-//! `meta`, and the lineage.
+//! `meta`, and the lineage. The catalog has the references of most artifacts; other manifests are read.
 //!
 //! A blob within its grace period is never collected, because the row that names it may follow. While a run is under
 //! way, blobs from before the store was opened have at least the usual grace period.
@@ -20,14 +20,13 @@ use std::sync::Arc;
 
 use checkpoint::BlobError;
 use futures::{StreamExt as _, TryStreamExt as _, stream};
-use protocol::artifact::mentioned;
 use protocol::{Digest, TaskId};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::blob::{BlobStore, Entry, ManifestError};
 use crate::calls::Calls;
-use crate::catalog::Needs;
+use crate::catalog::{Needs, References};
 use crate::lock::CollectionLock;
 use crate::proofs::Proofs;
 use crate::{QueryError, ReadStore, Store, WriteError, clock};
@@ -58,10 +57,11 @@ impl ReadStore {
     pub async fn gc_plan(&self, grace_ms: i64) -> Result<Plan, QueryError> {
         let rows = Rows::of(self).await?;
         let ages = Ages { now_ms: clock::now_ms(), grace_ms, opened_ms: self.opened_ms(), live: rows.live };
-        let planned = plan(&BlobCalls::of(self), &rows, &ages).await;
+        let of = Collected::of(self);
+        let planned = plan(&of, &rows, &ages).await;
         let (plan, candidates) = self.explained(planned).await?;
         let bytes = candidates.iter().map(|entry| entry.bytes).sum();
-        let unfinished = BlobCalls::of(self).ask(BlobStore::unfinished).await;
+        let unfinished = of.place.ask(BlobStore::unfinished).await;
         let uploads = unfinished.map_err(|e| QueryError::Blob(e.to_string()))?.len() as u64;
         let remove = candidates.iter().map(|entry| entry.digest).collect();
         Ok(Plan { remove, bytes, uploads, ..plan })
@@ -80,15 +80,15 @@ impl Store {
         let forgotten = self.begin_collection().await?;
         let rows = Rows::of(self).await?;
         let ages = Ages { now_ms: clock::now_ms(), grace_ms, opened_ms: self.opened_ms(), live: rows.live };
-        let place = BlobCalls::of(self);
-        let planned = plan(&place, &rows, &ages).await;
+        let of = Collected::of(self);
+        let planned = plan(&of, &rows, &ages).await;
         let plan = match self.explained(planned).await {
-            Ok((plan, candidates)) => self.sweep(&place, &rows, plan, candidates, ages).await,
+            Ok((plan, candidates)) => self.sweep(&of, &rows, plan, candidates, ages).await,
             Err(e) => Err(e.into()),
         };
         crate::reserve::keep(self.dir());
         let plan = plan?;
-        let uploads = place.ask(BlobStore::give_up_unfinished).await;
+        let uploads = of.place.ask(BlobStore::give_up_unfinished).await;
         let uploads = uploads.map_err(|e| WriteError::Storage(e.to_string()))?;
         Ok(Plan { forget_shards: forgotten, uploads, ..plan })
     }
@@ -96,7 +96,7 @@ impl Store {
     /// Removes the planned blobs, except blobs that were put again or named since.
     async fn sweep(
         &self,
-        place: &BlobCalls,
+        of: &Collected<'_>,
         rows: &Rows,
         mut plan: Plan,
         candidates: Vec<Entry>,
@@ -105,13 +105,13 @@ impl Store {
         let mut kept = Marks::default();
         for batch in candidates.chunks(BATCH) {
             // Follows the references of names in new rows.
-            let marked = mark(place, rows, self.proofs().to_follow(), &mut kept).await;
+            let marked = mark(of, rows, self.proofs().to_follow(), &mut kept).await;
             self.explained(marked).await?;
             let batch = batch.iter().map(|entry| entry.digest).filter(|digest| !kept.has(*digest));
             let condemned = Condemned(Arc::clone(self.proofs()), self.condemn(batch.collect()).await?);
             let removing = stream::iter(condemned.1.clone()).map(|digest| {
                 let is_young = move |put_ms| put_ms >= ages.before_ms(put_ms);
-                place.ask(move |blobs| blobs.remove_unless(digest, is_young))
+                of.place.ask(move |blobs| blobs.remove_unless(digest, is_young))
             });
             let removed = removing.buffer_unordered(AT_ONCE).try_collect::<Vec<Option<Entry>>>().await;
             drop(condemned);
@@ -161,6 +161,18 @@ impl BlobCalls {
 
     async fn list(&self) -> Result<Vec<Entry>, QueryError> {
         self.ask(BlobStore::list).await.map_err(|e| QueryError::Blob(e.to_string()))
+    }
+}
+
+/// The catalog and the blobs of a collection.
+struct Collected<'a> {
+    store: &'a ReadStore,
+    place: BlobCalls,
+}
+
+impl<'a> Collected<'a> {
+    fn of(store: &'a ReadStore) -> Self {
+        Self { store, place: BlobCalls::of(store) }
     }
 }
 
@@ -217,6 +229,8 @@ impl Ages {
 const AT_ONCE: usize = 16;
 /// Largest number of manifests that one call reads.
 const MANIFESTS: usize = 64;
+/// Largest number of artifacts whose references one query reads.
+const KNOWN: usize = 1024;
 /// Number of blobs removed before new rows are checked again.
 const BATCH: usize = 64;
 
@@ -289,29 +303,41 @@ impl ReadStore {
 }
 
 /// Adds everything reachable from `queue` to `marks`.
-async fn mark(place: &BlobCalls, rows: &Rows, mut queue: Vec<Digest>, marks: &mut Marks<'_>) -> Result<(), MarkError> {
+async fn mark(of: &Collected<'_>, rows: &Rows, mut queue: Vec<Digest>, marks: &mut Marks<'_>) -> Result<(), MarkError> {
     let is_root = |digest: Digest| rows.roots.binary_search(&digest).is_ok();
     while !queue.is_empty() {
         queue.retain(|digest| marks.add(*digest) && (is_root(*digest) || marks.may_be_there(*digest)));
         let parents = queue.iter().filter_map(|digest| rows.parents.get(digest)).flatten().copied();
         let mut next: Vec<Digest> = parents.collect();
-        let each = (queue.len() / AT_ONCE).clamp(1, MANIFESTS);
-        let batches: Vec<Vec<Digest>> = queue.chunks(each).map(<[Digest]>::to_vec).collect();
+        let mut follow = |references: References| {
+            for blob in references.blobs {
+                marks.add(blob);
+            }
+            next.extend(references.mentioned);
+        };
+        let mut unknown = Vec::new();
+        for batch in queue.chunks(KNOWN) {
+            let mut known: HashMap<Digest, References> = of.store.references(batch).await?.into_iter().collect();
+            for digest in batch {
+                match known.remove(digest) {
+                    Some(references) => follow(references),
+                    None => unknown.push(*digest),
+                }
+            }
+        }
+        let each = (unknown.len() / AT_ONCE).clamp(1, MANIFESTS);
+        let batches: Vec<Vec<Digest>> = unknown.chunks(each).map(<[Digest]>::to_vec).collect();
         let read = |batch: Vec<Digest>| {
-            place.ask(move |blobs| {
-                batch.into_iter().map(|digest| (digest, blobs.manifest_of_many(digest))).collect::<Vec<_>>()
+            of.place.ask(move |blobs| {
+                let read = |digest| (digest, blobs.manifest_of_many(digest).map(|manifest| References::of(&manifest)));
+                batch.into_iter().map(read).collect::<Vec<_>>()
             })
         };
         let mut reading = stream::iter(batches).map(read).buffer_unordered(AT_ONCE);
         while let Some(batch) = reading.next().await {
             for (digest, read) in batch {
                 match read {
-                    Ok(manifest) => {
-                        for blob in manifest.blobs() {
-                            marks.add(blob.digest);
-                        }
-                        mentioned(&manifest.meta, &mut next);
-                    }
+                    Ok(references) => follow(references),
                     // A digest in `meta` that is not a manifest, or a blob removed since the listing.
                     Err(ManifestError::NotAManifest { .. } | ManifestError::Blob(BlobError::NotFound(_)))
                         if !is_root(digest) => {}
@@ -326,16 +352,17 @@ async fn mark(place: &BlobCalls, rows: &Rows, mut queue: Vec<Digest>, marks: &mu
 }
 
 /// Adds everything reachable from the roots to `marks`.
-async fn mark_roots(place: &BlobCalls, rows: &Rows, marks: &mut Marks<'_>) -> Result<(), MarkError> {
+async fn mark_roots(of: &Collected<'_>, rows: &Rows, marks: &mut Marks<'_>) -> Result<(), MarkError> {
     for roots in rows.roots.chunks(AT_ONCE * MANIFESTS * 16) {
-        mark(place, rows, roots.to_vec(), marks).await?;
+        mark(of, rows, roots.to_vec(), marks).await?;
     }
     Ok(())
 }
 
 /// Returns the blobs that the rows need, after checking that they exist.
 pub(crate) async fn needed(store: &ReadStore, rows: &Rows) -> Result<Vec<Digest>, QueryError> {
-    let place = &BlobCalls::of(store);
+    let of = Collected::of(store);
+    let place = &of.place;
     let check = |root: &Digest| {
         let root = *root;
         let checked = place.ask(move |blobs| blobs.complete_manifest(root));
@@ -347,7 +374,7 @@ pub(crate) async fn needed(store: &ReadStore, rows: &Rows) -> Result<Vec<Digest>
     }
     let all = place.list().await?;
     let mut marks = Marks::among(&all);
-    let marked = mark_roots(place, rows, &mut marks).await;
+    let marked = mark_roots(&of, rows, &mut marks).await;
     store.explained(marked).await?;
     // A digest in `meta` need not be a stored blob; blobs that roots list were checked above.
     Ok(all.iter().zip(&marks.marked).filter(|(_, is_marked)| **is_marked).map(|(entry, _)| entry.digest).collect())
@@ -358,18 +385,18 @@ fn is_damaged_manifest(blobs: &BlobStore, digest: Digest) -> bool {
 }
 
 /// Returns the plan and the blobs that may be removed.
-async fn plan(place: &BlobCalls, rows: &Rows, ages: &Ages) -> Result<(Plan, Vec<Entry>), MarkError> {
-    let all = place.list().await?;
+async fn plan(of: &Collected<'_>, rows: &Rows, ages: &Ages) -> Result<(Plan, Vec<Entry>), MarkError> {
+    let all = of.place.list().await?;
     let mut marks = Marks::among(&all);
-    mark_roots(place, rows, &mut marks).await?;
+    mark_roots(of, rows, &mut marks).await?;
     // No row relies on these blobs yet, so a damaged one does not stop the collection.
     let of_rows = rows.held.clone();
     let held = move |blobs: &BlobStore| {
         let held: BTreeSet<Digest> = blobs.held().into_iter().chain(of_rows).collect();
         held.into_iter().partition(|digest| is_damaged_manifest(blobs, *digest))
     };
-    let (damaged, held): (Vec<Digest>, Vec<Digest>) = place.ask(held).await;
-    mark(place, rows, held, &mut marks).await?;
+    let (damaged, held): (Vec<Digest>, Vec<Digest>) = of.place.ask(held).await;
+    mark(of, rows, held, &mut marks).await?;
     for digest in damaged {
         marks.add(digest);
     }

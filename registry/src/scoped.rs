@@ -14,7 +14,7 @@ use protocol::{Alias, Digest, Group, ModelName, RunId, StageName, TaskId};
 use crate::QueryError;
 use crate::catalog::{
     CheckpointRow, EndedRow, HistoryQuery, HistoryRow, KindSize, LineageNode, LogRow, Needs, Records, Recovery,
-    RunListQuery, RunPage, RunRow, StageResultRow, Usage,
+    References, RunListQuery, RunPage, RunRow, StageResultRow, Usage,
 };
 use crate::curve::{Buckets, Curve, Page, Window};
 use crate::store_id::Stored;
@@ -55,6 +55,10 @@ impl Records for ScopedRecords {
 
     async fn present(&self, blobs: &[Digest]) -> Result<BTreeMap<Digest, u64>> {
         self.all.present(blobs).await
+    }
+
+    async fn references(&self, artifacts: &[Digest]) -> Result<Vec<(Digest, References)>> {
+        self.all.references(artifacts).await
     }
 
     async fn run_owners(&self, runs: &[RunId]) -> Result<BTreeMap<RunId, Group>> {

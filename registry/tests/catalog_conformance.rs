@@ -12,7 +12,7 @@ use common::{artifact, fence, grant, metrics, result, rows, version};
 use futures::future::join_all;
 use protocol::stage::Keep;
 use protocol::{Alias, ArtifactKind, Digest, FileEntry, Manifest, ModelName, RunId, StageName, TaskId};
-use registry::catalog::{Catalog, Done, Order, PromoteOrder, Records, RollbackOrder, Which};
+use registry::catalog::{Catalog, Done, Order, PromoteOrder, Records, References, RollbackOrder, Which};
 use registry::testing::slow::SlowBucket;
 use registry::versions::Action;
 use registry::{
@@ -457,7 +457,7 @@ async fn what_a_collection_condemns_is_proven_anew(place: &impl Place) {
 async fn what_a_row_has_named_is_known_to_be_present(place: &impl Place) {
     const FILES: usize = 40;
     let opened = place.open().await;
-    let mut manifest = Manifest::new(ArtifactKind::Vae, json!({}));
+    let mut manifest = Manifest::new(ArtifactKind::Vae, json!({"teacher": Digest::of(b"teacher")}));
     for i in 0..FILES {
         let digest = opened.blobs().put(format!("file {i}").as_bytes()).unwrap();
         manifest.files.insert(i.to_string(), FileEntry::of_blob(digest, format!("file {i}").len() as u64));
@@ -471,6 +471,8 @@ async fn what_a_row_has_named_is_known_to_be_present(place: &impl Place) {
     let opened = place.open().await;
     let known = opened.records().present(&all).await.unwrap();
     assert_eq!((known.len(), known.get(&Digest::of(b"file 0"))), (FILES + 1, Some(&6)));
+    let references = References { blobs: listed, mentioned: vec![Digest::of(b"teacher")] };
+    assert_eq!(opened.records().references(&all).await.unwrap(), [(made, references)]);
     // The manifest is read again, but its files are not requested.
     let before = opened.bucket.requests();
     drop(opened.store.prove(made).await.unwrap());
@@ -478,6 +480,7 @@ async fn what_a_row_has_named_is_known_to_be_present(place: &impl Place) {
     assert!(asked < FILES as u64 / 2, "{asked}");
     opened.catalog().commit(Order::Condemn(all.clone())).await.unwrap();
     assert!(opened.records().present(&all).await.unwrap().is_empty(), "nobody relies on it any more");
+    assert!(opened.records().references(&all).await.unwrap().is_empty());
 }
 
 async fn a_step_has_one_state_and_a_policy_says_which_stay(place: &impl Place) {

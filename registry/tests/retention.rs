@@ -6,6 +6,7 @@ mod common;
 use std::collections::{BTreeMap, BTreeSet};
 
 use common::{artifact, fence, grant, metrics, open, result, rows, run_in};
+use protocol::artifact::FileEntry;
 use protocol::stage::{Keep, Mode};
 use protocol::{ArtifactKind, Digest, Manifest, TaskId};
 use registry::testing::slow::SlowBucket;
@@ -101,18 +102,32 @@ async fn shards_go_once_their_run_is_finished_and_pins_stay() {
     assert_eq!(store.gc(-1000).await.unwrap().remove.len(), 2);
 }
 
+/// The second damaged artifact has too many files for its references to be recorded.
 #[tokio::test]
-async fn a_root_that_does_not_read_stops_the_collection() {
+async fn a_damaged_root_stops_the_collection_unless_its_references_are_recorded() {
     let dir = tempfile::tempdir().unwrap();
     let store = open(dir.path()).await;
+    let rot = |artifact: Digest| {
+        let hex = artifact.hex();
+        std::fs::write(dir.path().join("blobs/sha256").join(&hex[..2]).join(&hex[2..]), b"rot").unwrap();
+    };
     let output = artifact(store.blobs(), ArtifactKind::Vae, "weights");
     store.write(vec![result("k", output)]).await.unwrap();
+    let garbage = store.blobs().put(b"nobody needs this").unwrap();
+    rot(output);
+    assert_eq!(store.gc(-1000).await.unwrap().remove, [garbage]);
+    assert!(store.blobs().exists(Digest::of(b"weights")).unwrap());
+
+    let mut manifest = Manifest::new(ArtifactKind::Dataset, json!({}));
+    let clip = FileEntry::of_blob(store.blobs().put(b"clip").unwrap(), 4);
+    manifest.files = (0..1000).map(|i| (i.to_string(), clip.clone())).collect();
+    let large = store.blobs().put(&manifest.to_bytes()).unwrap();
+    store.pin(large, "to look at").await.unwrap();
     store.blobs().put(b"nobody needs this").unwrap();
-    let hex = output.hex();
-    std::fs::write(dir.path().join("blobs/sha256").join(&hex[..2]).join(&hex[2..]), b"rot").unwrap();
+    rot(large);
     let error = store.gc(-1000).await.unwrap_err();
-    assert!(error.to_string().contains("output `vae` of `r/s`"), "{error}");
-    assert_eq!(store.blobs().list().unwrap().len(), 3, "nothing went");
+    assert!(error.to_string().contains("pin (to look at)"), "{error}");
+    assert_eq!(store.blobs().list().unwrap().len(), 5, "nothing went");
 }
 
 fn put_before(dir: &std::path::Path, digest: Digest, minutes: u64) {

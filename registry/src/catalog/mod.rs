@@ -29,6 +29,6 @@ pub use address::{CatalogPlace, PostgresAddress};
 pub use orders::{Catalog, Done, Order, PromoteOrder, RollbackOrder, Which};
 pub use records::Records;
 pub use rows::{
-    CheckpointRow, EndedRow, HistoryQuery, HistoryRow, KindSize, LineageNode, LogRow, Needs, Recovery, RunListQuery,
-    RunOrder, RunPage, RunRow, StageResultRow, Usage,
+    CheckpointRow, EndedRow, HistoryQuery, HistoryRow, KindSize, LineageNode, LogRow, Needs, Recovery, References,
+    RunListQuery, RunOrder, RunPage, RunRow, StageResultRow, Usage,
 };

@@ -9,8 +9,8 @@ use protocol::message::Times;
 use protocol::{Alias, Digest, Group, ModelName, RunId, StageName, TaskId};
 
 use super::rows::{
-    CheckpointRow, EndedRow, HistoryQuery, HistoryRow, KindSize, LineageNode, LogRow, Needs, Recovery, RunListQuery,
-    RunPage, RunRow, StageResultRow, Usage,
+    CheckpointRow, EndedRow, HistoryQuery, HistoryRow, KindSize, LineageNode, LogRow, Needs, Recovery, References,
+    RunListQuery, RunPage, RunRow, StageResultRow, Usage,
 };
 use crate::QueryError;
 use crate::curve::{Buckets, Curve, Page, Window};
@@ -164,6 +164,9 @@ pub trait Records: Debug + Send + Sync {
 
     /// Returns those of `blobs` that are known to be stored, with their lengths.
     async fn present(&self, blobs: &[Digest]) -> Result<BTreeMap<Digest, u64>>;
+
+    /// Returns the references of those of `artifacts` that rows have named. Long lists are not recorded and left out.
+    async fn references(&self, artifacts: &[Digest]) -> Result<Vec<(Digest, References)>>;
 
     /// Returns the blobs that held tasks have stored and that are to be kept although no row may name them yet.
     async fn held(&self) -> Result<BTreeMap<TaskId, BTreeSet<Digest>>>;

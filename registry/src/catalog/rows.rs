@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, HashMap};
 
 use protocol::message::{RunState, RunSummary};
-use protocol::{Attempt, Digest, Group, RunId, StageName, TaskId, WorkerId};
+use protocol::{Attempt, Digest, Group, Manifest, RunId, StageName, TaskId, WorkerId};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
@@ -202,6 +202,22 @@ pub struct LineageNode {
     pub inputs: BTreeMap<String, Digest>,
     /// Distance from the requested artifact.
     pub depth: u32,
+}
+
+/// Digests that the manifest of an artifact names.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct References {
+    /// Blobs of its files.
+    pub blobs: Vec<Digest>,
+    /// Digests in its `meta`; each may be an artifact.
+    pub mentioned: Vec<Digest>,
+}
+
+impl References {
+    /// Reads them from a manifest.
+    pub(crate) fn of(manifest: &Manifest) -> Self {
+        Self { blobs: manifest.blobs().map(|blob| blob.digest).collect(), mentioned: manifest.mentions() }
+    }
 }
 
 /// Blobs that the rows need, as of one moment.

@@ -239,10 +239,16 @@ fn problems_of(report: &fsck::Report) -> String {
     text
 }
 
+/// Largest number of blobs that a collection lists.
+const SHOWN: usize = 20;
+
 fn removed(dry_run: bool, plan: &Plan) -> String {
     let mut text = String::new();
-    for digest in &plan.remove {
+    for digest in plan.remove.iter().take(SHOWN) {
         text += &format!("  {digest}\n");
+    }
+    if let Some(more) = plan.remove.len().checked_sub(SHOWN).filter(|more| *more > 0) {
+        text += &format!("  and {more} more; `-o json` lists all\n");
     }
     let verb = if dry_run { "would remove" } else { "removed" };
     let fresh = if plan.fresh == 0 { String::new() } else { format!(", {} within their grace period", plan.fresh) };

@@ -14,7 +14,7 @@ use super::error::write_error;
 use super::recording::Recording;
 use super::statement::{Builder, Column, Conn, ROWS, Values, insert, int, json, one, query, run, run_and_stage};
 use super::{history, logs, moves, owners};
-use crate::catalog::{PromoteOrder, Which};
+use crate::catalog::{PromoteOrder, References, Which};
 use crate::proofs::{Artifact, Proofs};
 use crate::write::two_states;
 use crate::{Write, WriteError, clock};
@@ -116,15 +116,24 @@ async fn add_checkpoint(conn: &mut Conn<'_>, grant: &Grant, step: u64, manifest:
     run(conn, insert.bind(manifest.to_string()).bind(metrics).bind(clock::now_ms())).await.map(drop)
 }
 
-/// Checks that an artifact which a row is about to name is proven, and records its blobs as stored.
+/// Largest number of references of an artifact that are recorded. A collection reads longer lists from the manifest.
+const REFERENCES: usize = 256;
+
+/// Checks that an artifact which a row is about to name is proven. Records its blobs as stored, and its references.
 pub(super) async fn proven(conn: &mut Conn<'_>, proofs: &Proofs, digest: Digest) -> Result<Arc<Artifact>> {
     let artifact = proofs.name(digest)?;
     let now = clock::now_ms();
+    let References { blobs, mentioned } = &artifact.references;
+    let refers = (blobs.len() + mentioned.len() <= REFERENCES).then(|| json(&artifact.references));
     let rows: Vec<(&Digest, &u64)> = artifact.blobs.iter().collect();
-    let values = |row: &mut Values<'_, '_>, (digest, bytes): &(&Digest, &u64)| {
-        row.push_bind(digest.to_string()).push_bind(int(**bytes)).push_bind(now);
+    let values = |row: &mut Values<'_, '_>, (blob, bytes): &(&Digest, &u64)| {
+        let refers = refers.clone().filter(|_| **blob == digest);
+        row.push_bind(blob.to_string()).push_bind(int(**bytes)).push_bind(now).push_bind(refers);
     };
-    insert(conn, "INSERT INTO blobs (digest, bytes, verified_ms) ", &rows, values, " ON CONFLICT DO NOTHING").await?;
+    let begin = "INSERT INTO blobs (digest, bytes, verified_ms, refers) ";
+    let end = " ON CONFLICT (digest) DO UPDATE SET refers = excluded.refers \
+               WHERE blobs.refers IS NULL AND excluded.refers IS NOT NULL";
+    insert(conn, begin, &rows, values, end).await?;
     Ok(artifact)
 }
 

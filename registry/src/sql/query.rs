@@ -9,13 +9,13 @@ use protocol::message::Times;
 use protocol::{Alias, Digest, Group, ModelName, RunId, StageName, TaskId};
 
 use super::pool::Pool;
-use super::rows::{checkpoints, digest, run_row, stage_result};
+use super::rows::{checkpoints, digest, references, run_row, stage_result};
 use super::statement::{Conn, Row, json, query};
 use super::{curves, history, logs, models, open, owners, postgres, retention, run_list, sqlite, transfer, usage};
 use crate::QueryError;
 use crate::catalog::{
     CheckpointRow, EndedRow, HistoryQuery, HistoryRow, KindSize, LineageNode, LogRow, Needs, Records, Recovery,
-    RunListQuery, RunPage, RunRow, StageResultRow, Usage,
+    References, RunListQuery, RunPage, RunRow, StageResultRow, Usage,
 };
 use crate::curve::{Buckets, Curve, Page, Window};
 use crate::store_id::Stored;
@@ -297,6 +297,14 @@ impl Records for SqlRecords {
         let find = "SELECT digest, bytes FROM blobs WHERE digest IN {texts ?}";
         let rows = query(find).bind(json(&blobs)).fetch_all(&mut conn).await?;
         rows.iter().map(|row| Ok((digest(row, "digest")?, row.try_get::<i64, _>("bytes")?.unsigned_abs()))).collect()
+    }
+
+    async fn references(&self, artifacts: &[Digest]) -> Result<Vec<(Digest, References)>> {
+        let mut reader = self.0.reader().await?;
+        let mut conn = reader.conn();
+        let find = "SELECT digest, refers FROM blobs WHERE refers IS NOT NULL AND digest IN {texts ?}";
+        let rows = query(find).bind(json(&artifacts)).fetch_all(&mut conn).await?;
+        rows.iter().map(|row| Ok((digest(row, "digest")?, references(row.try_get("refers")?)?))).collect()
     }
 
     async fn held(&self) -> Result<BTreeMap<TaskId, BTreeSet<Digest>>> {

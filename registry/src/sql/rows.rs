@@ -7,7 +7,7 @@ use protocol::{Attempt, Digest, RunId, StageName, TaskId};
 use super::models::numbers;
 use super::statement::{Conn, Row, query};
 use crate::QueryError;
-use crate::catalog::{CheckpointRow, RunRow, StageResultRow};
+use crate::catalog::{CheckpointRow, References, RunRow, StageResultRow};
 
 type Result<T> = std::result::Result<T, QueryError>;
 
@@ -18,6 +18,10 @@ pub(super) fn digest(row: &Row, column: &str) -> Result<Digest> {
 
 pub(super) fn digests(text: &str) -> Result<BTreeMap<String, Digest>> {
     serde_json::from_str(text).map_err(|e| QueryError::Blob(format!("cannot parse a list of artifacts: {e}")))
+}
+
+pub(super) fn references(text: &str) -> Result<References> {
+    serde_json::from_str(text).map_err(|e| QueryError::Blob(format!("cannot parse the references of an artifact: {e}")))
 }
 
 pub(super) fn stage_result(row: &Row) -> Result<StageResultRow> {
