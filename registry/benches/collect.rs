@@ -50,15 +50,11 @@ fn put(blobs: &Path, bytes: &[u8], at: SystemTime) -> Result<Digest> {
     Ok(digest)
 }
 
-/// Records blobs as stored, as the naming of an artifact does, with the references of each by its place.
-async fn present(
-    database: &mut SqliteConnection,
-    blobs: &[Digest],
-    refers: impl Fn(usize) -> Option<String>,
-) -> Result {
-    let mut rows = QueryBuilder::new("INSERT INTO blobs (digest, bytes, verified_ms, refers) ");
-    rows.push_values(blobs.iter().enumerate(), |mut row, (place, blob)| {
-        row.push_bind(blob.to_string()).push("1").push("0").push_bind(refers(place));
+/// Records blobs as stored, as the naming of an artifact does.
+async fn present(database: &mut SqliteConnection, blobs: &[Digest]) -> Result {
+    let mut rows = QueryBuilder::new("INSERT INTO blobs (digest, bytes, verified_ms) ");
+    rows.push_values(blobs, |mut row, blob| {
+        row.push_bind(blob.to_string()).push("1").push("0");
     });
     rows.build().execute(database).await?;
     Ok(())
@@ -77,7 +73,7 @@ async fn fill(dir: &Path) -> Result {
     let options = SqliteConnectOptions::new().filename(dir.join("stride.db")).synchronous(SqliteSynchronous::Off);
     let mut database = SqliteConnection::connect_with(&options).await?;
     for files in files.chunks(BATCH as usize) {
-        present(&mut database, files, |_| None).await?;
+        present(&mut database, files).await?;
     }
     let mut before = [Digest::of(b"a"); 2];
     for first in (0..RESULTS).step_by(BATCH as usize) {
@@ -106,11 +102,13 @@ async fn fill(dir: &Path) -> Result {
         });
         rows.build().execute(&mut database).await?;
         let digests: Vec<Digest> = results.iter().map(|(_, digest)| *digest).collect();
-        let refers = |place: usize| {
-            let file = files[((first + place as u64) % FILES) as usize];
-            Some(json!({"blobs": [file], "mentioned": []}).to_string())
-        };
-        present(&mut database, &digests, refers).await?;
+        present(&mut database, &digests).await?;
+        let mut rows = QueryBuilder::new("INSERT INTO manifests (digest, refers) ");
+        rows.push_values(&results, |mut row, (number, digest)| {
+            let refers = json!({"blobs": [files[(number % FILES) as usize]], "mentioned": []});
+            row.push_bind(digest.to_string()).push_bind(refers.to_string());
+        });
+        rows.build().execute(&mut database).await?;
     }
     database.close().await?;
     Ok(())

@@ -123,17 +123,16 @@ const REFERENCES: usize = 256;
 pub(super) async fn proven(conn: &mut Conn<'_>, proofs: &Proofs, digest: Digest) -> Result<Arc<Artifact>> {
     let artifact = proofs.name(digest)?;
     let now = clock::now_ms();
-    let References { blobs, mentioned } = &artifact.references;
-    let refers = (blobs.len() + mentioned.len() <= REFERENCES).then(|| json(&artifact.references));
     let rows: Vec<(&Digest, &u64)> = artifact.blobs.iter().collect();
-    let values = |row: &mut Values<'_, '_>, (blob, bytes): &(&Digest, &u64)| {
-        let refers = refers.clone().filter(|_| **blob == digest);
-        row.push_bind(blob.to_string()).push_bind(int(**bytes)).push_bind(now).push_bind(refers);
+    let values = |row: &mut Values<'_, '_>, (digest, bytes): &(&Digest, &u64)| {
+        row.push_bind(digest.to_string()).push_bind(int(**bytes)).push_bind(now);
     };
-    let begin = "INSERT INTO blobs (digest, bytes, verified_ms, refers) ";
-    let end = " ON CONFLICT (digest) DO UPDATE SET refers = excluded.refers \
-               WHERE blobs.refers IS NULL AND excluded.refers IS NOT NULL";
-    insert(conn, begin, &rows, values, end).await?;
+    insert(conn, "INSERT INTO blobs (digest, bytes, verified_ms) ", &rows, values, " ON CONFLICT DO NOTHING").await?;
+    let References { blobs, mentioned } = &artifact.references;
+    if blobs.len() + mentioned.len() <= REFERENCES {
+        let refers = query("INSERT INTO manifests (digest, refers) VALUES (?, ?) ON CONFLICT DO NOTHING");
+        run(conn, refers.bind(digest.to_string()).bind(json(&artifact.references))).await?;
+    }
     Ok(artifact)
 }
 

@@ -302,7 +302,7 @@ impl Records for SqlRecords {
     async fn references(&self, artifacts: &[Digest]) -> Result<Vec<(Digest, References)>> {
         let mut reader = self.0.reader().await?;
         let mut conn = reader.conn();
-        let find = "SELECT digest, refers FROM blobs WHERE refers IS NOT NULL AND digest IN {texts ?}";
+        let find = "SELECT digest, refers FROM manifests WHERE digest IN {texts ?}";
         let rows = query(find).bind(json(&artifacts)).fetch_all(&mut conn).await?;
         rows.iter().map(|row| Ok((digest(row, "digest")?, references(row.try_get("refers")?)?))).collect()
     }

@@ -76,11 +76,12 @@ pub(super) async fn let_go(conn: &mut Conn<'_>, tasks: &[TaskId]) -> Result<(), 
     run(conn, query(let_go).bind(json(&tasks))).await.map(|_| ())
 }
 
-/// Deletes the records of blobs that no row has named since the collection began, and returns these blobs.
+/// Deletes the records of blobs and manifests that no row has named since the collection began, and returns these blobs.
 pub(super) async fn condemn(conn: &mut Conn<'_>, proofs: &Proofs, blobs: &[Digest]) -> Result<Vec<Digest>, WriteError> {
     let taken = proofs.condemn(blobs);
-    let forget = "DELETE FROM blobs WHERE digest IN {texts ?}";
-    run(conn, query(forget).bind(json(&taken))).await?;
+    for forget in ["DELETE FROM blobs WHERE digest IN {texts ?}", "DELETE FROM manifests WHERE digest IN {texts ?}"] {
+        run(conn, query(forget).bind(json(&taken))).await?;
+    }
     Ok(taken)
 }
 

@@ -17,7 +17,7 @@ use crate::QueryError;
 type Result<T> = std::result::Result<T, QueryError>;
 
 /// All tables. A table follows the tables that it refers to, and those whose triggers fill it.
-pub(super) const TABLES: [&str; 36] = [
+pub(super) const TABLES: [&str; 37] = [
     "store",
     "facts",
     "snapshots",
@@ -45,6 +45,7 @@ pub(super) const TABLES: [&str; 36] = [
     "edges",
     "pins",
     "blobs",
+    "manifests",
     "held_blobs",
     "models",
     "model_owners",
