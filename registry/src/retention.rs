@@ -9,9 +9,9 @@
 //! way, blobs from before the store was opened have at least the usual grace period.
 //!
 //! Writes continue meanwhile. Marking reads one moment of the database; from just before it the writer records the
-//! names in new rows (`proofs`). Blobs are condemned in batches in the writer and then removed beside it. A root with
-//! an unreadable manifest stops the collection, because its references are unknown. So does a database or blob folder
-//! that no longer belongs to the store.
+//! names in new rows (`proofs`). Blobs are condemned in batches in the writer and then removed beside it. A root
+//! whose references are not in the catalog and whose manifest cannot be read stops the collection. So does a database or
+//! blob folder that no longer belongs to the store.
 //!
 //! In a bucket, a collection also ends the uploads in parts that killed processes left.
 
@@ -164,7 +164,7 @@ impl BlobCalls {
     }
 }
 
-/// The catalog and the blobs of a collection.
+/// The catalog and the blobs that a collection reads.
 struct Collected<'a> {
     store: &'a ReadStore,
     place: BlobCalls,

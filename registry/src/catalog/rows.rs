@@ -214,7 +214,7 @@ pub struct References {
 }
 
 impl References {
-    /// Reads them from a manifest.
+    /// Reads them from a manifest. If this finds more, a migration must empty the table `manifests`.
     pub(crate) fn of(manifest: &Manifest) -> Self {
         Self { blobs: manifest.blobs().map(|blob| blob.digest).collect(), mentioned: manifest.mentions() }
     }
