@@ -159,9 +159,12 @@ mutation finished-as-last-reported trainer/coordinator/src/view.rs 's/    progre
 mutation new-run-with-each-start trainer/coordinator/src/decide/runs.rs 's/&& old\.until == run\.until/\&\& false/' coordinator:decisions:views
 mutation paused-if-interrupted trainer/coordinator/src/state/run.rs 's/self\.parked && self\.state == RunState::Paused/false/' coordinator:decisions:views
 mutation every-word-is-known trainer/motion/src/vocabulary.rs 's/!self\.words\.contains_key\(&word\) && //; s/!unknown\.contains\(&word\)/false \&\& !unknown.contains(\&word)/' motion:lib:vocabulary
-mutation parts-of-a-killed-process-stay registry/src/retention.rs 's/place\.ask\(BlobStore::give_up_unfinished\)/place.ask(|_| Ok::<u64, BlobError>(0))/' registry:retention:upload
+mutation parts-of-a-killed-process-stay registry/src/retention.rs 's/self\.ask_blobs\(BlobStore::give_up_unfinished\)/self.ask_blobs(|_| Ok::<u64, BlobError>(0))/' registry:retention:upload
 mutation upload-without-a-record registry/src/blob/objects/multipart.rs 's/store\.put\(&record, text\.into\(\)\)\.await\.map\(\|_\| \(\)\)/Ok(drop(text))/' registry:conformance:parts_that
 mutation held-until-the-restart registry/src/store/orders.rs 's/self\.order\(Order::Hold \{ task: task\.clone\(\), digest \}\)\.await\?;//' registry:retention:upload
 mutation digesting-goes-on trainer/motion/src/files.rs 's/if !go_on\(\) \{/if false \&\& !go_on() {/' motion:lib:data_access
 mutation ended-states-stay trainer/coordinator/src/decide/outcome.rs 's/(keep, )at_end: true/$1at_end: false/' coordinator:decisions:ended
+mutation training-waits-for-its-saves worker/src/saver.rs 's/self\.running = Some\(thread\);/self.running = Some(thread); self.wait();/' worker:lib:saves
+mutation outcome-before-its-save worker/src/context.rs 's/self\.saver\.wait\(\);\n(        self\.telemetry\.flush)/$1/' worker:lib:saves
+mutation saved-before-its-values worker/src/saver.rs 's/self\.telemetry\.flush\(self\.recorded\)/Ok(())/' worker:lib:saves
 exit $missed

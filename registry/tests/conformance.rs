@@ -39,7 +39,7 @@ fn what_was_put_is_read(store: &BlobStore) {
 /// Large enough for several parts in an object store.
 fn large_blobs_come_and_go_in_parts(store: &BlobStore) {
     let bytes: Vec<u8> = (0..20 << 20).map(|i: u32| i.to_le_bytes()[(i % 4) as usize]).collect();
-    let digest = store.put_pieces(&[&bytes[..5], &bytes[5..9 << 20], &bytes[9 << 20..]]).unwrap();
+    let digest = Blobs::put_pieces(store, &[&bytes[..5], &bytes[5..9 << 20], &bytes[9 << 20..]]).unwrap();
     assert_eq!(digest, Digest::of(&bytes));
     let (mut reader, mut read) = (store.read(digest).unwrap(), Vec::new());
     while let Some(part) = reader.next_part().unwrap() {

@@ -6,12 +6,12 @@
 use std::sync::Arc;
 
 use bytes::{Bytes, BytesMut};
-use checkpoint::{Blob, BlobError, Blobs};
+use checkpoint::{Blob, BlobError, Blobs, read_parts};
 use protocol::artifact::Chunk;
 use protocol::digest::Hasher;
 use protocol::limits::SMALL_BLOB_BYTES;
 use protocol::proof::SignedRequest;
-use protocol::{Digest, FileEntry};
+use protocol::{Digest, FileEntry, Manifest};
 
 use crate::active_assignment::ActiveAssignment;
 use crate::cache::{Arriving, Cache, Cached};
@@ -38,6 +38,13 @@ const DAMAGED: u32 = 2;
 const PART_BYTES: usize = 8 << 20;
 
 impl HttpBlobs {
+    /// Uploads a manifest whose blobs are uploaded.
+    pub(crate) fn put_manifest(&self, manifest: &Manifest) -> Result<Digest, BlobError> {
+        let digest = self.put(manifest.to_bytes())?;
+        self.receipts.note(digest, manifest);
+        Ok(digest)
+    }
+
     /// Returns the blob from the cache, after fetching it if necessary.
     fn cached(&self, digest: Digest) -> Result<Cached, BlobError> {
         if let Some(blob) = self.cache.get(digest) {
@@ -73,16 +80,8 @@ impl HttpBlobs {
         }
         let local = |e: std::io::Error| BlobError::Storage(format!("file {} cannot be kept here: {e}", file.digest));
         let mut joined = self.cache.arriving(file.digest, Some(file.bytes)).map_err(local)?;
-        let mut part = vec![0; PART_BYTES];
         for Chunk { digest, .. } in file.blobs() {
-            let blob = self.cached(digest)?;
-            let mut offset = 0;
-            while offset < blob.bytes() {
-                let most = usize::try_from(blob.bytes() - offset).unwrap_or(PART_BYTES).min(PART_BYTES);
-                blob.read_at(offset, &mut part[..most])?;
-                joined.write(&part[..most]).map_err(local)?;
-                offset += most as u64;
-            }
+            read_parts(&self.cached(digest)?, |part| joined.write(part).map_err(local))?;
         }
         joined.finish(&self.cache)?.map_err(|found| BlobError::Corrupt { expected: file.digest, found })
     }
@@ -103,21 +102,22 @@ impl HttpBlobs {
     }
 
     /// Sends a blob to the place of the blobs. Gives up as soon as the grant has ended.
-    fn send_directly(&self, signed: &SignedRequest, bytes: u64, pieces: &[&[u8]]) -> Result<(), String> {
+    fn send_directly(&self, signed: &SignedRequest, source: &dyn Blob) -> Result<(), String> {
         let mut offset = 0;
         let next = || {
             if let Some(reason) = self.held.ended() {
                 return Err(reason);
             }
-            let part = cut(pieces, offset);
+            let part = part(source, offset).map_err(|error| error.to_string())?;
             offset += part.len() as u64;
             Ok((!part.is_empty()).then_some(part))
         };
-        self.client.wait(self.client.direct.put(signed, bytes, next))
+        self.client.wait(self.client.direct.put(signed, source.bytes(), next))
     }
 
     /// Sends the bytes that the store lacks, directly to the place of the blobs if the coordinator has signed a request.
-    fn send(&self, credential: &Credential, digest: Digest, bytes: u64, pieces: &[&[u8]]) -> Result<(), CallError> {
+    fn send(&self, credential: &Credential, digest: Digest, source: &dyn Blob) -> Result<(), CallError> {
+        let bytes = source.bytes();
         let mut offset = 0;
         if bytes > SMALL_BLOB_BYTES {
             let receipt = self.receipts.of(digest);
@@ -128,7 +128,7 @@ impl HttpBlobs {
             }
             offset = there.staged;
             if let Some(signed) = &there.direct
-                && self.send_directly(signed, bytes, pieces).is_ok()
+                && self.send_directly(signed, source).is_ok()
             {
                 let there = self.client.wait(self.client.sent(credential, digest))?;
                 if there.stored {
@@ -142,7 +142,7 @@ impl HttpBlobs {
             }
         }
         loop {
-            let part = cut(pieces, offset);
+            let part = part(source, offset).map_err(|error| CallError::Storage(error.to_string()))?;
             let end = offset + part.len() as u64;
             let there = self.client.wait(self.client.put_part(credential, digest, bytes, offset, part))?;
             if there.stored {
@@ -161,19 +161,11 @@ impl HttpBlobs {
 }
 
 /// The bytes that begin at `offset`, at most [`PART_BYTES`].
-fn cut(pieces: &[&[u8]], offset: u64) -> Bytes {
-    let mut part = BytesMut::new();
-    let mut skip = offset;
-    for piece in pieces {
-        let begin = usize::try_from(skip).map_or(piece.len(), |skip| skip.min(piece.len()));
-        skip -= begin as u64;
-        let piece = &piece[begin..];
-        part.extend_from_slice(&piece[..piece.len().min(PART_BYTES - part.len())]);
-        if part.len() == PART_BYTES {
-            break;
-        }
-    }
-    part.freeze()
+fn part(source: &dyn Blob, offset: u64) -> Result<Bytes, BlobError> {
+    let length = (source.bytes() - offset).min(PART_BYTES as u64);
+    let mut part = BytesMut::zeroed(usize::try_from(length).unwrap_or(PART_BYTES));
+    source.read_at(offset, &mut part)?;
+    Ok(part.freeze())
 }
 
 impl Blobs for HttpBlobs {
@@ -182,19 +174,21 @@ impl Blobs for HttpBlobs {
     }
 
     fn put(&self, bytes: Vec<u8>) -> Result<Digest, BlobError> {
-        self.put_pieces(&[&bytes])
+        self.put_copy(&&bytes[..])
     }
 
-    fn put_pieces(&self, pieces: &[&[u8]]) -> Result<Digest, BlobError> {
+    fn put_copy(&self, source: &dyn Blob) -> Result<Digest, BlobError> {
         if self.gang {
             failpoints::hit("checkpoint::before_upload");
         }
         let mut hasher = Hasher::default();
-        pieces.iter().for_each(|piece| hasher.update(piece));
+        read_parts(source, |part| {
+            hasher.update(part);
+            Ok::<_, BlobError>(())
+        })?;
         let digest = hasher.finish();
-        let bytes = pieces.iter().map(|piece| piece.len() as u64).sum();
         retry::until_put_off(&self.held, &format!("uploading blob {digest}"), |credential| {
-            self.send(credential, digest, bytes, pieces)
+            self.send(credential, digest, source)
         })
         .map_err(|gave_up| error(gave_up, None))?;
         if self.gang {
@@ -227,20 +221,5 @@ fn error(gave_up: GaveUp, wanted: Option<Digest>) -> BlobError {
             BlobError::Unfit(message)
         }
         (GaveUp::Answer(error), _) => BlobError::Unavailable(error.to_string()),
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn parts_of_pieces_are_the_parts_of_the_whole() {
-        let whole: Vec<u8> = (0..PART_BYTES + 1000).map(|i| (i % 251) as u8).collect();
-        let pieces = [&whole[..10], &[], &whole[10..PART_BYTES - 5], &whole[PART_BYTES - 5..]];
-        for offset in [0, 5, 10, 11, PART_BYTES - 6, PART_BYTES, whole.len() - 1, whole.len()] {
-            let end = (offset + PART_BYTES).min(whole.len());
-            assert_eq!(cut(&pieces, offset as u64), &whole[offset..end], "{offset}");
-        }
     }
 }

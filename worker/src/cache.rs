@@ -122,10 +122,21 @@ impl Cache {
         } else {
             match self.path(digest) {
                 Some(path) => Place::named(path)?,
-                None => Place::nameless()?,
+                None => Place::nameless(&std::env::temp_dir())?,
             }
         };
         Ok(Arriving { digest, place, hasher: Hasher::default(), written: 0 })
+    }
+
+    /// Copies bytes that come in pieces: small ones in memory, others to an unnamed file.
+    pub(crate) fn copy(&self, pieces: &[&[u8]]) -> io::Result<Box<dyn Blob>> {
+        let bytes: u64 = pieces.iter().map(|piece| piece.len() as u64).sum();
+        if bytes <= self.bounds.small as u64 {
+            return Ok(Box::new(Arc::<[u8]>::from(pieces.concat())));
+        }
+        let mut place = Place::nameless(self.folder.as_deref().unwrap_or(&std::env::temp_dir()))?;
+        pieces.iter().try_for_each(|piece| place.write(piece))?;
+        Ok(Box::new(Copied { file: place.publish()?, bytes }))
     }
 
     /// Keeps a verified blob. A cache that cannot be written makes reads slower but is no error.
@@ -265,6 +276,24 @@ impl Blob for Cached {
     }
 }
 
+/// A copy in a file without a name.
+#[derive(Debug)]
+struct Copied {
+    file: File,
+    bytes: u64,
+}
+
+impl Blob for Copied {
+    fn bytes(&self) -> u64 {
+        self.bytes
+    }
+
+    fn read_at(&self, offset: u64, out: &mut [u8]) -> Result<(), BlobError> {
+        let failed = |e| BlobError::Storage(format!("reading the copy of a checkpoint: {e}"));
+        self.file.read_exact_at(out, offset).map_err(failed)
+    }
+}
+
 /// A blob on its way into the cache, hashed while it arrives.
 #[derive(Debug)]
 pub(crate) struct Arriving {
@@ -339,8 +368,9 @@ impl Place {
         Ok(Self::Named { file, staged, path })
     }
 
-    fn nameless() -> io::Result<Self> {
-        let path = std::env::temp_dir().join(format!("stride-{}", unique()));
+    /// An unnamed file in `folder`.
+    fn nameless(folder: &Path) -> io::Result<Self> {
+        let path = folder.join(format!("stride-{}", unique()));
         let file = OpenOptions::new().read(true).write(true).create_new(true).open(&path)?;
         fs::remove_file(&path)?;
         Ok(Self::Nameless(file))
@@ -490,5 +520,24 @@ mod tests {
             assert!(damaged.finish(&cache).expect("no error of the disk").is_err());
         }
         assert_eq!(files(folder.path()).len(), 1, "no part is left");
+    }
+
+    #[test]
+    fn a_copy_of_pieces_is_in_memory_or_in_a_file_that_has_no_name() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let bounds = Bounds { small: 10, ..Bounds::default() };
+        let cache = Cache::new(Some(folder.path().to_owned()), None, bounds).expect("writable");
+        let mut bytes = vec![3; 1000];
+        let [none, small, large] = [&[][..], &[&bytes[..4]], &[&bytes[..600], &bytes[600..]]].map(|p| cache.copy(p));
+        bytes.fill(0);
+        for (copy, expected) in [(none, 0), (small, 4), (large, 1000)] {
+            let copy = copy.expect("copied");
+            assert_eq!(copy.bytes(), expected);
+            let mut read = vec![0; copy.bytes() as usize];
+            copy.read_at(0, &mut read).expect("read");
+            assert!(read.iter().all(|byte| *byte == 3));
+            assert!(copy.read_at(1, &mut read).is_err() || read.is_empty());
+        }
+        assert_eq!(fs::read_dir(folder.path()).expect("readable").count(), 0);
     }
 }

@@ -7,10 +7,9 @@ use std::time::{Duration, Instant};
 
 use burn::tensor::Device;
 use checkpoint::{BlobError, Blobs};
-use protocol::message::{CommitCheckpoint, Progress, StageTask, TaskOutcome};
-use protocol::proof::Vouched;
+use protocol::message::{Progress, StageTask, TaskOutcome};
 use protocol::{ArtifactKind, Digest, Manifest};
-use stages::context::{Adopted, AttemptContext, ContextError, Exchange, GangContext, Rendezvous};
+use stages::context::{Adopted, AttemptContext, Checkpoint, ContextError, Exchange, GangContext, Rendezvous};
 use stages::external::DataAccess;
 use stages::tree::Node;
 
@@ -26,7 +25,8 @@ use crate::gang::rendezvous::{self, Line, Met};
 use crate::gang::tree;
 use crate::process;
 use crate::receipts::Receipts;
-use crate::retry::{self, GaveUp};
+use crate::retry::GaveUp;
+use crate::saver::{Save, Saver};
 use crate::stage_log::{self, Pace, Spent};
 use crate::telemetry_buffer::{Sender, TelemetryBuffer};
 
@@ -50,6 +50,8 @@ pub(crate) struct HttpContext {
     begun: Instant,
     pace: Pace,
     spent: Spent,
+    // Dropped before the sender, because a save waits for recorded values.
+    saver: Saver,
     _sender: Sender,
 }
 
@@ -105,6 +107,7 @@ impl HttpContext {
             begun,
             pace,
             spent: Spent::default(),
+            saver: Saver::default(),
             _sender,
         }
     }
@@ -115,9 +118,10 @@ impl HttpContext {
         self.mesh.as_ref().map(|mesh| mesh.config.generation)
     }
 
-    /// Waits until all recorded metrics and log lines are stored.
-    pub(crate) fn flush(&self) -> Result<(), ContextError> {
-        self.telemetry.flush().map_err(given_up)
+    /// Waits until the save under way has ended, and all recorded metrics and log lines are stored.
+    pub(crate) fn flush(&mut self) -> Result<(), ContextError> {
+        self.saver.wait();
+        self.telemetry.flush(self.telemetry.mark()).map_err(given_up)
     }
 
     /// Logs the attempt's settings and inputs.
@@ -274,9 +278,7 @@ impl AttemptContext for HttpContext {
     }
 
     fn put_manifest(&mut self, manifest: &Manifest) -> Result<Digest, ContextError> {
-        let digest = self.blobs.put(manifest.to_bytes()).map_err(blob_error)?;
-        self.blobs.receipts.note(digest, manifest);
-        Ok(digest)
+        self.blobs.put_manifest(manifest).map_err(blob_error)
     }
 
     fn progress(&mut self, done: u64, total: u64, unit: &str, metrics: &[(&str, f64)]) {
@@ -382,7 +384,8 @@ impl GangContext for HttpContext {
     ) -> Result<Exchange, ContextError> {
         let step = steps.start;
         self.check()?;
-        let saved = self.held.busy().phase() == Phase::Saving;
+        // An upload may take half of the bandwidth of this member's line.
+        let saves = self.held.busy().phase() == Phase::Saving || self.saver.is_running();
         self.held.busy().set(Phase::Working);
         failpoints::pace();
         let computed = self.computes_since.elapsed();
@@ -404,7 +407,7 @@ impl GangContext for HttpContext {
         }
         let drain = self.held.drain(mesh.size());
         let durable = self.telemetry.durable();
-        let contribution = Contribution { step, slices, parts: own, drain, saved, computed, durable };
+        let contribution = Contribution { step, slices, parts: own, drain, saves, computed, durable };
         let held = self.held.clone();
         let begun = Instant::now();
         let exchanged = exchange::exchange(&mesh, &contribution, &|| held.halt(generation));
@@ -447,51 +450,32 @@ impl GangContext for HttpContext {
         !self.held.is_away() && !self.held.is_put_off()
     }
 
-    fn may_postpone(&mut self, may: bool) {
-        self.held.set_postponable(may);
-    }
-
-    fn commit_checkpoint(
-        &mut self,
-        step: u64,
-        manifest: &Manifest,
-        metrics: &BTreeMap<String, f64>,
-    ) -> Result<(), ContextError> {
-        self.flush()?;
-        // The stage has uploaded it before. Storing it again costs one call and makes the commit independent of that
-        // upload.
-        let digest = self.put_manifest(manifest)?;
-        let metrics: BTreeMap<String, f64> =
-            metrics.iter().filter(|(_, v)| v.is_finite()).map(|(k, v)| (k.clone(), *v)).collect();
-        let receipts = self.receipts(digest);
-        failpoints::hit("checkpoint::before_commit");
-        retry::until_put_off(&self.held, &format!("committing the checkpoint of step {step}"), |credential| {
-            if self.is_regrouped() && !self.held.leads() {
-                return Err(CallError::NoLongerLeads("another member leads the gang now".to_owned()));
-            }
-            let grant = credential.grant.clone();
-            let metrics = metrics.clone();
-            let commit = CommitCheckpoint { grant, step, manifest: digest, metrics };
-            let vouched = Vouched { what: commit, receipts: receipts.clone() };
-            self.client.wait(self.client.tell("/v1/checkpoints", credential, &vouched))
+    fn save(&mut self, checkpoint: Checkpoint, files: &[(&str, &[&[u8]])]) -> Result<(), ContextError> {
+        // The peers wait while the state is copied, and for the save before.
+        self.saves();
+        self.saver.wait();
+        let copy = |(name, pieces): &(&str, &[&[u8]])| Ok(((*name).to_owned(), self.blobs.cache.copy(pieces)?));
+        let copies: std::io::Result<Vec<_>> = files.iter().map(copy).collect();
+        let files =
+            copies.map_err(|error| ContextError::Storage(format!("no copy of a checkpoint can be made: {error}")))?;
+        self.saver.begin(Save {
+            checkpoint,
+            files,
+            met: self.mesh.as_ref().map(|mesh| mesh.config.generation),
+            recorded: self.telemetry.mark(),
+            held: self.held.clone(),
+            client: self.client.clone(),
+            blobs: self.blobs.clone(),
+            telemetry: self.telemetry.clone(),
         })
-        .map_err(|gave_up| match gave_up {
-            // The next leader has saved a later step.
-            GaveUp::Answer(CallError::Refused(why)) if self.is_regrouped() => ContextError::NoLongerLeads(why),
-            gave_up => given_up(gave_up),
-        })?;
-        failpoints::hit("checkpoint::after_commit");
-        self.held.committed(digest);
-        self.log(&stage_log::checkpoint(step, manifest, &metrics));
-        Ok(())
     }
-}
 
-impl HttpContext {
-    /// Returns true if the gang has a newer generation than the one that this stage has met.
-    fn is_regrouped(&self) -> bool {
-        let met = self.mesh.as_ref().map(|mesh| mesh.config.generation);
-        met.is_some_and(|met| matches!(self.held.halt(met), Some(Halt::Regroup)))
+    fn saved(&mut self, wait: bool) -> Option<Result<u64, ContextError>> {
+        if wait {
+            self.saves();
+            self.saver.wait();
+        }
+        self.saver.take()
     }
 }
 
@@ -501,7 +485,7 @@ fn rows(behind: &[u8]) -> Option<&[u8]> {
     (u64::from_le_bytes(length.try_into().ok()?) == rows.len() as u64).then_some(rows)
 }
 
-fn given_up(gave_up: GaveUp) -> ContextError {
+pub(crate) fn given_up(gave_up: GaveUp) -> ContextError {
     match gave_up {
         GaveUp::Ended(reason) | GaveUp::Answer(CallError::Stale(reason)) => ContextError::GrantEnded(reason),
         GaveUp::Answer(CallError::Storage(message)) => ContextError::Storage(message),
@@ -513,7 +497,7 @@ fn given_up(gave_up: GaveUp) -> ContextError {
     }
 }
 
-fn blob_error(error: BlobError) -> ContextError {
+pub(crate) fn blob_error(error: BlobError) -> ContextError {
     match error {
         BlobError::Refused(reason) => ContextError::GrantEnded(reason),
         BlobError::Unfit(message) => ContextError::Refused(message),

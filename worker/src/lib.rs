@@ -30,6 +30,7 @@ pub mod process;
 mod receipts;
 mod retry;
 mod sandbox;
+mod saver;
 mod stage_limits;
 mod stage_log;
 mod stage_thread;

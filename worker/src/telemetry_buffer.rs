@@ -54,7 +54,26 @@ struct State {
     failed: Option<CallError>,
 }
 
+/// A place in the recorded rows and lines.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Mark {
+    /// The newest step with a row.
+    step: u64,
+    /// Number of the newest unsent line.
+    line: Option<u64>,
+}
+
 impl State {
+    /// Returns true if rows up to `mark` are not stored.
+    fn lacks_rows(&self, mark: Mark) -> bool {
+        self.rows.front().is_some_and(|row| row.step <= mark.step)
+    }
+
+    /// Returns true if lines up to `mark` are not stored.
+    fn lacks_lines(&self, mark: Mark) -> bool {
+        mark.line.is_some_and(|line| self.lines.front().is_some_and(|(number, _)| *number <= line))
+    }
+
     /// Takes over a peer's rows, oldest first, of the steps after `applied`; all rows if no step was applied here.
     fn take_over(&mut self, rows: Vec<MetricRow>, applied: Option<u64>) {
         let missed = rows.into_iter().filter(|row| applied.is_none_or(|applied| row.step > applied));
@@ -163,8 +182,14 @@ impl TelemetryBuffer {
         }
     }
 
-    /// Waits until everything recorded so far is stored.
-    pub(crate) fn flush(&self) -> Result<(), GaveUp> {
+    /// Everything that is recorded so far.
+    pub(crate) fn mark(&self) -> Mark {
+        let state = lock(&self.state);
+        Mark { step: state.newest_step, line: state.lines.back().map(|(number, _)| *number) }
+    }
+
+    /// Waits until everything up to `mark` is stored.
+    pub(crate) fn flush(&self, mark: Mark) -> Result<(), GaveUp> {
         loop {
             let ticket = self.held.event_count().ticket();
             {
@@ -173,7 +198,7 @@ impl TelemetryBuffer {
                     return Err(GaveUp::Answer(error.clone()));
                 }
                 // Other members only keep rows in case rank 0 dies, so those are not waited for.
-                if state.lines.is_empty() && (state.rows.is_empty() || !self.held.leads()) {
+                if !state.lacks_lines(mark) && (!state.lacks_rows(mark) || !self.held.leads()) {
                     return Ok(());
                 }
             }

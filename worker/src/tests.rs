@@ -4,6 +4,7 @@ mod blobs;
 mod direct;
 mod fake;
 mod prepare;
+mod saves;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -19,7 +20,7 @@ use protocol::stage::{Backend, CheckpointPolicy, DataSynthetic, StageSettings};
 use protocol::{
     ArtifactKind, Attempt, Digest, Fence, Generation, Incarnation, Manifest, RunId, Seed, StageName, TaskId, WorkerId,
 };
-use stages::context::{AttemptContext, Exchange, GangContext, Outcome, Part, StageError};
+use stages::context::{AttemptContext, Checkpoint, Exchange, GangContext, Outcome, Part, StageError};
 use tokio::runtime::Runtime;
 
 use self::fake::{BUSY_S, Fake, FakeState, LEASE_MS};
@@ -223,6 +224,11 @@ fn finished(context: &mut dyn GangContext) -> Result<Outcome, StageError> {
     Ok(Outcome::Finished { output, metrics: BTreeMap::from([("loss".to_owned(), 0.5)]) })
 }
 
+/// A checkpoint that waits for a busy store.
+fn checkpoint(step: u64, meta: serde_json::Value) -> Checkpoint {
+    Checkpoint { step, meta, metrics: BTreeMap::new(), chunk_bytes: protocol::limits::CHUNK_BYTES, may_wait: false }
+}
+
 /// Trains `steps` steps as a gang of the current workers, with a checkpoint every tenth step.
 fn train(context: &mut dyn GangContext, steps: u64, pause: Duration) -> Result<Outcome, StageError> {
     context.rendezvous(None, &[])?;
@@ -240,9 +246,8 @@ fn train(context: &mut dyn GangContext, steps: u64, pause: Duration) -> Result<O
                 if step.is_multiple_of(10) || drain {
                     context.log(&format!("saving at {step}"));
                     let blob = context.blobs().put(step.to_le_bytes().to_vec()).expect("stored");
-                    let manifest = Manifest::new(ArtifactKind::Checkpoint, serde_json::json!({"blob": blob}));
-                    context.put_manifest(&manifest)?;
-                    context.commit_checkpoint(step, &manifest, &BTreeMap::new())?;
+                    context.save(checkpoint(step, serde_json::json!({"blob": blob})), &[])?;
+                    assert_eq!(context.saved(true).expect("a save was begun")?, step);
                 }
                 if drain {
                     return Ok(Outcome::Yielded { at: step });

@@ -10,14 +10,18 @@ use protocol::artifact::Chunk;
 use protocol::digest::Hasher;
 use protocol::{FileEntry, limits};
 
-use crate::{Blob, BlobError, Blobs, past_the_end};
+use crate::{Blob, BlobError, Blobs, Joined, past_the_end, read_parts};
 
-/// Stores the concatenation of `pieces` as a file whose blobs have `chunk_bytes` bytes, usually
-/// [`limits::CHUNK_BYTES`].
+/// Stores the concatenation of `pieces` as a file; see [`put_copy`].
 pub fn put(blobs: &dyn Blobs, pieces: &[&[u8]], chunk_bytes: u64) -> Result<FileEntry, BlobError> {
-    let bytes: u64 = pieces.iter().map(|piece| piece.len() as u64).sum();
+    put_copy(blobs, &Joined::new(pieces.to_vec()), chunk_bytes)
+}
+
+/// Stores a copy of `source` as a file whose blobs have `chunk_bytes` bytes, usually [`limits::CHUNK_BYTES`].
+pub fn put_copy(blobs: &dyn Blobs, source: &dyn Blob, chunk_bytes: u64) -> Result<FileEntry, BlobError> {
+    let bytes = source.bytes();
     if bytes <= chunk_bytes {
-        return Ok(FileEntry::of_blob(blobs.put_pieces(pieces)?, bytes));
+        return Ok(FileEntry::of_blob(blobs.put_copy(source)?, bytes));
     }
     if bytes.div_ceil(chunk_bytes) > limits::FILE_CHUNKS as u64 {
         let most = limits::FILE_CHUNKS as u64 * chunk_bytes;
@@ -25,33 +29,38 @@ pub fn put(blobs: &dyn Blobs, pieces: &[&[u8]], chunk_bytes: u64) -> Result<File
     }
     let mut hasher = Hasher::default();
     let mut chunks = Vec::new();
-    let mut rest = pieces.to_vec();
-    while !rest.is_empty() {
-        let chunk = cut(&mut rest, chunk_bytes);
-        chunk.iter().for_each(|piece| hasher.update(piece));
-        let bytes = chunk.iter().map(|piece| piece.len() as u64).sum();
-        chunks.push(Chunk { digest: blobs.put_pieces(&chunk)?, bytes });
+    let mut start = 0;
+    while start < bytes {
+        let chunk = Part { whole: source, start, bytes: chunk_bytes.min(bytes - start) };
+        read_parts(&chunk, |part| {
+            hasher.update(part);
+            Ok::<_, BlobError>(())
+        })?;
+        chunks.push(Chunk { digest: blobs.put_copy(&chunk)?, bytes: chunk.bytes });
+        start += chunk.bytes;
     }
     Ok(FileEntry { digest: hasher.finish(), bytes, chunks })
 }
 
-/// Removes the first `bytes` bytes from `pieces` and returns them.
-fn cut<'a>(pieces: &mut Vec<&'a [u8]>, bytes: u64) -> Vec<&'a [u8]> {
-    let mut taken = Vec::new();
-    let mut left = usize::try_from(bytes).unwrap_or(usize::MAX);
-    let mut used = 0;
-    for piece in pieces.iter_mut() {
-        let (begin, rest) = piece.split_at(piece.len().min(left));
-        left -= begin.len();
-        taken.push(begin);
-        if !rest.is_empty() {
-            *piece = rest;
-            break;
-        }
-        used += 1;
+/// A part of a blob.
+#[derive(Debug)]
+struct Part<'a> {
+    whole: &'a dyn Blob,
+    start: u64,
+    bytes: u64,
+}
+
+impl Blob for Part<'_> {
+    fn bytes(&self) -> u64 {
+        self.bytes
     }
-    pieces.drain(..used);
-    taken
+
+    fn read_at(&self, offset: u64, out: &mut [u8]) -> Result<(), BlobError> {
+        if offset.checked_add(out.len() as u64).is_none_or(|end| end > self.bytes) {
+            return Err(past_the_end(offset, out.len(), self.bytes));
+        }
+        self.whole.read_at(self.start + offset, out)
+    }
 }
 
 /// Returns the verified bytes of a file in memory.
@@ -88,7 +97,7 @@ pub fn open(blobs: &dyn Blobs, file: &FileEntry) -> Result<Box<dyn Blob>, BlobEr
         }
         opened.push(blob);
     }
-    Ok(Box::new(Chunked { blobs: opened, bytes: file.bytes }))
+    Ok(Box::new(Joined::new(opened)))
 }
 
 /// Maps a file; see [`Blobs::map`].
@@ -97,43 +106,6 @@ pub fn map(blobs: &dyn Blobs, file: &FileEntry) -> Result<Bytes, BlobError> {
         return blobs.map(file.digest);
     }
     blobs.map_chunks(file).unwrap_or_else(|| get(blobs, file).map(Bytes::from_owner))
-}
-
-/// An open file in several blobs.
-#[derive(Debug)]
-struct Chunked {
-    blobs: Vec<Box<dyn Blob>>,
-    bytes: u64,
-}
-
-impl Blob for Chunked {
-    fn bytes(&self) -> u64 {
-        self.bytes
-    }
-
-    fn read_at(&self, offset: u64, out: &mut [u8]) -> Result<(), BlobError> {
-        let wanted = out.len();
-        if offset.checked_add(wanted as u64).is_none_or(|end| end > self.bytes) {
-            return Err(past_the_end(offset, wanted, self.bytes));
-        }
-        let mut skip = offset;
-        let mut out = out;
-        for blob in &self.blobs {
-            if out.is_empty() {
-                break;
-            }
-            if skip >= blob.bytes() {
-                skip -= blob.bytes();
-                continue;
-            }
-            let here = usize::try_from(blob.bytes() - skip).unwrap_or(usize::MAX).min(out.len());
-            let (part, rest) = out.split_at_mut(here);
-            blob.read_at(skip, part)?;
-            out = rest;
-            skip = 0;
-        }
-        Ok(())
-    }
 }
 
 #[cfg(test)]

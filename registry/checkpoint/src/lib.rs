@@ -51,7 +51,7 @@ pub enum BlobError {
 
 /// Content-addressed bytes. Reads are verified. The module [`file`] reads and writes the files of artifacts.
 ///
-/// Large blobs should use [`put_pieces`](Self::put_pieces) and [`open`](Self::open), which hold no second copy.
+/// Large blobs should use [`put_copy`](Self::put_copy) and [`open`](Self::open), which hold no second copy.
 pub trait Blobs: Send + Sync + fmt::Debug {
     /// Returns the bytes named `digest` in memory.
     fn get(&self, digest: Digest) -> Result<Arc<[u8]>, BlobError>;
@@ -59,9 +59,16 @@ pub trait Blobs: Send + Sync + fmt::Debug {
     /// Stores bytes and returns their digest. Equal bytes are stored once.
     fn put(&self, bytes: Vec<u8>) -> Result<Digest, BlobError>;
 
+    /// Stores a copy of `source`, which is read in parts.
+    fn put_copy(&self, source: &dyn Blob) -> Result<Digest, BlobError> {
+        let mut bytes = vec![0; usize::try_from(source.bytes()).unwrap_or(usize::MAX)];
+        source.read_at(0, &mut bytes)?;
+        self.put(bytes)
+    }
+
     /// Stores the concatenation of `pieces`.
     fn put_pieces(&self, pieces: &[&[u8]]) -> Result<Digest, BlobError> {
-        self.put(pieces.concat())
+        self.put_copy(&Joined::new(pieces.to_vec()))
     }
 
     /// Verifies and opens the blob named `digest` for reading in parts.
@@ -92,7 +99,7 @@ pub fn blob_path(store: &Path, digest: Digest) -> PathBuf {
 pub const BLOBS: &str = "blobs/sha256";
 
 /// A verified blob.
-pub trait Blob: Send + fmt::Debug {
+pub trait Blob: Send + Sync + fmt::Debug {
     /// Returns the blob's length.
     fn bytes(&self) -> u64;
 
@@ -101,6 +108,16 @@ pub trait Blob: Send + fmt::Debug {
 }
 
 impl Blob for Arc<[u8]> {
+    fn bytes(&self) -> u64 {
+        self.len() as u64
+    }
+
+    fn read_at(&self, offset: u64, out: &mut [u8]) -> Result<(), BlobError> {
+        (&**self).read_at(offset, out)
+    }
+}
+
+impl Blob for &[u8] {
     fn bytes(&self) -> u64 {
         self.len() as u64
     }
@@ -116,6 +133,79 @@ impl Blob for Arc<[u8]> {
             None => Err(past_the_end(offset, out.len(), self.len() as u64)),
         }
     }
+}
+
+impl Blob for Box<dyn Blob> {
+    fn bytes(&self) -> u64 {
+        (**self).bytes()
+    }
+
+    fn read_at(&self, offset: u64, out: &mut [u8]) -> Result<(), BlobError> {
+        (**self).read_at(offset, out)
+    }
+}
+
+/// Several blobs as one.
+#[derive(Debug)]
+pub struct Joined<B> {
+    blobs: Vec<B>,
+    bytes: u64,
+}
+
+impl<B: Blob> Joined<B> {
+    /// The concatenation of `blobs`.
+    pub fn new(blobs: Vec<B>) -> Self {
+        let bytes = blobs.iter().map(Blob::bytes).sum();
+        Self { blobs, bytes }
+    }
+}
+
+impl<B: Blob> Blob for Joined<B> {
+    fn bytes(&self) -> u64 {
+        self.bytes
+    }
+
+    fn read_at(&self, offset: u64, out: &mut [u8]) -> Result<(), BlobError> {
+        let wanted = out.len();
+        if offset.checked_add(wanted as u64).is_none_or(|end| end > self.bytes) {
+            return Err(past_the_end(offset, wanted, self.bytes));
+        }
+        let mut skip = offset;
+        let mut out = out;
+        for blob in &self.blobs {
+            if out.is_empty() {
+                break;
+            }
+            if skip >= blob.bytes() {
+                skip -= blob.bytes();
+                continue;
+            }
+            let here = usize::try_from(blob.bytes() - skip).unwrap_or(usize::MAX).min(out.len());
+            let (part, rest) = out.split_at_mut(here);
+            blob.read_at(skip, part)?;
+            out = rest;
+            skip = 0;
+        }
+        Ok(())
+    }
+}
+
+/// Calls `take` with all bytes of a blob, in parts.
+///
+/// # Errors
+/// The first error of a read or of `take`.
+pub fn read_parts<E: From<BlobError>>(blob: &dyn Blob, mut take: impl FnMut(&[u8]) -> Result<(), E>) -> Result<(), E> {
+    const PART: u64 = 1 << 20;
+    let mut part = vec![0; PART.min(blob.bytes()) as usize];
+    let mut offset = 0;
+    while offset < blob.bytes() {
+        let length = (blob.bytes() - offset).min(PART);
+        let part = &mut part[..length as usize];
+        blob.read_at(offset, part)?;
+        take(part)?;
+        offset += length;
+    }
+    Ok(())
 }
 
 /// Error of a read past the end of a blob.

@@ -4,7 +4,7 @@ use std::fmt;
 use std::path::Path;
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError, RwLock};
 
-use checkpoint::{Blob, BlobError, Blobs};
+use checkpoint::{Blob, BlobError, Blobs, read_parts};
 use protocol::Digest;
 use protocol::digest::Hasher;
 
@@ -193,19 +193,20 @@ impl BlobStore {
 
     /// Stores bytes and returns their digest when they are durable.
     pub fn put(&self, bytes: &[u8]) -> Result<Digest, BlobError> {
-        self.put_pieces(&[bytes])
+        self.put_copy(&bytes)
     }
 
-    /// Stores the concatenation of `pieces`.
-    pub fn put_pieces(&self, pieces: &[&[u8]]) -> Result<Digest, BlobError> {
+    /// Stores a copy of `source`, which is read in parts, and returns its digest when it is durable.
+    pub fn put_copy(&self, source: &dyn Blob) -> Result<Digest, BlobError> {
         let mut hasher = Hasher::default();
-        pieces.iter().for_each(|piece| hasher.update(piece));
+        read_parts(source, |part| {
+            hasher.update(part);
+            Ok::<_, BlobError>(())
+        })?;
         let digest = hasher.finish();
         if !self.reuse(digest)? {
-            let mut upload = self.begin(pieces.iter().map(|piece| piece.len() as u64).sum())?;
-            for piece in pieces {
-                upload.write(piece)?;
-            }
+            let mut upload = self.begin(source.bytes())?;
+            read_parts(source, |part| upload.write(part))?;
             self.commit(upload, digest)?;
         }
         Ok(digest)
@@ -356,8 +357,8 @@ impl Blobs for BlobStore {
         Self::put(self, &bytes)
     }
 
-    fn put_pieces(&self, pieces: &[&[u8]]) -> Result<Digest, BlobError> {
-        Self::put_pieces(self, pieces)
+    fn put_copy(&self, source: &dyn Blob) -> Result<Digest, BlobError> {
+        Self::put_copy(self, source)
     }
 
     fn open(&self, digest: Digest) -> Result<Box<dyn Blob>, BlobError> {

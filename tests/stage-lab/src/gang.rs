@@ -13,7 +13,9 @@ use protocol::message::StageTask;
 use protocol::{Digest, Manifest};
 
 use super::attempt::{MemoryAttempt, Ran, Told, lock};
-use stages::context::{Adopted, AttemptContext, ContextError, Exchange, GangContext, Outcome, Rendezvous, StageError};
+use stages::context::{
+    Adopted, AttemptContext, Checkpoint, ContextError, Exchange, GangContext, Outcome, Rendezvous, StageError,
+};
 use stages::external::DataAccess;
 use stages::tree::{Node, tree_sum};
 
@@ -83,6 +85,8 @@ struct Member {
     demoted_saving: Option<u64>,
     loses_donor: bool,
     drain: Option<u64>,
+    /// Result of the save that was not taken yet, and whether it was asked for.
+    saved: Option<(Result<u64, ContextError>, bool)>,
 }
 
 fn other_length(bytes: usize) -> ContextError {
@@ -127,6 +131,7 @@ pub(super) fn run(
         demoted_saving: script.demoted_saving.iter().find(|(who, _)| *who == me).map(|(_, step)| *step),
         loses_donor: script.lost_donating.contains(&me),
         drain: script.drain,
+        saved: None,
     };
     let starters = (0..count).map(|me| (member(me), None));
     let joiners = script.joins.iter().map(|&(me, step)| (member(me), Some(step)));
@@ -379,13 +384,27 @@ impl GangContext for Member {
         if state.over { Err(ContextError::GrantEnded("rank 0 has reported the end".into())) } else { Ok(()) }
     }
 
-    fn commit_checkpoint(
-        &mut self,
-        step: u64,
-        manifest: &Manifest,
-        _metrics: &BTreeMap<String, f64>,
-    ) -> Result<(), ContextError> {
+    fn save(&mut self, checkpoint: Checkpoint, files: &[(&str, &[&[u8]])]) -> Result<(), ContextError> {
         assert!(self.leads(), "only the leader saves");
+        assert!(self.saved.is_none(), "the save before was asked for");
+        self.saved = Some((self.commit(&checkpoint, files), false));
+        Ok(())
+    }
+
+    /// A save seems to be under way until it is asked for again or waited for.
+    fn saved(&mut self, wait: bool) -> Option<Result<u64, ContextError>> {
+        let (saved, is_asked) = self.saved.take()?;
+        if wait || is_asked {
+            return Some(saved);
+        }
+        self.saved = Some((saved, true));
+        None
+    }
+}
+
+impl Member {
+    fn commit(&mut self, checkpoint: &Checkpoint, files: &[(&str, &[&[u8]])]) -> Result<u64, ContextError> {
+        let step = checkpoint.step;
         if self.lost_saving == Some(step) {
             let me = self.me;
             lock(&self.gang.state).regroup(|members| members.retain(|m| *m != me));
@@ -400,16 +419,18 @@ impl GangContext for Member {
             self.gang.changed.notify_all();
             return Err(ContextError::NoLongerLeads(format!("member {} does not lead at step {step}", self.me)));
         }
-        self.put_manifest(manifest)?;
-        lock(&self.gang.state).checkpoints.push((step, manifest.clone()));
-        Ok(())
+        let uploaded = checkpoint.upload_pieces(&*self.blobs(), files);
+        let manifest = uploaded.map_err(|error| ContextError::Storage(error.to_string()))?;
+        self.put_manifest(&manifest)?;
+        lock(&self.gang.state).checkpoints.push((step, manifest));
+        Ok(step)
     }
 }
 
 #[cfg(test)]
 mod tests {
     use protocol::stage::{CheckpointPolicy, StageSettings, TextEmbed};
-    use protocol::{ArtifactKind, RunId, Seed, StageName};
+    use protocol::{RunId, Seed, StageName};
 
     use super::*;
 
@@ -453,8 +474,10 @@ mod tests {
                     if drain {
                         if cx.leads() {
                             let meta = serde_json::json!([step, value]);
-                            let manifest = Manifest::new(ArtifactKind::Checkpoint, meta);
-                            cx.commit_checkpoint(step, &manifest, &BTreeMap::new())?;
+                            let metrics = BTreeMap::new();
+                            let chunk_bytes = cx.chunk_bytes();
+                            cx.save(Checkpoint { step, meta, metrics, chunk_bytes, may_wait: false }, &[])?;
+                            assert_eq!(cx.saved(true).expect("a save was begun")?, step);
                         }
                         return Ok(Outcome::Yielded { at: step });
                     }

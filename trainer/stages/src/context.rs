@@ -7,10 +7,10 @@ use std::collections::BTreeMap;
 use std::ops::Range;
 use std::sync::Arc;
 
-use checkpoint::Blobs;
+use checkpoint::{Blob, BlobError, Blobs, Joined};
 use motion::data_access::DataAccess;
 use protocol::message::{FailureClass, StageTask};
-use protocol::{Digest, Manifest, limits};
+use protocol::{ArtifactKind, Digest, Manifest, limits};
 
 use crate::tree::Node;
 
@@ -229,19 +229,51 @@ pub trait GangContext: AttemptContext {
         true
     }
 
-    /// Declares that the following uploads belong to a checkpoint that may be saved later. If the store is busy, such an
-    /// upload fails instead of waiting, and [`can_save`](Self::can_save) returns false for a while.
-    fn may_postpone(&mut self, may: bool) {
-        let _ = may;
+    /// Begins to store a checkpoint of the caller's state. Returns once `files`, by name and in pieces, are copied; they
+    /// are uploaded and committed while the caller trains on. A save under way is waited for. Rank 0 only.
+    fn save(&mut self, checkpoint: Checkpoint, files: &[(&str, &[&[u8]])]) -> Result<(), ContextError>;
+
+    /// The step of the save that has ended since the last call, once the checkpoint is durable. Returns `None` if no save
+    /// was begun, or if it is still under way and the caller does not `wait`.
+    fn saved(&mut self, wait: bool) -> Option<Result<u64, ContextError>>;
+}
+
+/// A checkpoint to be stored, besides its files.
+#[derive(Debug, Clone)]
+pub struct Checkpoint {
+    /// Number of updates in the state.
+    pub step: u64,
+    /// Meta of its manifest.
+    pub meta: serde_json::Value,
+    /// Values of the training up to this step, by name.
+    pub metrics: BTreeMap<String, f64>,
+    /// Bytes of the blobs of a long file.
+    pub chunk_bytes: u64,
+    /// It may be saved later. If the store is busy, the save fails instead of waiting, and
+    /// [`can_save`](GangContext::can_save) returns false for a while.
+    pub may_wait: bool,
+}
+
+impl Checkpoint {
+    /// Uploads the files and returns the manifest, which is not uploaded.
+    pub fn upload<'a>(
+        &self,
+        blobs: &dyn Blobs,
+        files: impl Iterator<Item = (&'a str, &'a dyn Blob)>,
+    ) -> Result<Manifest, BlobError> {
+        let mut manifest = Manifest::new(ArtifactKind::Checkpoint, self.meta.clone());
+        for (name, source) in files {
+            let file = checkpoint::file::put_copy(blobs, source, self.chunk_bytes)?;
+            manifest.list([(name.to_owned(), file)]);
+        }
+        Ok(manifest)
     }
 
-    /// Commits an uploaded manifest as the newest checkpoint; returns once it is durable. Rank 0 only.
-    fn commit_checkpoint(
-        &mut self,
-        step: u64,
-        manifest: &Manifest,
-        metrics: &BTreeMap<String, f64>,
-    ) -> Result<(), ContextError>;
+    /// Like [`upload`](Self::upload), of files in pieces.
+    pub fn upload_pieces(&self, blobs: &dyn Blobs, files: &[(&str, &[&[u8]])]) -> Result<Manifest, BlobError> {
+        let joined: Vec<_> = files.iter().map(|(name, pieces)| (*name, Joined::new(pieces.to_vec()))).collect();
+        self.upload(blobs, joined.iter().map(|(name, file)| (*name, file as &dyn Blob)))
+    }
 }
 
 /// The part of a map stage that a task computes.

@@ -20,7 +20,7 @@ use super::mesh::{Halt, Mesh};
 use super::tree::{self, Node};
 
 const DRAIN: u32 = 1;
-const SAVED: u32 = 2;
+const SAVES: u32 = 2;
 /// The sender has mapped the receiver's memory.
 const MAPPED: u32 = 4;
 
@@ -35,8 +35,8 @@ pub(crate) struct Contribution<'a> {
     /// The gradients of this member's share, slice by slice; all of one length.
     pub(crate) parts: Vec<(Node, &'a [f32])>,
     pub(crate) drain: bool,
-    /// True if the member has saved since the last step.
-    pub(crate) saved: bool,
+    /// True if the member saves, or has saved since the last step.
+    pub(crate) saves: bool,
     /// Time that its share took to compute.
     pub(crate) computed: Duration,
     /// The last step up to which rank 0 knows that all rows are stored.
@@ -71,7 +71,7 @@ pub(crate) fn exchange(mesh: &Mesh, contribution: &Contribution<'_>, interrupt: 
     };
     let own_slices = tree::share(contribution.slices, own, size);
     mesh.pace.begin(contribution.computed, own_slices.len(), contribution.slices);
-    if contribution.saved {
+    if contribution.saves {
         mesh.pace.excuse();
     }
 
@@ -153,7 +153,7 @@ fn receive_parts(
         let announced = greeting.announced.filter(|_| mesh.may_share_memory(peer, barrier, interrupt) == Ok(true));
         mesh.memory(peer).greeted(begin.step, announced.as_ref(), begin.b & MAPPED != 0);
         received.drain |= begin.b & DRAIN != 0;
-        if begin.b & SAVED != 0 {
+        if begin.b & SAVES != 0 {
             mesh.pace.excuse();
         }
         if peer == 0 {
@@ -272,7 +272,7 @@ fn send_parts(
     let (parts, sums) = (nodes.len() * chunk.len(), own.len());
     let announced = if local && parts + sums > 0 { memory.announce(step, parts, sums) } else { None };
     let greeting = Greeting { length: length as u64, durable: contribution.durable, announced };
-    let flags = [(contribution.drain, DRAIN), (contribution.saved, SAVED), (memory.has_incoming(), MAPPED)];
+    let flags = [(contribution.drain, DRAIN), (contribution.saves, SAVES), (memory.has_incoming(), MAPPED)];
     let flags = flags.iter().filter(|(is_set, _)| *is_set).fold(0, |all, (_, flag)| all | flag);
     let head = Head::new(Kind::Begin, step, number(contribution.slices), flags);
     mesh.send(peer, barrier, head, &greeting.to_bytes(), interrupt)?;

@@ -11,7 +11,7 @@ use protocol::message::StageTask;
 use protocol::{Digest, Manifest};
 
 use super::clock::Clock;
-use crate::context::{Adopted, AttemptContext, ContextError, Exchange, GangContext, Rendezvous};
+use crate::context::{Adopted, AttemptContext, Checkpoint, ContextError, Exchange, GangContext, Rendezvous};
 use crate::external::DataAccess;
 use crate::train::STATE_FILE;
 use crate::tree::{Node, tree_sum};
@@ -59,6 +59,8 @@ pub(crate) struct Solo {
     blobs: Arc<Overlay>,
     checkpoint: Option<Manifest>,
     until: u64,
+    /// Result of the save that was not asked for yet.
+    saved: Option<Result<u64, ContextError>>,
     /// Recorded values by step and name.
     pub(crate) values: BTreeMap<(u64, String), f64>,
     /// Digest of the training state by step, for each saved one.
@@ -82,7 +84,7 @@ impl Solo {
         let values = BTreeMap::new();
         let states = BTreeMap::new();
         let clock = Clock::Wall(Instant::now());
-        Self { task, device, blobs, checkpoint, until, values, states, clock, progressed: Vec::new() }
+        Self { task, device, blobs, checkpoint, until, saved: None, values, states, clock, progressed: Vec::new() }
     }
 }
 
@@ -154,13 +156,16 @@ impl GangContext for Solo {
         true
     }
 
-    fn commit_checkpoint(
-        &mut self,
-        step: u64,
-        manifest: &Manifest,
-        _: &BTreeMap<String, f64>,
-    ) -> Result<(), ContextError> {
-        self.states.extend(state_digest(manifest).map(|digest| (step, digest)));
+    fn save(&mut self, checkpoint: Checkpoint, files: &[(&str, &[&[u8]])]) -> Result<(), ContextError> {
+        let stored = checkpoint.upload_pieces(&*self.blobs, files).map_err(|e| ContextError::Storage(e.to_string()));
+        self.saved = Some(stored.map(|manifest| {
+            self.states.extend(state_digest(&manifest).map(|digest| (checkpoint.step, digest)));
+            checkpoint.step
+        }));
         Ok(())
+    }
+
+    fn saved(&mut self, _: bool) -> Option<Result<u64, ContextError>> {
+        self.saved.take()
     }
 }

@@ -4,7 +4,7 @@ use std::ops::Range;
 
 use burn::tensor::Device;
 use protocol::stage::Training;
-use protocol::{ArtifactKind, Digest, limits};
+use protocol::{Digest, limits};
 
 use super::buffers::SumPlan;
 use super::objective::Objective;
@@ -15,8 +15,7 @@ use super::start::{Met, begin, meet};
 use super::state::TrainState;
 use super::step::{Layout, apply, hook};
 use super::values::{GRADIENT_NORM, LEARNING_RATE, Recent, due};
-use crate::artifacts::Draft;
-use crate::context::{ContextError, Exchange, GangContext, StageError};
+use crate::context::{Checkpoint, ContextError, Exchange, GangContext, StageError};
 use crate::tree::Sums;
 
 /// Trains to the last step (of the schedule, or of a rung that stops earlier), or until a stop is requested.
@@ -225,24 +224,15 @@ impl<'a> TrainingLoop<'a> {
         Ok(())
     }
 
-    /// Saves a checkpoint if one is due and this member leads the gang.
+    /// Begins to save a checkpoint if one is due and this member leads the gang. Waits for the save before it, so that
+    /// the speed of the store does not decide which steps are saved.
     fn save_if_due(&mut self) -> Result<(), StageError> {
         let ends = self.stop || self.state.step >= self.steps;
-        if ends || !self.save_is_due || !self.cx.leads() || !self.cx.can_save() {
-            return Ok(());
-        }
-        self.cx.may_postpone(true);
-        let saved = self.save();
-        self.cx.may_postpone(false);
-        match saved {
-            Ok(()) => self.save_is_due = false,
-            Err(StageError::Context(ContextError::Unavailable(why))) if !self.cx.can_save() => {
-                let step = self.state.step;
-                self.cx.log(&format!("the checkpoint after step {step} is delayed: {why}"));
-            }
-            // The next exchange meets the others, and the next leader saves.
-            Err(StageError::Context(ContextError::NoLongerLeads(_))) => {}
-            Err(error) => return Err(error),
+        let is_due = self.save_is_due && !ends && self.cx.leads() && self.cx.can_save();
+        self.end_save(is_due)?;
+        if is_due && self.cx.can_save() {
+            self.begin_save(true)?;
+            self.save_is_due = false;
         }
         Ok(())
     }
@@ -250,28 +240,47 @@ impl<'a> TrainingLoop<'a> {
     /// Saves the last step as rank 0, because publishing may fail or be interrupted. Returns false if another member
     /// leads the gang meanwhile; it makes this save from its own copy of the state.
     fn save_last(&mut self) -> Result<bool, StageError> {
+        self.end_save(true)?;
         if self.saved_at == Some(self.state.step) {
             return Ok(true);
         }
-        match self.save() {
-            Ok(()) => Ok(true),
-            Err(StageError::Context(ContextError::NoLongerLeads(_))) => {
+        self.begin_save(false)?;
+        match self.cx.saved(true) {
+            Some(Ok(step)) => {
+                self.saved_at = Some(step);
+                Ok(true)
+            }
+            Some(Err(ContextError::NoLongerLeads(_))) => {
                 self.meet()?;
                 Ok(false)
             }
-            Err(error) => Err(error),
+            Some(Err(error)) => Err(error.into()),
+            None => Err(StageError::Fault("the last save was begun and has no end".to_owned())),
         }
     }
 
-    fn save(&mut self) -> Result<(), StageError> {
+    fn begin_save(&mut self, may_wait: bool) -> Result<(), StageError> {
         self.state.fetch();
-        let meta = meta(&self.state, self.config, self.cx.task().seed);
-        let mut draft = Draft::new(self.cx, ArtifactKind::Checkpoint, meta);
-        self.state.saved(|pieces| draft.add_pieces(STATE_FILE, pieces))?;
-        let digest = draft.finish(self.cx)?;
-        let manifest = self.cx.manifest(digest)?;
-        self.cx.commit_checkpoint(self.state.step, &manifest, &self.recent.means())?;
-        self.saved_at = Some(self.state.step);
+        let checkpoint = Checkpoint {
+            step: self.state.step,
+            meta: meta(&self.state, self.config, self.cx.task().seed),
+            metrics: self.recent.means(),
+            chunk_bytes: self.cx.chunk_bytes(),
+            may_wait,
+        };
+        Ok(self.state.saved(|pieces| self.cx.save(checkpoint, &[(STATE_FILE, pieces)]))?)
+    }
+
+    /// Notes the end of a save, if it has ended or the caller waits for it. One that was not stored is due again.
+    fn end_save(&mut self, waits: bool) -> Result<(), StageError> {
+        match self.cx.saved(waits) {
+            None => {}
+            Some(Ok(step)) => self.saved_at = Some(step),
+            Some(Err(ContextError::Unavailable(_))) if !self.cx.can_save() => self.save_is_due = true,
+            // The next exchange meets the others, and the next leader saves.
+            Some(Err(ContextError::NoLongerLeads(_))) => self.save_is_due = true,
+            Some(Err(error)) => return Err(error.into()),
+        }
         Ok(())
     }
 

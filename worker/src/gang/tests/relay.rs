@@ -213,7 +213,7 @@ fn step(mesh: &Mesh, step: u64, numbers: &[f32], interrupt: Interrupt<'_>) -> Re
     let own = mesh.config.rank;
     let parts = vec![(own..own + 1, numbers)];
     let computed = Duration::from_millis(20);
-    let contribution = Contribution { step, slices: 2, parts, drain: false, saved: false, computed, durable: 0 };
+    let contribution = Contribution { step, slices: 2, parts, drain: false, saves: false, computed, durable: 0 };
     exchange::exchange(mesh, &contribution, interrupt).map(|total| total.sum)
 }
 

@@ -81,7 +81,7 @@ fn p18_each_barrier_has_a_name_and_a_time_and_lists_who_is_missing() {
                                 slices: 4,
                                 parts,
                                 drain: false,
-                                saved: false,
+                                saves: false,
                                 computed: Duration::ZERO,
                                 durable: 0,
                             };

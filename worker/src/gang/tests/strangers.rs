@@ -153,7 +153,7 @@ fn members_at_different_steps_or_with_other_slices_add_nothing_up() {
                             slices,
                             parts,
                             drain: false,
-                            saved: false,
+                            saves: false,
                             computed: Duration::ZERO,
                             durable: 0,
                         };
