@@ -21,9 +21,8 @@ impl Store {
     /// catalog knows.
     pub async fn prove(&self, artifact: Digest) -> Result<Proof, WriteError> {
         let begun = self.proofs().begin();
-        let blobs = self.blobs().clone();
         let (manifest, own) =
-            self.ask_blobs(move || blobs.stored_manifest(artifact)).await.map_err(|e| unproven(&e))?;
+            self.ask_blobs(move |blobs| blobs.stored_manifest(artifact)).await.map_err(|e| unproven(&e))?;
         let found = Artifact::of(artifact, own, &manifest);
         let mut unknown: Vec<_> = listed(&manifest).collect();
         unknown.retain(|part| self.blobs().just_stored(part.blob.digest) != Some(part.blob.bytes));
@@ -33,10 +32,7 @@ impl Store {
             unknown.retain(|part| present.get(&part.blob.digest) != Some(&part.blob.bytes));
         }
         stream::iter(unknown)
-            .map(|part| async move {
-                let blobs = self.blobs().clone();
-                self.ask_blobs(move || blobs.check_listed(artifact, &part)).await
-            })
+            .map(|part| self.ask_blobs(move |blobs| blobs.check_listed(artifact, &part)))
             .buffer_unordered(AT_ONCE)
             .try_collect::<()>()
             .await

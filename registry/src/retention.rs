@@ -25,7 +25,6 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::blob::{BlobStore, Entry, ManifestError};
-use crate::calls::Calls;
 use crate::catalog::{Needs, References};
 use crate::lock::CollectionLock;
 use crate::proofs::Proofs;
@@ -57,11 +56,10 @@ impl ReadStore {
     pub async fn gc_plan(&self, grace_ms: i64) -> Result<Plan, QueryError> {
         let rows = Rows::of(self).await?;
         let ages = Ages { now_ms: clock::now_ms(), grace_ms, opened_ms: self.opened_ms(), live: rows.live };
-        let of = Collected::of(self);
-        let planned = plan(&of, &rows, &ages).await;
+        let planned = plan(self, &rows, &ages).await;
         let (plan, candidates) = self.explained(planned).await?;
         let bytes = candidates.iter().map(|entry| entry.bytes).sum();
-        let unfinished = of.place.ask(BlobStore::unfinished).await;
+        let unfinished = self.ask_blobs(BlobStore::unfinished).await;
         let uploads = unfinished.map_err(|e| QueryError::Blob(e.to_string()))?.len() as u64;
         let remove = candidates.iter().map(|entry| entry.digest).collect();
         Ok(Plan { remove, bytes, uploads, ..plan })
@@ -80,38 +78,30 @@ impl Store {
         let forgotten = self.begin_collection().await?;
         let rows = Rows::of(self).await?;
         let ages = Ages { now_ms: clock::now_ms(), grace_ms, opened_ms: self.opened_ms(), live: rows.live };
-        let of = Collected::of(self);
-        let planned = plan(&of, &rows, &ages).await;
+        let planned = plan(self, &rows, &ages).await;
         let plan = match self.explained(planned).await {
-            Ok((plan, candidates)) => self.sweep(&of, &rows, plan, candidates, ages).await,
+            Ok((plan, candidates)) => self.sweep(&rows, plan, candidates, ages).await,
             Err(e) => Err(e.into()),
         };
         crate::reserve::keep(self.dir());
         let plan = plan?;
-        let uploads = of.place.ask(BlobStore::give_up_unfinished).await;
+        let uploads = self.ask_blobs(BlobStore::give_up_unfinished).await;
         let uploads = uploads.map_err(|e| WriteError::Storage(e.to_string()))?;
         Ok(Plan { forget_shards: forgotten, uploads, ..plan })
     }
 
     /// Removes the planned blobs, except blobs that were put again or named since.
-    async fn sweep(
-        &self,
-        of: &Collected<'_>,
-        rows: &Rows,
-        mut plan: Plan,
-        candidates: Vec<Entry>,
-        ages: Ages,
-    ) -> Result<Plan, WriteError> {
+    async fn sweep(&self, rows: &Rows, mut plan: Plan, candidates: Vec<Entry>, ages: Ages) -> Result<Plan, WriteError> {
         let mut kept = Marks::default();
         for batch in candidates.chunks(BATCH) {
             // Follows the references of names in new rows.
-            let marked = mark(of, rows, self.proofs().to_follow(), &mut kept).await;
+            let marked = mark(self, rows, self.proofs().to_follow(), &mut kept).await;
             self.explained(marked).await?;
             let batch = batch.iter().map(|entry| entry.digest).filter(|digest| !kept.has(*digest));
             let condemned = Condemned(Arc::clone(self.proofs()), self.condemn(batch.collect()).await?);
             let removing = stream::iter(condemned.1.clone()).map(|digest| {
                 let is_young = move |put_ms| put_ms >= ages.before_ms(put_ms);
-                of.place.ask(move |blobs| blobs.remove_unless(digest, is_young))
+                self.ask_blobs(move |blobs| blobs.remove_unless(digest, is_young))
             });
             let removed = removing.buffer_unordered(AT_ONCE).try_collect::<Vec<Option<Entry>>>().await;
             drop(condemned);
@@ -140,39 +130,6 @@ struct Condemned(Arc<Proofs>, Vec<Digest>);
 impl Drop for Condemned {
     fn drop(&mut self) {
         self.0.removed(&self.1);
-    }
-}
-
-/// The blobs' backend, with its limit of calls.
-pub(crate) struct BlobCalls {
-    blobs: BlobStore,
-    calls: Calls,
-}
-
-impl BlobCalls {
-    pub(crate) fn of(store: &ReadStore) -> Self {
-        Self { blobs: store.blobs().clone(), calls: store.calls().clone() }
-    }
-
-    async fn ask<T: Send + 'static>(&self, call: impl FnOnce(&BlobStore) -> T + Send + 'static) -> T {
-        let blobs = self.blobs.clone();
-        self.calls.run(move || call(&blobs)).await
-    }
-
-    async fn list(&self) -> Result<Vec<Entry>, QueryError> {
-        self.ask(BlobStore::list).await.map_err(|e| QueryError::Blob(e.to_string()))
-    }
-}
-
-/// The catalog and the blobs that a collection reads.
-struct Collected<'a> {
-    store: &'a ReadStore,
-    place: BlobCalls,
-}
-
-impl<'a> Collected<'a> {
-    fn of(store: &'a ReadStore) -> Self {
-        Self { store, place: BlobCalls::of(store) }
     }
 }
 
@@ -303,7 +260,7 @@ impl ReadStore {
 }
 
 /// Adds everything reachable from `queue` to `marks`.
-async fn mark(of: &Collected<'_>, rows: &Rows, mut queue: Vec<Digest>, marks: &mut Marks<'_>) -> Result<(), MarkError> {
+async fn mark(store: &ReadStore, rows: &Rows, mut queue: Vec<Digest>, marks: &mut Marks<'_>) -> Result<(), MarkError> {
     let is_root = |digest: Digest| rows.roots.binary_search(&digest).is_ok();
     while !queue.is_empty() {
         queue.retain(|digest| marks.add(*digest) && (is_root(*digest) || marks.may_be_there(*digest)));
@@ -317,7 +274,7 @@ async fn mark(of: &Collected<'_>, rows: &Rows, mut queue: Vec<Digest>, marks: &m
         };
         let mut unknown = Vec::new();
         for batch in queue.chunks(KNOWN) {
-            let mut known: HashMap<Digest, References> = of.store.references(batch).await?.into_iter().collect();
+            let mut known: HashMap<Digest, References> = store.references(batch).await?.into_iter().collect();
             for digest in batch {
                 match known.remove(digest) {
                     Some(references) => follow(references),
@@ -328,7 +285,7 @@ async fn mark(of: &Collected<'_>, rows: &Rows, mut queue: Vec<Digest>, marks: &m
         let each = (unknown.len() / AT_ONCE).clamp(1, MANIFESTS);
         let batches: Vec<Vec<Digest>> = unknown.chunks(each).map(<[Digest]>::to_vec).collect();
         let read = |batch: Vec<Digest>| {
-            of.place.ask(move |blobs| {
+            store.ask_blobs(move |blobs| {
                 let read = |digest| (digest, blobs.manifest_of_many(digest).map(|manifest| References::of(&manifest)));
                 batch.into_iter().map(read).collect::<Vec<_>>()
             })
@@ -352,32 +309,34 @@ async fn mark(of: &Collected<'_>, rows: &Rows, mut queue: Vec<Digest>, marks: &m
 }
 
 /// Adds everything reachable from the roots to `marks`.
-async fn mark_roots(of: &Collected<'_>, rows: &Rows, marks: &mut Marks<'_>) -> Result<(), MarkError> {
+async fn mark_roots(store: &ReadStore, rows: &Rows, marks: &mut Marks<'_>) -> Result<(), MarkError> {
     for roots in rows.roots.chunks(AT_ONCE * MANIFESTS * 16) {
-        mark(of, rows, roots.to_vec(), marks).await?;
+        mark(store, rows, roots.to_vec(), marks).await?;
     }
     Ok(())
 }
 
 /// Returns the blobs that the rows need, after checking that they exist.
 pub(crate) async fn needed(store: &ReadStore, rows: &Rows) -> Result<Vec<Digest>, QueryError> {
-    let of = Collected::of(store);
-    let place = &of.place;
     let check = |root: &Digest| {
         let root = *root;
-        let checked = place.ask(move |blobs| blobs.complete_manifest(root));
+        let checked = store.ask_blobs(move |blobs| blobs.complete_manifest(root));
         async move { checked.await.map(|_| ()).map_err(|e| (root, e)) }
     };
     let checked = stream::iter(&rows.roots).map(check).buffered(AT_ONCE).try_collect::<()>().await;
     if let Err((root, e)) = checked {
         return Err(QueryError::Blob(format!("{}: {e}", store.named_by(root).await?)));
     }
-    let all = place.list().await?;
+    let all = list(store).await?;
     let mut marks = Marks::among(&all);
-    let marked = mark_roots(&of, rows, &mut marks).await;
+    let marked = mark_roots(store, rows, &mut marks).await;
     store.explained(marked).await?;
     // A digest in `meta` need not be a stored blob; blobs that roots list were checked above.
     Ok(all.iter().zip(&marks.marked).filter(|(_, is_marked)| **is_marked).map(|(entry, _)| entry.digest).collect())
+}
+
+async fn list(store: &ReadStore) -> Result<Vec<Entry>, QueryError> {
+    store.ask_blobs(BlobStore::list).await.map_err(|e| QueryError::Blob(e.to_string()))
 }
 
 fn is_damaged_manifest(blobs: &BlobStore, digest: Digest) -> bool {
@@ -385,18 +344,18 @@ fn is_damaged_manifest(blobs: &BlobStore, digest: Digest) -> bool {
 }
 
 /// Returns the plan and the blobs that may be removed.
-async fn plan(of: &Collected<'_>, rows: &Rows, ages: &Ages) -> Result<(Plan, Vec<Entry>), MarkError> {
-    let all = of.place.list().await?;
+async fn plan(store: &ReadStore, rows: &Rows, ages: &Ages) -> Result<(Plan, Vec<Entry>), MarkError> {
+    let all = list(store).await?;
     let mut marks = Marks::among(&all);
-    mark_roots(of, rows, &mut marks).await?;
+    mark_roots(store, rows, &mut marks).await?;
     // No row relies on these blobs yet, so a damaged one does not stop the collection.
     let of_rows = rows.held.clone();
     let held = move |blobs: &BlobStore| {
         let held: BTreeSet<Digest> = blobs.held().into_iter().chain(of_rows).collect();
         held.into_iter().partition(|digest| is_damaged_manifest(blobs, *digest))
     };
-    let (damaged, held): (Vec<Digest>, Vec<Digest>) = of.place.ask(held).await;
-    mark(of, rows, held, &mut marks).await?;
+    let (damaged, held): (Vec<Digest>, Vec<Digest>) = store.ask_blobs(held).await;
+    mark(store, rows, held, &mut marks).await?;
     for digest in damaged {
         marks.add(digest);
     }

@@ -80,9 +80,8 @@ impl Store {
         model: Option<ModelName>,
         owner: Owner,
     ) -> Result<Version, ImportError> {
-        let blobs = self.blobs().clone();
         let file = file.to_owned();
-        let (Bundle { head, .. }, _protected) = self.ask_blobs(move || store(&blobs, &file)).await?;
+        let (Bundle { head, .. }, _protected) = self.ask_blobs(move |blobs| store(blobs, &file)).await?;
         let name = model.unwrap_or_else(|| head.model.clone());
         let mut source = json!({
             "imported": {"model": head.model, "version": head.version, "source": head.source},

@@ -50,13 +50,11 @@ pub(super) async fn known(store: &ReadStore, name: &str) -> Result<(Model, Vec<V
 }
 
 async fn exists(store: &ReadStore, digest: Digest) -> Result<bool, Refused> {
-    let blobs = store.blobs().clone();
-    store.ask_blobs(move || blobs.exists(digest)).await.map_err(|e| Refused::from(QueryError::Blob(e.to_string())))
+    store.ask_blobs(move |blobs| blobs.exists(digest)).await.map_err(|e| Refused::from(QueryError::Blob(e.to_string())))
 }
 
 pub(super) async fn manifest(store: &ReadStore, digest: Digest) -> Result<Manifest, QueryError> {
-    let blobs = store.blobs().clone();
-    store.ask_blobs(move || blobs.manifest(digest)).await.map_err(|e| QueryError::Blob(e.to_string()))
+    store.ask_blobs(move |blobs| blobs.manifest(digest)).await.map_err(|e| QueryError::Blob(e.to_string()))
 }
 
 pub(super) async fn show(store: &ReadStore, text: &str) -> Result<Data, Refused> {

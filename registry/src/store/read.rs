@@ -138,17 +138,14 @@ impl ReadStore {
     }
 
     /// Runs a blocking call to the blobs' backend outside the async threads.
-    pub async fn ask_blobs<T: Send + 'static>(&self, call: impl FnOnce() -> T + Send + 'static) -> T {
-        self.0.calls.run(call).await
+    pub async fn ask_blobs<T: Send + 'static>(&self, call: impl FnOnce(&BlobStore) -> T + Send + 'static) -> T {
+        let blobs = self.blobs().clone();
+        self.0.calls.run(move || call(&blobs)).await
     }
 
     /// Size in bytes of the database and its log in the folder; 0 if the database is in PostgreSQL.
     pub fn database_bytes(&self) -> u64 {
         folder::database_bytes(self.dir()) + folder::log_bytes(self.dir())
-    }
-
-    pub(crate) fn calls(&self) -> &Calls {
-        &self.0.calls
     }
 
     /// Returns the time at which this process opened the store, in milliseconds since 1970.

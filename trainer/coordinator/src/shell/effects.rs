@@ -96,9 +96,8 @@ async fn looked_up(actor_handle: &ActorHandle, key: Digest) -> Result<Event, Que
 /// recomputed, which repairs it.
 async fn known(actor_handle: &ActorHandle, key: Digest) -> Result<Option<(Known, (RunId, StageName))>, QueryError> {
     let Some(row) = actor_handle.store.stage_result(key).await? else { return Ok(None) };
-    let blobs = actor_handle.store.blobs().clone();
     let outputs = row.outputs.clone();
-    let look = move || outputs.values().find_map(|output| blobs.flaw(*output).transpose()).transpose();
+    let look = move |blobs: &BlobStore| outputs.values().find_map(|output| blobs.flaw(*output).transpose()).transpose();
     let flaw = actor_handle.store.ask_blobs(look).await.map_err(|e| QueryError::Blob(e.to_string()))?;
     if let Some(flaw) = &flaw {
         tracing::warn!(%key, "a stage's value is incomplete in the store and is recomputed: {flaw}");
@@ -134,9 +133,8 @@ async fn register(
 }
 
 async fn try_to_register(actor_handle: &ActorHandle, key: Digest, candidates: &[Candidate]) -> Result<(), Unbundled> {
-    let blobs = actor_handle.store.blobs().clone();
     let candidates = candidates.to_vec();
-    let event = match actor_handle.store.ask_blobs(move || bundles(&blobs, &candidates)).await {
+    let event = match actor_handle.store.ask_blobs(move |blobs| bundles(blobs, &candidates)).await {
         Ok((bundles, protected)) => {
             tell(actor_handle, Event::Bundled { key, bundles }).await;
             // Rows now name the bundles.

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use checkpoint::BlobError;
 use protocol::message::StorageProblem;
-use registry::Store;
+use registry::{BlobStore, Store};
 
 /// Time before a pending call checks for a known problem. A storage that has recovered answers within this time.
 const PATIENCE: Duration = Duration::from_secs(1);
@@ -38,7 +38,7 @@ pub(super) async fn unless_away<T>(store: &Store, asked: impl Future<Output = T>
 /// Makes a call to the storage outside the threads that serve requests.
 pub(super) async fn ask<T: Send + 'static, E: From<BlobError> + Send + 'static>(
     store: &Store,
-    call: impl FnOnce() -> Result<T, E> + Send + 'static,
+    call: impl FnOnce(&BlobStore) -> Result<T, E> + Send + 'static,
 ) -> Result<T, E> {
     unless_away(store, store.ask_blobs(call)).await?
 }

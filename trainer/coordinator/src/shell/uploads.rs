@@ -17,7 +17,7 @@ use protocol::message::{CommitCheckpoint, Grant, LogBatch, MetricBatch, ReportOu
 use protocol::proof::{BlobStored, DIRECT_HEADER, RECEIPT_HEADER, SignedRequest, Vouched};
 use protocol::{Digest, RunId, limits};
 use registry::blob::{Arriving, PART_BYTES, ResumeError};
-use registry::{Store, Write, WriteError};
+use registry::{BlobStore, Store, Write, WriteError};
 
 use super::actor_handle::ActorHandle;
 use super::body::Message;
@@ -138,9 +138,8 @@ async fn check_blobs(
     let caller = &proof.caller.name;
     let is_own = |(digest, shown): &(&Digest, &String)| actor_handle.secrets.is_receipt(caller, grant, **digest, shown);
     let own: BTreeSet<Digest> = receipts.iter().filter(is_own).map(|(digest, _)| *digest).collect();
-    let blobs = actor_handle.store.blobs().clone();
     let reach = Arc::clone(&actor_handle.reach);
-    let looking = move || reach.foreign(&blobs, &roots, |digest| own.contains(&digest), manifest);
+    let looking = move |blobs: &BlobStore| reach.foreign(blobs, &roots, |digest| own.contains(&digest), manifest);
     match ask(&actor_handle.store, looking).await? {
         None => Ok(()),
         Some(digest) => Err(Failure::new(
@@ -186,18 +185,16 @@ pub(crate) async fn staged(
     let receipt = headers.get(RECEIPT_HEADER).and_then(|shown| shown.to_str().ok()).map(str::to_owned);
     let receipt = receipt.filter(|shown| actor_handle.secrets.is_receipt(&proof.caller.name, &grant, digest, shown));
     let roots = actor_handle.state().read_by(&grant.task)?;
-    let blobs = actor_handle.store.blobs().clone();
     let reach = Arc::clone(&actor_handle.reach);
     let has_receipt = receipt.is_some();
     let asks_direct = headers.contains_key(DIRECT_HEADER);
     let store = &actor_handle.store;
-    let looked = blobs.clone();
     // The existence of other blobs is not revealed: the worker either has their bytes or has no use for them.
-    let is_known = has_receipt || ask(store, move || reach.includes(&looked, &roots, digest)).await?;
+    let is_known = has_receipt || ask(store, move |blobs| reach.includes(blobs, &roots, digest)).await?;
     if is_known {
         store.hold(&grant.task, digest).await?;
     }
-    let looked = ask(store, move || -> Result<_, Failure> {
+    let looked = ask(store, move |blobs| -> Result<_, Failure> {
         let stored = is_known && blobs.reuse(digest)?;
         let receipt = receipt.filter(|_| stored);
         let staged = blobs.staged(&grant, digest)?;
@@ -219,12 +216,11 @@ pub(crate) async fn sent(
     let digest = named(&digest)?;
     let store = &actor_handle.store;
     let receipt = actor_handle.secrets.receipt(&proof.caller.name, &grant, digest);
-    let (blobs, asked) = (store.blobs().clone(), grant.clone());
-    let stored = ask(store, move || Ok::<_, BlobError>(blobs.has_arrived(&asked, digest))).await?;
+    let asked = grant.clone();
+    let stored = ask(store, move |blobs| Ok::<_, BlobError>(blobs.has_arrived(&asked, digest))).await?;
     if stored {
         store.hold(&grant.task, digest).await?;
-        let blobs = store.blobs().clone();
-        ask(store, move || blobs.take_over(&grant, digest)).await?;
+        ask(store, move |blobs| blobs.take_over(&grant, digest)).await?;
     }
     Ok(Json(BlobStored { digest, stored, staged: 0, receipt: stored.then_some(receipt), direct: None }))
 }
@@ -252,18 +248,17 @@ pub(crate) async fn put_blob(
         return Err(failure.hint("update the worker: this build stores a longer file as several blobs"));
     }
     let store = &actor_handle.store;
-    let blobs = actor_handle.store.blobs().clone();
     let receipt = actor_handle.secrets.receipt(&proof.caller.name, &grant, digest);
     let stored = async {
         let task = grant.task.clone();
-        let arriving = ask(store, move || blobs.take_up(&grant, digest, offset, bytes)).await?;
+        let arriving = ask(store, move |blobs| blobs.take_up(&grant, digest, offset, bytes)).await?;
         let arriving = receive(store, arriving, body).await?;
         let staged = arriving.written();
         actor_handle.meters.carried("in", bytes, staged.saturating_sub(offset));
         if arriving.is_complete() {
             store.hold(&task, digest).await.map_err(unheld)?;
         }
-        let stored = ask(store, move || arriving.finish()).await.map_err(ResumeError::Blob)?;
+        let stored = ask(store, move |_| arriving.finish()).await.map_err(ResumeError::Blob)?;
         Ok(Json(BlobStored { digest, stored, staged, receipt: stored.then_some(receipt), direct: None }))
     };
     stored.await.map_err(|error: Unstored| {
@@ -305,7 +300,7 @@ async fn receive(store: &Store, mut arriving: Arriving, body: Body) -> Result<Ar
             }
         }
         // If the request is dropped, `arriving` is dropped too, which keeps the bytes received.
-        arriving = ask(store, move || -> Result<Arriving, BlobError> {
+        arriving = ask(store, move |_| -> Result<Arriving, BlobError> {
             for part in parts {
                 arriving.write(&part)?;
             }
@@ -365,14 +360,12 @@ pub(crate) async fn get_blob(
     if !proof.caller.scopes.allow(Scope::Read) {
         check_read(&actor_handle, &proof, &headers, digest).await?;
     }
-    if headers.contains_key(DIRECT_HEADER) {
-        let blobs = actor_handle.store.blobs().clone();
-        if let Some(signed) = ask(&actor_handle.store, move || blobs.sign_read(digest)).await? {
-            return redirect(signed);
-        }
+    if headers.contains_key(DIRECT_HEADER)
+        && let Some(signed) = ask(&actor_handle.store, move |blobs| blobs.sign_read(digest)).await?
+    {
+        return redirect(signed);
     }
-    let blobs = actor_handle.store.blobs().clone();
-    let opened = ask(&actor_handle.store, move || -> Result<_, Failure> {
+    let opened = ask(&actor_handle.store, move |blobs| -> Result<_, Failure> {
         let mut reader = match from {
             None => blobs.read(digest)?,
             Some(from) => {
@@ -392,7 +385,7 @@ pub(crate) async fn get_blob(
     let length = bytes - from.unwrap_or_default();
     actor_handle.meters.carried("out", bytes, length);
     let rest = stream::try_unfold((reader, actor_handle.store.clone()), |(mut reader, store)| async {
-        let (part, reader) = ask(&store, move || Ok::<_, BlobError>((reader.next_part()?, reader))).await?;
+        let (part, reader) = ask(&store, move |_| Ok::<_, BlobError>((reader.next_part()?, reader))).await?;
         Ok::<_, BlobError>(part.map(|part| (part, (reader, store))))
     });
     let body = Body::from_stream(stream::iter(first.map(Ok)).chain(rest));
@@ -439,9 +432,8 @@ async fn check_read(
         return Ok(());
     }
     let roots = state.readable_by(&process.worker);
-    let blobs = actor_handle.store.blobs().clone();
     let reach = Arc::clone(&actor_handle.reach);
-    if ask(&actor_handle.store, move || reach.includes(&blobs, &roots, digest)).await? {
+    if ask(&actor_handle.store, move |blobs| reach.includes(blobs, &roots, digest)).await? {
         return Ok(());
     }
     let message = format!("the tasks of worker `{}` do not read blob {digest}", process.worker);

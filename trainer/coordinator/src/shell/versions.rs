@@ -19,9 +19,8 @@ pub async fn resolve_versions(pipeline: &mut Pipeline, store: &ReadStore) -> Res
         for input in stage.versions() {
             let found = match store.resolve(&input.version).await {
                 Ok(version) => {
-                    let blobs = store.blobs().clone();
                     let input = input.clone();
-                    store.ask_blobs(move || part(&blobs, version.artifact, &input)).await
+                    store.ask_blobs(move |blobs| part(blobs, version.artifact, &input)).await
                 }
                 Err(error) => Err(error),
             };
