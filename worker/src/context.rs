@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use burn::tensor::Device;
-use checkpoint::{BlobError, Blobs};
+use checkpoint::Blobs;
 use protocol::message::{Progress, StageTask, TaskOutcome};
 use protocol::{ArtifactKind, Digest, Manifest};
 use stages::context::{Adopted, AttemptContext, Checkpoint, ContextError, Exchange, GangContext, Rendezvous};
@@ -16,7 +16,8 @@ use stages::tree::Node;
 use crate::active_assignment::ActiveAssignment;
 use crate::blobs::HttpBlobs;
 use crate::cache::Cache;
-use crate::client::{CallError, Client};
+use crate::client::Client;
+use crate::errors::{blob_error, given_up};
 use crate::failpoints;
 use crate::gang::exchange::{self, Contribution};
 use crate::gang::member::Phase;
@@ -25,7 +26,6 @@ use crate::gang::rendezvous::{self, Line, Met};
 use crate::gang::tree;
 use crate::process;
 use crate::receipts::Receipts;
-use crate::retry::GaveUp;
 use crate::saver::{Save, Saver};
 use crate::stage_log::{self, Pace, Spent};
 use crate::telemetry_buffer::{Sender, TelemetryBuffer};
@@ -483,30 +483,6 @@ impl GangContext for HttpContext {
 fn rows(behind: &[u8]) -> Option<&[u8]> {
     let (rows, length) = behind.split_at_checked(behind.len().checked_sub(8)?)?;
     (u64::from_le_bytes(length.try_into().ok()?) == rows.len() as u64).then_some(rows)
-}
-
-pub(crate) fn given_up(gave_up: GaveUp) -> ContextError {
-    match gave_up {
-        GaveUp::Ended(reason) | GaveUp::Answer(CallError::Stale(reason)) => ContextError::GrantEnded(reason),
-        GaveUp::Answer(CallError::Storage(message)) => ContextError::Storage(message),
-        GaveUp::Answer(CallError::NoLongerLeads(message)) => ContextError::NoLongerLeads(message),
-        GaveUp::Answer(CallError::Refused(message) | CallError::Unauthorized(message)) => {
-            ContextError::Refused(message)
-        }
-        GaveUp::Answer(error) => ContextError::Unavailable(error.to_string()),
-    }
-}
-
-pub(crate) fn blob_error(error: BlobError) -> ContextError {
-    match error {
-        BlobError::Refused(reason) => ContextError::GrantEnded(reason),
-        BlobError::Unfit(message) => ContextError::Refused(message),
-        BlobError::Storage(message) => ContextError::Storage(message),
-        BlobError::Unreachable(message) | BlobError::Unavailable(message) => ContextError::Unavailable(message),
-        error @ (BlobError::NotFound(_) | BlobError::Corrupt { .. } | BlobError::Damaged(_)) => {
-            ContextError::Damaged(error.to_string())
-        }
-    }
 }
 
 #[cfg(test)]

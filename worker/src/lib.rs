@@ -19,6 +19,7 @@ mod cli;
 mod client;
 mod context;
 mod direct;
+mod errors;
 mod event_count;
 pub mod failpoints;
 mod gang;

@@ -16,7 +16,7 @@ use stages::context::{Checkpoint, ContextError};
 use crate::active_assignment::ActiveAssignment;
 use crate::blobs::HttpBlobs;
 use crate::client::{CallError, Client};
-use crate::context::{blob_error, given_up};
+use crate::errors::{blob_error, given_up};
 use crate::failpoints;
 use crate::gang::mesh::Halt;
 use crate::retry::{self, GaveUp};
