@@ -166,5 +166,5 @@ mutation digesting-goes-on trainer/motion/src/files.rs 's/if !go_on\(\) \{/if fa
 mutation ended-states-stay trainer/coordinator/src/decide/outcome.rs 's/(keep, )at_end: true/$1at_end: false/' coordinator:decisions:ended
 mutation training-waits-for-its-saves worker/src/saver.rs 's/self\.running = Some\(thread\);/self.running = Some(thread); self.wait();/' worker:lib:saves
 mutation outcome-before-its-save worker/src/context.rs 's/self\.saver\.wait\(\);\n(        self\.telemetry\.flush)/$1/' worker:lib:saves
-mutation saved-before-its-values worker/src/saver.rs 's/self\.telemetry\.flush\(self\.recorded\)/Ok(())/' worker:lib:saves
+mutation saved-before-its-values worker/src/saver.rs 's/self\.telemetry\.flush\(self\.recorded\)/Ok(())/' worker:lib:p9
 exit $missed

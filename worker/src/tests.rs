@@ -155,7 +155,9 @@ impl Worker {
         assert_eq!(self.poll.join().expect("no panic"), End::Left);
         self.stage.join().expect("no panic");
         self.preparer.join().expect("no panic");
-        std::mem::take(&mut *lock(&self.fake.coordinator))
+        let received = std::mem::take(&mut *lock(&self.fake.coordinator));
+        assert_eq!(received.early, [0; 0], "values and manifests arrive before the commit");
+        received
     }
 }
 

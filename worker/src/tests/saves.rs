@@ -94,13 +94,15 @@ fn a_save_under_way_is_complete_before_the_outcome_is_reported() {
         context.save(checkpoint(1, serde_json::Value::Null), &[("state", &[&[1]])])?;
         Err(StageError::Diverged { step: 1, loss: f64::NAN, norm: 1.0 })
     }));
-    grant_without_room(&worker);
+    worker.fake.slow.store(true, Ordering::SeqCst);
+    worker.grant(1);
     worker.wait("a step", |coordinator| progress(coordinator) == Some(1));
-    worker.fake.full.store(false, Ordering::SeqCst);
-    worker.wait("an outcome", |coordinator| {
-        assert!(coordinator.outcomes.is_empty() || coordinator.checkpoints.len() == 1);
-        !coordinator.outcomes.is_empty()
-    });
+    // The stage has failed by then.
+    thread::sleep(Duration::from_millis(500));
+    assert!(lock(&worker.fake.coordinator).outcomes.is_empty());
+    worker.fake.slow.store(false, Ordering::SeqCst);
+    worker.wait("an outcome", |coordinator| !coordinator.outcomes.is_empty());
+    assert_eq!(lock(&worker.fake.coordinator).checkpoints.len(), 1);
     assert!(matches!(worker.leave().outcomes[0].outcome, TaskOutcome::Failed { class: FailureClass::Diverged, .. }));
 }
 
