@@ -29,7 +29,7 @@ pub(super) fn config() -> PathBuf {
     Bench::repository().join("configs/smoke.yaml")
 }
 
-type Curves = BTreeMap<String, Vec<(u64, f64)>>;
+pub(super) type Curves = BTreeMap<String, Vec<(u64, f64)>>;
 
 /// The undisturbed run of one worker: digests and all recorded values.
 fn reference() -> &'static (Value, Curves) {
@@ -53,7 +53,7 @@ pub(super) fn equals_reference(cluster: &Cluster, run: &str, view: &Value) {
 }
 
 #[track_caller]
-fn equals(cluster: &Cluster, run: &str, view: &Value, (expected, curves): &(Value, Curves)) {
+pub(super) fn equals(cluster: &Cluster, run: &str, view: &Value, (expected, curves): &(Value, Curves)) {
     assert_eq!(digests(view), digests(expected), "digests");
     let found = cluster.metrics(run, "vae");
     assert_eq!(found.keys().collect::<Vec<_>>(), curves.keys().collect::<Vec<_>>());

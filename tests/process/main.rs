@@ -36,6 +36,7 @@ mod results;
 mod running;
 mod shares;
 mod showpieces;
+mod slurm;
 mod stand_by;
 mod storage;
 mod streaming;

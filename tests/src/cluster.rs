@@ -84,9 +84,15 @@ impl Cluster {
 
     /// Like [`start`](Self::start), with its blobs in a bucket. Workers get no credentials of the bucket.
     pub fn on_bucket(trainer: &str, bucket: &Bucket, prefix: &str) -> Self {
+        Self::on_bucket_with(trainer, bucket, prefix, &[])
+    }
+
+    /// Like [`on_bucket`](Self::on_bucket), with more arguments for its servers.
+    pub fn on_bucket_with(trainer: &str, bucket: &Bucket, prefix: &str, arguments: &[&str]) -> Self {
         let bench = Bench::new(trainer).with_token(TOKEN).with_environment(bucket.environment());
         fs::create_dir_all(bench.path().join("logs")).expect("a folder for logs");
-        Self::serving_with(bench, Self::free_address(), &["--blobs", &Bucket::url(prefix)])
+        let blobs = Bucket::url(prefix);
+        Self::serving_with(bench, Self::free_address(), &[&["--blobs", &blobs], arguments].concat())
     }
 
     fn serving_with(bench: Bench, address: SocketAddr, arguments: &[&str]) -> Self {
@@ -216,8 +222,29 @@ impl Cluster {
 
     /// Starts a worker with more arguments, by a wrapping command.
     pub fn join_by(&mut self, name: &str, wrap: &[String], more: &[&str]) {
-        let urls = self.second.iter().fold(self.url(), |urls, second| format!("{urls},http://{second}"));
-        self.join_at(&urls, name, wrap, more);
+        self.join_at(&self.urls(), name, wrap, more);
+    }
+
+    /// Starts a launcher of workers, by a wrapping command. It is signalled, killed and heard like a worker.
+    pub fn launch(&mut self, name: &str, wrap: &[String], engine: &str, options: &[&str]) {
+        let secret = |file: &str, token: &str| {
+            let path = self.bench.path().join(file);
+            fs::write(&path, token).expect("a token file");
+            fs::set_permissions(&path, fs::Permissions::from_mode(0o600)).expect("ours");
+            path.display().to_string()
+        };
+        let (own, workers) = (secret("launcher.token", TOKEN), secret("workers.token", WORKER_TOKEN));
+        let urls = self.urls();
+        let mut arguments = vec!["launch", engine, "--server", &urls, "--token-file", &own];
+        arguments.extend(["--worker-token-file", &workers, "--name", name]);
+        arguments.extend_from_slice(options);
+        let launcher = self.spawn(name, wrap, &arguments);
+        self.workers.insert(name.to_owned(), launcher);
+    }
+
+    /// The addresses of the server and of its stand-by, if it has one.
+    fn urls(&self) -> String {
+        self.second.iter().fold(self.url(), |urls, second| format!("{urls},http://{second}"))
     }
 
     /// Like [`join_by`](Self::join_by), with another URL of the coordinator.

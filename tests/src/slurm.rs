@@ -2,6 +2,7 @@
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
+use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
 /// A Slurm below a folder of its own. It ends with this value.
@@ -12,7 +13,7 @@ pub struct Slurm {
 }
 
 impl Slurm {
-    /// Starts a cluster of `nodes` nodes; `None` with a notice where it cannot run. Nothing is installed.
+    /// Starts a cluster of up to three nodes; `None` with a notice where it cannot run. Nothing is installed.
     ///
     /// # Panics
     /// Under CI if the scripts are missing.
@@ -40,8 +41,9 @@ impl Slurm {
             return None;
         }
         let slurm = Self { dir: tempfile::tempdir().expect("a folder"), scripts };
-        // Below the ports that the system gives to clients.
-        let port = 20_000 + std::process::id() % 1_000 * 10;
+        // Below the ports that the system gives to clients. Two clusters of a process may run at once.
+        static STARTED: AtomicU32 = AtomicU32::new(0);
+        let port = 20_000 + std::process::id() % 1_000 * 10 + STARTED.fetch_add(1, Ordering::SeqCst) % 2 * 5;
         let mut up = slurm.script("slurm-up.sh");
         up.env("N", nodes.to_string()).env("CTLD", port.to_string()).env("BASE", (port + 1).to_string());
         // Its daemons keep the output open, so it goes to a file.
@@ -59,6 +61,38 @@ impl Slurm {
     /// The value of `SLURM_CONF` with which commands find the cluster.
     pub fn configuration(&self) -> PathBuf {
         self.dir.path().join("slurm.conf")
+    }
+
+    /// What one of Slurm's commands prints, without its last line break.
+    ///
+    /// # Errors
+    /// What it says if it fails.
+    pub fn ask(&self, program: &str, arguments: &[&str]) -> Result<String, String> {
+        let mut command = Command::new(program);
+        command.args(arguments).env("SLURM_CONF", self.configuration()).stdin(Stdio::null());
+        let output = command.output().map_err(|error| format!("{program}: {error}"))?;
+        let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).trim_end().to_owned();
+        if output.status.success() { Ok(text(&output.stdout)) } else { Err(text(&output.stderr)) }
+    }
+
+    /// The process of a daemon: `slurmctld`, or `slurmd.n1` of a node.
+    ///
+    /// # Panics
+    /// If it was not started.
+    pub fn pid(&self, daemon: &str) -> u32 {
+        let file = self.dir.path().join(format!("{daemon}.pid"));
+        let number = std::fs::read_to_string(&file).expect("a daemon writes its number");
+        number.trim().parse().expect("a number")
+    }
+
+    /// Starts the controller again after its end.
+    ///
+    /// # Panics
+    /// If it does not start.
+    pub fn start_controller(&self) {
+        let configuration = self.configuration();
+        let status = Command::new("slurmctld").arg("-f").arg(configuration).stdin(Stdio::null()).status();
+        assert!(status.expect("slurmctld runs").success(), "the controller starts again");
     }
 
     /// Entries of the running daemons in `/proc`.
