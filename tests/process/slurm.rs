@@ -17,7 +17,7 @@ const TRAINER: &str = env!("CARGO_BIN_EXE_trainer");
 /// A stage that lasts as long as Slurm needs for all faults, and the one before it.
 const LONG: [&str; 8] = [
     "--set",
-    "stages.vae.steps=1600",
+    "stages.vae.steps=1300",
     "--set",
     "stages.vae.windows.until=1",
     "--set",
@@ -104,10 +104,12 @@ fn p4_whatever_slurm_does_a_training_ends_on_the_digests_of_a_folder() {
     let catalog = postgres.address(&postgres.create());
     let mut cluster = Cluster::on_bucket_with(TRAINER, &bucket, "slurm", &["--catalog", &catalog]);
     cluster.stand_by(&["--store", "second"]);
-    let conf = format!("SLURM_CONF={}", slurm.configuration().display());
+    // Its jobs inherit both. A step of 60 ms lets the stage outlast all faults on a fast machine, too.
+    let variables = [format!("SLURM_CONF={}", slurm.configuration().display()), "STRIDE_WORKER_PACE=60".to_owned()];
+    let wrap = [&["env".to_owned()], &variables[..]].concat();
     let name = format!("t{}", std::process::id());
     let options = ["--workers", "0..2", "--idle", "60s", "--program", TRAINER, "--", "--exclusive", "--mem=100"];
-    cluster.launch(&name, &["env".to_owned(), conf], "slurm", &options);
+    cluster.launch(&name, &wrap, "slurm", &options);
     let run = cluster.submit(&config(), &LONG);
     let mut site = Site { slurm, cluster, run, begun: Instant::now() };
     site.cluster.wait_step(&site.run, "vae", 20);
