@@ -1,5 +1,7 @@
 //! A training whose workers are jobs of a real Slurm, whose catalog is in PostgreSQL and whose blobs are in a bucket.
 
+use std::fs;
+use std::process::Command;
 use std::time::{Duration, Instant};
 
 use cluster_tests::bucket::Bucket;
@@ -49,6 +51,21 @@ struct Job {
 
 fn send(pid: u32, signal: Signal) {
     kill(Pid::from_raw(i32::try_from(pid).expect("a process")), signal).expect("the process runs");
+}
+
+/// Ends workers that are out of Slurm's reach, and the processes of the lost node that wait for them.
+fn end_stranded(pattern: &str) {
+    let found = Command::new("pgrep").args(["-f", pattern]).output().expect("pgrep runs");
+    for worker in String::from_utf8_lossy(&found.stdout).lines().filter_map(|line| line.parse::<u32>().ok()) {
+        let status = fs::read_to_string(format!("/proc/{worker}/status")).unwrap_or_default();
+        let parent = status.lines().find_map(|line| line.strip_prefix("PPid:")?.trim().parse::<u32>().ok());
+        let is_step =
+            |pid: &u32| fs::read_to_string(format!("/proc/{pid}/comm")).is_ok_and(|comm| comm.contains("slurmstepd"));
+        for pid in parent.filter(is_step).into_iter().chain([worker]) {
+            // It may have ended by itself.
+            let _ = kill(Pid::from_raw(i32::try_from(pid).expect("a process")), Signal::SIGKILL);
+        }
+    }
 }
 
 struct Site {
@@ -152,8 +169,6 @@ fn p4_whatever_slurm_does_a_training_ends_on_the_digests_of_a_folder() {
 
     cluster.kill(&name);
     let _ = slurm.ask("scancel", &["-p", "batch"]);
-    // The worker of the lost node is out of Slurm's reach.
-    let pattern = format!("worker join .*{name}-");
-    let _ = std::process::Command::new("pkill").args(["-KILL", "-f", &pattern]).status();
+    end_stranded(&format!("worker join .*{name}-"));
     wait_for("the jobs to end", || slurm.ask("squeue", &["-h", "-p", "batch"]).ok()?.is_empty().then_some(()));
 }
