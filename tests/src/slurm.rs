@@ -63,7 +63,7 @@ impl Slurm {
         self.dir.path().join("slurm.conf")
     }
 
-    /// What one of Slurm's commands prints, without its last line break.
+    /// Runs one of Slurm's commands and returns its output, without the last line break.
     ///
     /// # Errors
     /// What it says if it fails.

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use burn::tensor::Device;
-use checkpoint::Blobs;
+use checkpoint::{Blob, Blobs, Joined};
 use protocol::message::{Progress, StageTask, TaskOutcome};
 use protocol::{ArtifactKind, Digest, Manifest};
 use stages::context::{Adopted, AttemptContext, Checkpoint, ContextError, Exchange, GangContext, Rendezvous};
@@ -225,6 +225,19 @@ impl HttpContext {
             peak_mib = process::memory().map(|memory| memory.peak >> 20),
             "met the gang"
         );
+    }
+
+    fn to_save<'a>(&self, checkpoint: Checkpoint, files: Vec<(String, Box<dyn Blob + 'a>)>) -> Save<'a> {
+        Save {
+            checkpoint,
+            files,
+            met: self.mesh.as_ref().map(|mesh| mesh.config.generation),
+            recorded: self.telemetry.mark(),
+            held: self.held.clone(),
+            client: self.client.clone(),
+            blobs: self.blobs.clone(),
+            telemetry: self.telemetry.clone(),
+        }
     }
 
     /// Marks this member as saving if it asks for blobs between two steps.
@@ -456,18 +469,19 @@ impl GangContext for HttpContext {
         self.saver.wait();
         let copy = |(name, pieces): &(&str, &[&[u8]])| Ok(((*name).to_owned(), self.blobs.cache.copy(pieces)?));
         let copies: std::io::Result<Vec<_>> = files.iter().map(copy).collect();
-        let files =
-            copies.map_err(|error| ContextError::Storage(format!("no copy of a checkpoint can be made: {error}")))?;
-        self.saver.begin(Save {
-            checkpoint,
-            files,
-            met: self.mesh.as_ref().map(|mesh| mesh.config.generation),
-            recorded: self.telemetry.mark(),
-            held: self.held.clone(),
-            client: self.client.clone(),
-            blobs: self.blobs.clone(),
-            telemetry: self.telemetry.clone(),
-        })
+        match copies {
+            Ok(copies) => self.saver.begin(self.to_save(checkpoint, copies)),
+            Err(error) => {
+                // A full disk here must not cost a checkpoint.
+                tracing::warn!("no copy of a checkpoint can be made here, so training waits for it: {error}");
+                let own = files.iter().map(|(name, pieces)| {
+                    let joined: Box<dyn Blob + '_> = Box::new(Joined::new(pieces.to_vec()));
+                    ((*name).to_owned(), joined)
+                });
+                self.saver.make(&self.to_save(checkpoint, own.collect()));
+                Ok(())
+            }
+        }
     }
 
     fn saved(&mut self, wait: bool) -> Option<Result<u64, ContextError>> {

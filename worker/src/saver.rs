@@ -35,13 +35,18 @@ pub(crate) struct Saver {
 
 impl Saver {
     /// Begins a save after the one that runs has ended.
-    pub(crate) fn begin(&mut self, save: Save) -> Result<(), ContextError> {
+    pub(crate) fn begin(&mut self, save: Save<'static>) -> Result<(), ContextError> {
         self.wait();
         let span = tracing::Span::current();
         let thread = thread::Builder::new().name("save".to_owned()).spawn(move || span.in_scope(|| save.run()));
         let thread = thread.map_err(|error| ContextError::Unavailable(format!("no thread for the save: {error}")))?;
         self.running = Some(thread);
         Ok(())
+    }
+
+    /// Makes a save while the stage waits, because its files could not be copied.
+    pub(crate) fn make(&mut self, save: &Save<'_>) {
+        self.ended = Some(save.run());
     }
 
     /// Returns true while a save runs.
@@ -74,10 +79,10 @@ impl Drop for Saver {
 
 /// A save with all that its thread needs.
 #[derive(Debug)]
-pub(crate) struct Save {
+pub(crate) struct Save<'a> {
     pub(crate) checkpoint: Checkpoint,
-    /// Copies of the files, by name.
-    pub(crate) files: Vec<(String, Box<dyn Blob>)>,
+    /// Copies of the files, by name, or the stage's own.
+    pub(crate) files: Vec<(String, Box<dyn Blob + 'a>)>,
     /// The generation that the stage has met, in a gang.
     pub(crate) met: Option<Generation>,
     /// The recorded values and lines before the save.
@@ -88,9 +93,9 @@ pub(crate) struct Save {
     pub(crate) telemetry: Arc<TelemetryBuffer>,
 }
 
-impl Save {
-    fn run(self) -> Saved {
-        let Self { checkpoint, held, .. } = &self;
+impl Save<'_> {
+    fn run(&self) -> Saved {
+        let Self { checkpoint, held, .. } = self;
         held.set_postponable(checkpoint.may_wait);
         let saved = self.upload().and_then(|manifest| self.commit(&manifest));
         held.set_postponable(false);

@@ -72,6 +72,10 @@ impl Worker {
     }
 
     fn start_within(script: Script, limits: StageLimits) -> Self {
+        Self::start_on(script, limits, Cache::new(None, None, Bounds::default()).expect("memory"))
+    }
+
+    fn start_on(script: Script, limits: StageLimits, cache: Cache) -> Self {
         let fake: Arc<Fake> = Arc::default();
         let server = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build();
         let server = server.expect("a runtime");
@@ -85,7 +89,7 @@ impl Worker {
         let peer_address = endpoint.address().to_string();
         let member = Member { worker: "w0".into(), incarnation: Incarnation(1), peer_address: peer_address.clone() };
         let shared = Shared::new(endpoint);
-        let cache = Arc::new(Cache::new(None, None, Bounds::default()).expect("memory"));
+        let cache = Arc::new(cache);
         let preparer = {
             let shared = shared.clone();
             let client = client.clone();

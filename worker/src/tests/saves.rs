@@ -60,6 +60,28 @@ fn a_stage_trains_on_while_its_checkpoint_is_stored() {
     }
 }
 
+/// The folder of the copies is gone, as one on a full disk takes nothing.
+#[test]
+fn a_state_that_cannot_be_copied_is_stored_while_the_stage_waits() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let cache = Cache::new(Some(folder.path().to_owned()), None, Bounds::default()).expect("writable");
+    drop(folder);
+    let script = Box::new(|context: &mut dyn GangContext| {
+        context.rendezvous(None, &[])?;
+        steps(context, 0, 1)?;
+        let state = vec![1; LARGE];
+        context.save(checkpoint(1, serde_json::Value::Null), &[("state", &[&state])])?;
+        assert_eq!(context.saved(false).expect("it is stored")?, 1);
+        finished(context)
+    });
+    let worker = Worker::start_on(script, StageLimits { memory: None, ..StageLimits::default() }, cache);
+    worker.grant(1);
+    worker.wait("an outcome", |coordinator| !coordinator.outcomes.is_empty());
+    let coordinator = worker.leave();
+    assert!(matches!(coordinator.outcomes[0].outcome, TaskOutcome::Finished { .. }), "{:?}", coordinator.outcomes);
+    assert_eq!(coordinator.blobs[&Digest::of(&vec![1; LARGE])].len(), LARGE);
+}
+
 #[test]
 fn a_save_that_may_wait_is_put_off_by_a_busy_store_and_another_follows() {
     let worker = Worker::start(Box::new(|context| {
