@@ -15,6 +15,16 @@ pub const ALL: [&str; 8] = [
     "db::after_commit",
 ];
 
+/// Passes a point.
+macro_rules! fail_point {
+    ($name:expr) => {
+        #[cfg(feature = "failpoints")]
+        fail::fail_point!($name);
+    };
+}
+
+pub(crate) use fail_point;
+
 /// Arms the point in `STRIDE_FAILPOINT`; called once by a binary's `main`. Does nothing without the feature.
 ///
 /// # Panics

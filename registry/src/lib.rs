@@ -39,6 +39,7 @@ mod server_key;
 mod sql;
 mod store;
 mod store_id;
+mod table;
 #[cfg(feature = "testing")]
 pub mod testing;
 pub mod versions;

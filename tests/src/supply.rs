@@ -1,5 +1,6 @@
 //! Dependencies of the workspace, from `cargo metadata` without a network.
 
+use std::collections::BTreeSet;
 use std::process::Command;
 
 use serde_json::Value;
@@ -11,14 +12,28 @@ pub fn metadata() -> Value {
     let version = Command::new("rustc").arg("-vV").output().expect("rustc -vV runs");
     let version = String::from_utf8_lossy(&version.stdout).into_owned();
     let host = version.lines().find_map(|line| line.strip_prefix("host: ")).expect("rustc names its host");
+    let json = cargo(&["metadata", "--format-version", "1", "--filter-platform", host]);
+    serde_json::from_slice(&json).expect("JSON")
+}
+
+/// Names and versions of the packages that a build of this package with its default features compiles.
+pub fn built(package: &str) -> BTreeSet<String> {
+    let tree = cargo(&["tree", "--package", package, "--edges", "normal,build", "--prefix", "none"]);
+    let tree = String::from_utf8_lossy(&tree);
+    tree.lines().filter_map(|line| line.split(" (").next()).map(str::to_owned).collect()
+}
+
+/// Returns what `cargo` prints, without a network.
+fn cargo(args: &[&str]) -> Vec<u8> {
     let cargo = std::env::var("CARGO").unwrap_or_else(|_| "cargo".to_owned());
     let output = Command::new(cargo)
-        .args(["metadata", "--format-version", "1", "--locked", "--offline", "--filter-platform", host])
+        .args(args)
+        .args(["--locked", "--offline"])
         .current_dir(Bench::repository())
         .output()
-        .expect("cargo metadata runs");
+        .expect("cargo runs");
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
-    serde_json::from_slice(&output.stdout).expect("JSON")
+    output.stdout
 }
 
 /// Returns true if the licences that `is_allowed` accepts satisfy an SPDX expression. A slash is the old form of `OR`.

@@ -8,6 +8,9 @@ use std::process::Command;
 use cluster_tests::{Bench, supply};
 use serde_json::Value;
 
+/// Largest number of packages in a build of the trainer. Each costs time in every build, and somebody must watch it.
+const MOST_PACKAGES: usize = 427;
+
 /// The texts of `key = [...]` in `deny.toml`, or of a field of its tables.
 fn listed<'a>(deny: &'a str, begin: &str, before: &str) -> BTreeSet<&'a str> {
     let list = deny.split_once(begin).and_then(|(_, rest)| rest.split_once("\n]")).expect("deny.toml has the list").0;
@@ -42,6 +45,19 @@ fn every_crate_is_allowed() {
         }
     }
     assert!(foreign > 300 && wrong.is_empty(), "of {foreign} crates: {wrong:#?}");
+}
+
+#[test]
+fn a_build_of_the_trainer_needs_few_packages() {
+    let packages = supply::built("trainer");
+    let has = |package: &str| packages.iter().any(|name| name.strip_prefix(package).is_some_and(|v| v.starts_with(" v")));
+    assert!(has("burn-flex") && !has("s3s"), "not a list of what is built: {packages:?}");
+    let many = packages.len();
+    assert!(
+        many <= MOST_PACKAGES,
+        "{many} packages are built, expected {MOST_PACKAGES} at most; `cargo tree -e normal,build` shows what needs \
+         them, and `cargo update -p idna_adapter --precise 1.1.0` saves twenty if an update brought icu_*"
+    );
 }
 
 #[test]

@@ -75,10 +75,12 @@ pub(crate) fn secret() -> Option<access::Token> {
 /// Passes a point.
 pub(crate) fn hit(name: &'static str) {
     debug_assert!(ALL.contains(&name));
+    #[cfg(feature = "failpoints")]
     fail::fail_point!(name);
 }
 
 /// Passes the point of the exchange of a training step.
 pub(crate) fn pace() {
+    #[cfg(feature = "failpoints")]
     fail::fail_point!(PACE);
 }

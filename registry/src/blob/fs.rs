@@ -16,7 +16,6 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use checkpoint::BlobError;
-use fail::fail_point;
 use nix::fcntl::{Flock, FlockArg};
 use protocol::Digest;
 
@@ -25,6 +24,7 @@ use super::disk::{Disk, Os, regular, write_whole};
 pub(super) use super::disk_error::error;
 use super::staging::{Part, Staging};
 use crate::clock;
+use crate::failpoints::fail_point;
 
 /// Backend that stores blobs in a folder.
 #[derive(Debug)]

@@ -9,10 +9,10 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use checkpoint::BlobError;
-use fail::fail_point;
 
 use super::disk::{Disk, DiskFile, free_bytes, regular};
 use super::disk_error::error;
+use crate::failpoints::fail_point;
 
 /// Free space that a blob must leave for the database.
 const RESERVE_BYTES: u64 = 16 << 20;

@@ -4,7 +4,6 @@ use std::collections::BTreeMap;
 use std::io::{self, Write};
 
 use checkpoint::model::{Model, Parts};
-use comfy_table::{ContentArrangement, Table, presets};
 use protocol::artifact::Role;
 use protocol::message::ApiError;
 use protocol::units::{counted, size};
@@ -17,6 +16,7 @@ use crate::backup::Summary;
 use crate::clock::format_ms;
 use crate::forget::Forgotten;
 use crate::retention::Plan;
+use crate::table::table;
 use crate::versions::{self, Action, Promotion, Version};
 use crate::{LineageNode, fsck, leaderboard};
 
@@ -114,7 +114,7 @@ fn models_as_table(models: &[versions::Model]) -> String {
     if models.is_empty() {
         return "no models yet; a `register` stage creates one\n".into();
     }
-    let mut table = table(&["MODEL", "VERSIONS", "BEST", "METRIC", "ALIASES"]);
+    let mut table = table(["MODEL", "VERSIONS", "BEST", "METRIC", "ALIASES"]);
     for model in models {
         let mode = model.mode.map(|mode| format!(" ({})", json!(mode).as_str().unwrap_or_default()));
         table.add_row([
@@ -129,7 +129,7 @@ fn models_as_table(models: &[versions::Model]) -> String {
 }
 
 fn versions_as_table(model: &versions::Model, versions: &[Version]) -> String {
-    let mut table = table(&["VERSION", "ALIASES", "METRICS", "FROM", "REGISTERED"]);
+    let mut table = table(["VERSION", "ALIASES", "METRICS", "FROM", "REGISTERED"]);
     for version in versions {
         let best = (model.best == Some(version.version)).then(|| "best".to_owned());
         let metrics = leaderboard::in_brief(version, model.metric.as_deref());
@@ -155,7 +155,7 @@ fn version_in_full(version: &Version, manifest: &Manifest, fits: &BTreeMap<Role,
     for (name, value) in lines.into_iter().chain(drawn(manifest)).chain(made_for(fits)).chain(beside(bases)) {
         text += &format!("  {name:<11} {value}\n");
     }
-    let mut values = table(&["EVALUATION", "METRIC", "VALUE, ± HALF THE 95 % INTERVAL"]);
+    let mut values = table(["EVALUATION", "METRIC", "VALUE, ± HALF THE 95 % INTERVAL"]);
     for (stage, measures) in leaderboard::measured(version) {
         for (metric, measure) in leaderboard::in_order(&measures) {
             values.add_row([dash(stage.as_ref()), metric.clone(), leaderboard::in_words(measure)]);
@@ -164,7 +164,7 @@ fn version_in_full(version: &Version, manifest: &Manifest, fits: &BTreeMap<Role,
     if !version.metrics.is_empty() {
         text += &format!("{}\n\n", values.trim_fmt());
     }
-    let mut files = table(&["FILE", "BYTES", "BLOB"]);
+    let mut files = table(["FILE", "BYTES", "BLOB"]);
     for (name, file) in &manifest.files {
         files.add_row([name.clone(), file.bytes.to_string(), file.digest.short()]);
     }
@@ -172,7 +172,7 @@ fn version_in_full(version: &Version, manifest: &Manifest, fits: &BTreeMap<Role,
 }
 
 fn history_as_table(history: &[Promotion]) -> String {
-    let mut table = table(&["#", "WHEN", "ALIAS", "ACTION", "FROM", "TO", "WHO", "WHY", "GATES"]);
+    let mut table = table(["#", "WHEN", "ALIAS", "ACTION", "FROM", "TO", "WHO", "WHY", "GATES"]);
     for entry in history {
         table.add_row([
             entry.id.to_string(),
@@ -193,7 +193,7 @@ fn audit_as_table(entries: &[AuditEntry]) -> String {
     if entries.is_empty() {
         return "the audit log is empty\n".into();
     }
-    let mut table = table(&["WHEN", "WHO", "FROM", "CALL", "OBJECT", "STATUS", "CALLS"]);
+    let mut table = table(["WHEN", "WHO", "FROM", "CALL", "OBJECT", "STATUS", "CALLS"]);
     for entry in entries {
         table.add_row([
             format_ms(entry.at_ms),
@@ -209,7 +209,7 @@ fn audit_as_table(entries: &[AuditEntry]) -> String {
 }
 
 fn lineage_as_table(nodes: &[LineageNode]) -> String {
-    let mut table = table(&["ARTIFACT", "KIND", "STAGE", "RUN", "MADE OF"]);
+    let mut table = table(["ARTIFACT", "KIND", "STAGE", "RUN", "MADE OF"]);
     for node in nodes {
         table.add_row([
             format!("{}{}", "  ".repeat(node.depth as usize), node.digest.short()),
@@ -278,12 +278,6 @@ fn forgotten(runs: &[(RunId, Forgotten)]) -> String {
         }
     }
     text + "`registry gc` removes blobs that are no longer needed\n"
-}
-
-fn table(header: &[&str]) -> Table {
-    let mut table = Table::new();
-    table.load_style(presets::NOTHING).set_content_arrangement(ContentArrangement::Dynamic).set_header(header);
-    table
 }
 
 fn action(entry: &Promotion) -> &'static str {

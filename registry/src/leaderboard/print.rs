@@ -1,12 +1,12 @@
 //! Leaderboards as text for terminals, and as Markdown and LaTeX rows for papers and pages.
 
 use clap::ValueEnum;
-use comfy_table::{ContentArrangement, Table, presets};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::column::{COLUMNS, Column, PAPER_COLUMNS};
 use super::{Better, Comparison, Leaderboard, Measure, Row, Verdict};
+use crate::table::table;
 
 /// Format of a table.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, ValueEnum, JsonSchema)]
@@ -50,11 +50,7 @@ impl Leaderboard {
         match style {
             Style::Text => {
                 let head = std::iter::once(self.title.clone()).chain(heads);
-                let mut table = Table::new();
-                table
-                    .load_style(presets::NOTHING)
-                    .set_content_arrangement(ContentArrangement::Dynamic)
-                    .set_header(head);
+                let mut table = table(head);
                 for row in &self.rows {
                     table.add_row(std::iter::once(label(row)).chain(cells(row, |cell| format!("{cell} *"), " ± ")));
                 }
@@ -124,11 +120,7 @@ impl Comparison {
             .map(|d| [d.metric.clone(), cell(d.left), cell(d.right), cell(d.difference), verdict(d.verdict)]);
         match style {
             Style::Text => {
-                let mut table = Table::new();
-                table
-                    .load_style(presets::NOTHING)
-                    .set_content_arrangement(ContentArrangement::Dynamic)
-                    .set_header(heads);
+                let mut table = table(heads);
                 table.add_rows(lines);
                 format!("{}\n", table.trim_fmt())
             }

@@ -9,7 +9,6 @@ use std::sync::Arc;
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-use fail::fail_point;
 use tokio::sync::{mpsc, oneshot};
 
 use super::error::write_error;
@@ -20,6 +19,7 @@ use super::statement::{Conn, int, query};
 use super::{apply, forget, history, moves, postgres, retention};
 use crate::WriteError;
 use crate::catalog::{Done, Order, PostgresAddress};
+use crate::failpoints::fail_point;
 use crate::identity::Witness;
 use crate::lock::StoreLock;
 use crate::proofs::Proofs;

@@ -46,8 +46,8 @@ fn array(header: &str, data: &[u8]) -> Vec<u8> {
 pub fn npy() -> Vec<Vec<u8>> {
     let numbers: Vec<u8> = (0..66).flat_map(|i| (f64::from(i) * 0.1).to_le_bytes()).collect();
     vec![
-        npy::to_bytes(&[5, 22, 3], &joints()).expect("an array"),
-        npy::to_bytes(&[2, 63], &[0.5; 126]).expect("an array"),
+        npy::to_bytes(&[5, 22, 3], &joints()),
+        npy::to_bytes(&[2, 63], &[0.5; 126]),
         array("{'descr': '<f8', 'fortran_order': False, 'shape': (1, 22, 3), }\n", &numbers),
     ]
 }
@@ -65,7 +65,7 @@ fn archive(members: &[(&str, Vec<u8>)], packed: bool) -> Vec<u8> {
 
 /// Archives of arrays, packed and unpacked, and a plain array, which is accepted in place of an archive.
 pub fn npz() -> Vec<Vec<u8>> {
-    let joints = npy::to_bytes(&[5, 22, 3], &joints()).expect("an array");
+    let joints = npy::to_bytes(&[5, 22, 3], &joints());
     let rate = array("{'descr': '<f8', 'fortran_order': False, 'shape': (), }\n", &60_f64.to_le_bytes());
     let fps = array("{'descr': '<i8', 'fortran_order': False, 'shape': (), }\n", &30_i64.to_le_bytes());
     vec![

@@ -1,13 +1,11 @@
 //! Reads and writes `.npy` files of f32, with errors that name the file and the expected content.
 //!
-//! A thin layer over `npyz`: its checks on type, order and size report a truncated or foreign file instead of returning
-//! wrong numbers.
+//! A truncated or foreign file is reported, and nothing is allocated before the size of the file bears its header out.
 
 use std::fs;
-use std::io::{Error, ErrorKind, Write as _};
+use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
-use npyz::{DType, NpyHeader, Order, TypeChar, WriterBuilder as _};
 use protocol::{excerpt, limits};
 
 use crate::files::DataPath;
@@ -32,11 +30,11 @@ pub enum NpyError {
         source: std::io::Error,
     },
     /// The header is not that of a `.npy` file.
-    #[error("{}: not a .npy file ({source})", file.display())]
+    #[error("{}: not a .npy file ({why})", file.display())]
     Header {
         file: PathBuf,
         /// Defect of the header.
-        source: std::io::Error,
+        why: String,
     },
     /// The element type is not the expected one.
     #[error("{}: has type {found}; expected {expected}; save it with numpy.save(..., x.astype(numpy.float32))", file.display())]
@@ -87,114 +85,116 @@ fn bytes_of(file: &DataPath, limit: u64) -> Result<Vec<u8>, NpyError> {
 
 /// Reads an array from bytes; `file` is only its name in errors.
 pub fn parse(file: &Path, bytes: &[u8], allow_f64: bool) -> Result<Array, NpyError> {
-    let header_error = |source| NpyError::Header { file: file.into(), source };
-    check_header(bytes).map_err(|what| header_error(Error::new(ErrorKind::InvalidData, what)))?;
-    let mut rest = bytes;
-    let header = NpyHeader::from_reader(&mut rest).map_err(|error| header_error(quoted(&error)))?;
-    let expected = if allow_f64 { "f32 or f64 (<f4, <f8)" } else { "f32 (<f4)" };
-    let wrong_type = |found: String| NpyError::Type { file: file.into(), found, expected };
-    let width = match header.dtype() {
-        DType::Plain(ty)
-            if ty.type_char() == TypeChar::Float && (ty.size_field() == 4 || (allow_f64 && ty.size_field() == 8)) =>
-        {
-            ty.size_field()
+    let (header, data) = Header::split(bytes).map_err(|why| NpyError::Header { file: file.into(), why })?;
+    let width = match header.descr {
+        "<f4" | ">f4" => 4,
+        "<f8" | ">f8" if allow_f64 => 8,
+        other => {
+            let expected = if allow_f64 { "f32 or f64 (<f4, <f8)" } else { "f32 (<f4)" };
+            return Err(NpyError::Type { file: file.into(), found: format!("`{}`", excerpt(other)), expected });
         }
-        other => return Err(wrong_type(format!("`{}`", excerpt(&other.descr())))),
     };
-    if header.order() == Order::Fortran && header.shape().len() > 1 {
+    if header.is_column_major && header.shape.len() > 1 {
         return Err(NpyError::Order { file: file.into() });
     }
-    let size = |shape: &[u64]| shape.iter().try_fold(width, |n, axis| n.checked_mul(*axis));
-    let found = rest.len() as u64;
-    let expected = size(header.shape()).unwrap_or(u64::MAX);
+    let found = data.len() as u64;
+    let expected = header.elements.saturating_mul(width);
     if found != expected {
-        return Err(NpyError::Size { file: file.into(), shape: header.shape().to_vec(), expected, found });
+        return Err(NpyError::Size { file: file.into(), shape: header.shape, expected, found });
     }
-    let shape: Vec<usize> = header.shape().iter().map(|n| *n as usize).collect();
-    let body = npyz::NpyFile::with_header(header, rest);
+    let big_endian = header.descr.starts_with('>');
     let data = if width == 4 {
-        body.into_vec::<f32>()
+        let value = if big_endian { f32::from_be_bytes } else { f32::from_le_bytes };
+        data.as_chunks().0.iter().map(|bytes| value(*bytes)).collect()
     } else {
-        body.into_vec::<f64>().map(|v| v.into_iter().map(|x| x as f32).collect())
+        let value = if big_endian { f64::from_be_bytes } else { f64::from_le_bytes };
+        data.as_chunks().0.iter().map(|bytes| value(*bytes) as f32).collect()
     };
-    Ok(Array { shape, data: data.map_err(|error| header_error(quoted(&error)))? })
+    Ok(Array { shape: header.shape.iter().map(|n| *n as usize).collect(), data })
 }
 
-/// Hides the reader's message about a header, which may quote it.
-fn quoted(error: &Error) -> Error {
-    Error::new(error.kind(), format!("cannot read its header: {}", excerpt(&error.to_string())))
+/// The header of a `.npy` file, versions 1 to 3 of NumPy's `numpy.lib.format`: a mapping as Python writes it.
+struct Header<'a> {
+    /// Type of an element: `<f4` is a little-endian f32. A type with fields is a list.
+    descr: &'a str,
+    is_column_major: bool,
+    shape: Vec<u64>,
+    /// Product of the axes.
+    elements: u64,
 }
 
-/// Largest nesting of brackets; the header of a plain array has a mapping and a tuple in it.
-const DEPTH: usize = 4;
-
-/// Checks the header before its reader trusts it: the length, for which it allocates, the nesting, and the shape, whose
-/// axes it multiplies.
-fn check_header(bytes: &[u8]) -> Result<(), String> {
-    let [b'\x93', b'N', b'U', b'M', b'P', b'Y', major, _, rest @ ..] = bytes else {
-        return Err("its first bytes are not those of a .npy file".into());
-    };
-    let (length, rest) = match (major, rest) {
-        (1, [a, b, rest @ ..]) => (u32::from(u16::from_le_bytes([*a, *b])), rest),
-        (2 | 3, [a, b, c, d, rest @ ..]) => (u32::from_le_bytes([*a, *b, *c, *d]), rest),
-        (1..=3, _) => return Err("its header is truncated".into()),
-        (other, _) => return Err(format!("it has version {other}; expected 1 to 3")),
-    };
-    if length as usize > limits::ARRAY_HEADER_BYTES {
-        return Err(format!("its header has {length} bytes; expected at most {}", limits::ARRAY_HEADER_BYTES));
-    }
-    let header = rest.get(..length as usize).ok_or("its header is truncated")?;
-    // The reader's time doubles with each level.
-    let mut depth = 0_usize;
-    for byte in header {
-        match byte {
-            b'(' | b'[' | b'{' => depth += 1,
-            b')' | b']' | b'}' => depth = depth.saturating_sub(1),
-            _ => {}
+impl<'a> Header<'a> {
+    /// Returns the header and the bytes after it, or what is wrong.
+    fn split(bytes: &'a [u8]) -> Result<(Self, &'a [u8]), String> {
+        let [b'\x93', b'N', b'U', b'M', b'P', b'Y', major, _, rest @ ..] = bytes else {
+            return Err("its first bytes are not those of a .npy file".into());
+        };
+        let (length, rest) = match (major, rest) {
+            (1, [a, b, rest @ ..]) => (u32::from(u16::from_le_bytes([*a, *b])), rest),
+            (2 | 3, [a, b, c, d, rest @ ..]) => (u32::from_le_bytes([*a, *b, *c, *d]), rest),
+            (1..=3, _) => return Err("its header is truncated".into()),
+            (other, _) => return Err(format!("it has version {other}; expected 1 to 3")),
+        };
+        if length as usize > limits::ARRAY_HEADER_BYTES {
+            return Err(format!("its header has {length} bytes; expected at most {}", limits::ARRAY_HEADER_BYTES));
         }
-        if depth > DEPTH {
-            return Err(format!("its header has brackets nested more than {DEPTH} levels deep"));
-        }
+        let (header, data) = rest.split_at_checked(length as usize).ok_or("its header is truncated")?;
+        let fields = std::str::from_utf8(header).map_err(|_| "its header is not text")?;
+        let descr = field(fields, "'descr'")?;
+        let descr = descr.strip_prefix('\'').and_then(|text| text.split('\'').next()).unwrap_or(descr);
+        let is_column_major = match field(fields, "'fortran_order'")? {
+            order if order.starts_with("False") => false,
+            order if order.starts_with("True") => true,
+            _ => return Err("its `fortran_order` is neither True nor False".into()),
+        };
+        let axes = field(fields, "'shape'")?.strip_prefix('(').and_then(|axes| axes.split_once(')'));
+        let axes = axes.ok_or("its shape is not a tuple")?.0.split(',').map(str::trim).filter(|axis| !axis.is_empty());
+        let axes = axes.map(|axis| axis.parse().map_err(|_| "its shape has an axis that is not a number"));
+        let shape = axes.collect::<Result<Vec<u64>, _>>()?;
+        let elements = shape.iter().try_fold(1_u64, |product, axis| product.checked_mul(*axis));
+        let elements = elements.ok_or("its shape has more than 2^64 elements")?;
+        Ok((Self { descr, is_column_major, shape, elements }, data))
     }
-    let header = String::from_utf8_lossy(header);
-    for after in header.split("shape").skip(1) {
-        let axes = after.split_once('(').and_then(|(_, axes)| axes.split_once(')')).map_or("", |(axes, _)| axes);
-        let axes = axes.split(',').map(str::trim).filter(|axis| !axis.is_empty());
-        let mut numbers =
-            axes.map(|axis| axis.parse::<u64>().map_err(|_| "its shape has an axis that is not a number"));
-        numbers.try_fold(1_u64, |product, axis| {
-            product.checked_mul(axis?).ok_or("its shape has more than 2^64 elements")
-        })?;
-    }
-    Ok(())
 }
 
-/// Serialises an f32 array as a `.npy` file.
-pub fn to_bytes(shape: &[usize], data: &[f32]) -> std::io::Result<Vec<u8>> {
-    let shape: Vec<u64> = shape.iter().map(|n| *n as u64).collect();
-    let mut bytes = Vec::with_capacity(128 + 4 * data.len());
-    let mut writer = npyz::WriteOptions::new().default_dtype().shape(&shape).writer(&mut bytes).begin_nd()?;
-    writer.extend(data.iter().copied())?;
-    writer.finish()?;
-    Ok(bytes)
+/// The text of a mapping from a key's value on.
+fn field<'a>(fields: &'a str, key: &str) -> Result<&'a str, String> {
+    let value = fields.split_once(key).and_then(|(_, rest)| rest.trim_start().strip_prefix(':'));
+    value.map(str::trim_start).ok_or_else(|| format!("its header has no {key}"))
+}
+
+/// Serialises an f32 array as a `.npy` file of version 1. As NumPy writes it, the data begin at a multiple of 64 bytes.
+pub fn to_bytes(shape: &[usize], data: &[f32]) -> Vec<u8> {
+    const BEFORE: usize = 10;
+    let comma = if shape.len() == 1 { "," } else { "" };
+    let axes = shape.iter().map(usize::to_string).collect::<Vec<_>>().join(", ");
+    let header = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': ({axes}{comma}), }}");
+    let length = (BEFORE + header.len() + 1).next_multiple_of(64) - BEFORE;
+    let mut bytes = Vec::with_capacity(BEFORE + length + 4 * data.len());
+    bytes.extend(b"\x93NUMPY\x01\x00");
+    bytes.extend((length as u16).to_le_bytes());
+    bytes.extend(format!("{header:<width$}\n", width = length - 1).bytes());
+    bytes.extend(data.iter().flat_map(|value| value.to_le_bytes()));
+    bytes
 }
 
 /// Writes an f32 array.
 pub fn write(file: &Path, shape: &[usize], data: &[f32]) -> Result<(), NpyError> {
     let io = |source| NpyError::Io { file: file.into(), source };
-    let bytes = to_bytes(shape, data).map_err(io)?;
-    fs::File::create(file).and_then(|mut f| f.write_all(&bytes)).map_err(io)
+    fs::File::create(file).and_then(|mut f| f.write_all(&to_bytes(shape, data))).map_err(io)
 }
 
 #[cfg(test)]
 mod tests {
+    use npyz::WriterBuilder as _;
+
     use super::*;
 
     #[test]
     fn an_array_survives_its_file_and_a_truncated_one_is_named() {
         let file = Path::new("clip.npy");
         let data: Vec<f32> = (0..6).map(|v| v as f32 / 3.0).collect();
-        let bytes = to_bytes(&[2, 3], &data).unwrap();
+        let bytes = to_bytes(&[2, 3], &data);
         assert_eq!(parse(file, &bytes, false).unwrap(), Array { shape: vec![2, 3], data });
         let cut = parse(file, &bytes[..bytes.len() - 5], false).unwrap_err().to_string();
         assert!(
@@ -202,6 +202,39 @@ mod tests {
             "{cut}"
         );
         assert!(matches!(parse(file, b"hello", false), Err(NpyError::Header { .. })));
+    }
+
+    /// `npyz` reads and writes as NumPy does.
+    #[test]
+    fn another_library_reads_and_writes_the_same_files() {
+        let data: Vec<f32> = (0..6).map(|v| v as f32 / 3.0).collect();
+        let file = Path::new("clip.npy");
+        for shape in [vec![], vec![6], vec![2, 3], vec![1, 2, 3]] {
+            let data = &data[..shape.iter().product()];
+            let ours = to_bytes(&shape, data);
+            let read = npyz::NpyFile::new(&ours[..]).unwrap();
+            assert!(read.shape().iter().map(|n| *n as usize).eq(shape.iter().copied()), "{shape:?}");
+            assert_eq!(read.into_vec::<f32>().unwrap(), data);
+            let wide: Vec<f64> = data.iter().map(|value| f64::from(*value)).collect();
+            for theirs in [written("<f4", &shape, data), written(">f4", &shape, data)] {
+                assert_eq!(parse(file, &theirs, false).unwrap(), Array { shape: shape.clone(), data: data.to_vec() });
+            }
+            for theirs in [written("<f8", &shape, &wide), written(">f8", &shape, &wide)] {
+                assert_eq!(parse(file, &theirs, true).unwrap(), Array { shape: shape.clone(), data: data.to_vec() });
+                assert!(matches!(parse(file, &theirs, false), Err(NpyError::Type { .. })));
+            }
+        }
+    }
+
+    /// A file that `npyz` writes.
+    fn written<T: npyz::Serialize + Copy>(descr: &str, shape: &[usize], data: &[T]) -> Vec<u8> {
+        let mut bytes = Vec::new();
+        let axes: Vec<u64> = shape.iter().map(|n| *n as u64).collect();
+        let options = npyz::WriteOptions::new().shape(&axes).dtype(npyz::DType::Plain(descr.parse().unwrap()));
+        let mut writer = options.writer(&mut bytes).begin_nd().unwrap();
+        writer.extend(data.iter().copied()).unwrap();
+        writer.finish().unwrap();
+        bytes
     }
 
     /// A file of `version` with the header `header`, which declares `length` bytes.
@@ -236,6 +269,10 @@ mod tests {
         refuse(&shaped("(4611686018427387904, 4)", b""), "more than 2^64 elements");
         refuse(&shaped("(0xffffffffffffffff, 2)", b""), "an axis that is not a number");
         refuse(&shaped(&format!("({most},)"), b""), "truncated");
+        refuse(&with_header(1, 2, b"{}", b""), "no 'descr'");
+        refuse(&shaped("[2]", b""), "not a tuple");
+        let order = b"{'descr': '<f4', 'fortran_order': 0, 'shape': ()}";
+        refuse(&with_header(1, order.len() as u32, order, b""), "neither True nor False");
         // An axis of zero has no elements, for any other axes.
         assert_eq!(parse(file, &shaped("(0, 9000000000)", b""), false).unwrap().data, [0.0; 0]);
         let nested = "(".repeat(900);
@@ -253,7 +290,7 @@ mod tests {
         ) {
             let file = Path::new("clip.npy");
             let _ = parse(file, &bytes, true);
-            let mut good = to_bytes(&[2, 9], &[1.0; 18]).unwrap();
+            let mut good = to_bytes(&[2, 9], &[1.0; 18]);
             let place = at % good.len();
             good[place] = byte;
             good.truncate(good.len() - cut % good.len());

@@ -7,7 +7,6 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use checkpoint::BlobError;
-use fail::fail_point;
 use futures::TryStreamExt as _;
 use object_store::{Error, ObjectStoreExt as _, PutMode, PutOptions};
 use protocol::Digest;
@@ -23,6 +22,7 @@ use crate::blob::disk::Os;
 use crate::blob::staging::Staging;
 use crate::blob::{Backend, Entry, Problem, Staged, Stat};
 use crate::clock;
+use crate::failpoints::fail_point;
 
 /// Time limit of a removal. It starts under a lease and must end before another process can take the lease.
 const REMOVAL: Duration = Duration::from_secs(10);

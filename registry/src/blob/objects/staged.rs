@@ -5,7 +5,6 @@ use std::io;
 use std::sync::Arc;
 
 use checkpoint::BlobError;
-use fail::fail_point;
 use protocol::Digest;
 
 use super::multipart::PART_BYTES;
@@ -13,6 +12,7 @@ use super::requests::Inner;
 use crate::blob::Staged;
 use crate::blob::disk::regular;
 use crate::blob::staging::Part;
+use crate::failpoints::fail_point;
 
 /// A blob being written to the store's folder, sent when it is complete.
 #[derive(Debug)]

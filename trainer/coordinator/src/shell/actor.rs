@@ -110,6 +110,7 @@ impl Actor {
                 self.batches.ask(ask, reply);
             }
             self.snapshot_if_due();
+            #[cfg(feature = "failpoints")]
             fail::fail_point!("actor::decide");
             let mut turn = self.batches.decide(|| self.moments.next());
             while let Turn::Store(writes) = turn {

@@ -250,6 +250,6 @@ fn extras(dataset: &Dataset) -> Result<Vec<Extra>, StageError> {
     let mut sheet = Vec::new();
     draw::sheet_to(&motions, SHEET.1, skeleton, draw::Given::default(), &mut sheet).map_err(fault)?;
     let std = corpus::evaluator_std(skeleton, &dataset.std);
-    let array = |values: &[f32]| npy::to_bytes(&[skeleton.features], values).map_err(fault);
-    Ok(vec![(SHEET_FILE, sheet), ("evaluator-mean.npy", array(&dataset.mean)?), ("evaluator-std.npy", array(&std)?)])
+    let array = |values: &[f32]| npy::to_bytes(&[skeleton.features], values);
+    Ok(vec![(SHEET_FILE, sheet), ("evaluator-mean.npy", array(&dataset.mean)), ("evaluator-std.npy", array(&std))])
 }

@@ -194,7 +194,7 @@ fn publish(
         draft.add(&name("bvh"), rig.to_bvh(fps, 100.0 * metres_per_unit).to_text().into_bytes())?;
         draft.add(&name("glb"), glb::to_bytes(&rig, fps, metres_per_unit, sentence).map_err(refused)?)?;
         let positions: Vec<f32> = metres(motion, skeleton).into_iter().map(|value| value as f32).collect();
-        draft.add(&name("npy"), npy::to_bytes(&[motion.frames, joints, 3], &positions).map_err(refused)?)?;
+        draft.add(&name("npy"), npy::to_bytes(&[motion.frames, joints, 3], &positions))?;
     }
     Ok(Outcome::Finished { output: draft.finish(cx)?, metrics })
 }
