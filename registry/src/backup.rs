@@ -21,7 +21,6 @@ use std::path::{Path, PathBuf};
 
 use checkpoint::{BLOBS, BlobError, blob_path};
 use protocol::Digest;
-use protocol::digest::Hasher;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -140,21 +139,8 @@ fn names(dir: &Path) -> Result<Vec<String>, BackupError> {
         .collect()
 }
 
-/// Returns the digest and the length of a file, read part by part.
 fn hashed(path: &Path) -> io::Result<(Digest, u64)> {
-    let mut file = File::open(path)?;
-    let mut hasher = Hasher::default();
-    let mut bytes = 0;
-    let mut part = vec![0; 1 << 20];
-    loop {
-        let read = file.read(&mut part)?;
-        if read == 0 {
-            break;
-        }
-        hasher.update(&part[..read]);
-        bytes += read as u64;
-    }
-    Ok((hasher.finish(), bytes))
+    Digest::of_all(&mut File::open(path)?)
 }
 
 fn expect(path: &Path, digest: Digest) -> Result<u64, BackupError> {

@@ -14,7 +14,6 @@ use std::sync::OnceLock;
 use checkpoint::BlobError;
 use checkpoint::model::{Model, assemble, extend};
 use protocol::artifact::{Chunk, FileEntry, Role};
-use protocol::digest::Hasher;
 use protocol::stage::{DataFormat, Sampler};
 use protocol::{ArtifactKind, Digest, Manifest, ModelName};
 use serde_json::{Value, json};
@@ -208,9 +207,7 @@ impl Sink for Held {
     fn end(&mut self, digest: Digest) -> Result<(), BlobError> {
         let (announced, bytes, content) = self.open.take().expect("a file was begun");
         assert_eq!((announced, bytes), (digest, content.len() as u64), "another file was announced");
-        let mut hasher = Hasher::default();
-        hasher.update(&content);
-        assert_eq!(hasher.finish(), digest, "a file of another digest");
+        assert_eq!(Digest::of(&content), digest, "a file of another digest");
         self.files.insert(digest, content);
         Ok(())
     }

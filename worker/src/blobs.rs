@@ -6,9 +6,8 @@
 use std::sync::Arc;
 
 use bytes::{Bytes, BytesMut};
-use checkpoint::{Blob, BlobError, Blobs, read_parts};
+use checkpoint::{Blob, BlobError, Blobs, digest_of, read_parts};
 use protocol::artifact::Chunk;
-use protocol::digest::Hasher;
 use protocol::limits::SMALL_BLOB_BYTES;
 use protocol::proof::SignedRequest;
 use protocol::{Digest, FileEntry, Manifest};
@@ -181,12 +180,7 @@ impl Blobs for HttpBlobs {
         if self.gang {
             failpoints::hit("checkpoint::before_upload");
         }
-        let mut hasher = Hasher::default();
-        read_parts(source, |part| {
-            hasher.update(part);
-            Ok::<_, BlobError>(())
-        })?;
-        let digest = hasher.finish();
+        let digest = digest_of(source)?;
         retry::until_put_off(&self.held, &format!("uploading blob {digest}"), |credential| {
             self.send(credential, digest, source)
         })

@@ -6,7 +6,7 @@
 
 use std::collections::{HashMap, VecDeque};
 use std::fs::{self, File, OpenOptions};
-use std::io::{self, Read as _, Write as _};
+use std::io::{self, Write as _};
 use std::os::unix::fs::FileExt as _;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -82,7 +82,7 @@ impl Cache {
         }
         let path = self.path(digest)?;
         let mut file = File::open(&path).ok()?;
-        if file.metadata().is_ok_and(|data| !data.is_file()) || digest_of(&mut file).ok() != Some(digest) {
+        if file.metadata().is_ok_and(|data| !data.is_file()) || !Digest::of_all(&mut file).is_ok_and(|(found, _)| found == digest) {
             tracing::warn!("a cached blob does not hash to its name and is fetched again: {}", path.display());
             remove(&path);
             return None;
@@ -96,7 +96,7 @@ impl Cache {
     /// Opens a blob of the store on this machine. `None` if it is missing or damaged; the coordinator reports that.
     fn in_store(&self, digest: Digest) -> Option<CachedFile> {
         let mut file = File::open(checkpoint::blob_path(self.store.as_ref()?, digest)).ok()?;
-        if file.metadata().is_ok_and(|data| !data.is_file()) || digest_of(&mut file).ok() != Some(digest) {
+        if file.metadata().is_ok_and(|data| !data.is_file()) || !Digest::of_all(&mut file).is_ok_and(|(found, _)| found == digest) {
             return None;
         }
         CachedFile::new(digest, file).ok()
@@ -404,17 +404,6 @@ impl Place {
 fn unique() -> String {
     static NEXT: AtomicU64 = AtomicU64::new(0);
     format!("{}.{}.part", std::process::id(), NEXT.fetch_add(1, Ordering::Relaxed))
-}
-
-fn digest_of(file: &mut File) -> io::Result<Digest> {
-    let mut hasher = Hasher::default();
-    let mut buffer = vec![0; 1 << 20];
-    loop {
-        match file.read(&mut buffer)? {
-            0 => return Ok(hasher.finish()),
-            read => hasher.update(&buffer[..read]),
-        }
-    }
 }
 
 fn remove(path: &Path) {

@@ -13,6 +13,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use bytes::Bytes;
+use protocol::digest::Hasher;
 use protocol::{Digest, FileEntry};
 
 /// Error of reading or writing a blob.
@@ -206,6 +207,19 @@ pub fn read_parts<E: From<BlobError>>(blob: &dyn Blob, mut take: impl FnMut(&[u8
         offset += length;
     }
     Ok(())
+}
+
+/// Digest of a blob, which is read in parts.
+///
+/// # Errors
+/// The first error of a read.
+pub fn digest_of(blob: &dyn Blob) -> Result<Digest, BlobError> {
+    let mut hasher = Hasher::default();
+    read_parts(blob, |part| {
+        hasher.update(part);
+        Ok::<_, BlobError>(())
+    })?;
+    Ok(hasher.finish())
 }
 
 /// Error of a read past the end of a blob.

@@ -4,9 +4,8 @@ use std::fmt;
 use std::path::Path;
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError, RwLock};
 
-use checkpoint::{Blob, BlobError, Blobs, read_parts};
+use checkpoint::{Blob, BlobError, Blobs, digest_of, read_parts};
 use protocol::Digest;
-use protocol::digest::Hasher;
 
 use super::backend::{Backend, Entry, Problem, Stat};
 use super::begun::{Upload, Uploads};
@@ -198,12 +197,7 @@ impl BlobStore {
 
     /// Stores a copy of `source`, which is read in parts, and returns its digest when it is durable.
     pub fn put_copy(&self, source: &dyn Blob) -> Result<Digest, BlobError> {
-        let mut hasher = Hasher::default();
-        read_parts(source, |part| {
-            hasher.update(part);
-            Ok::<_, BlobError>(())
-        })?;
-        let digest = hasher.finish();
+        let digest = digest_of(source)?;
         if !self.reuse(digest)? {
             let mut upload = self.begin(source.bytes())?;
             read_parts(source, |part| upload.write(part))?;

@@ -6,9 +6,9 @@ use std::io::{self, Write};
 use std::path::{Component, Path};
 
 use checkpoint::published::{ExportError, Layout, Planned, Written};
+use protocol::digest::Hasher;
 use protocol::message::ApiError;
 use protocol::{Digest, FileEntry, Manifest};
-use sha2::{Digest as _, Sha256};
 
 use super::answer::error;
 use crate::Version;
@@ -130,7 +130,7 @@ pub(super) async fn whole(
     digest: Digest,
     write: &mut impl FnMut(&[u8]) -> io::Result<()>,
 ) -> Result<(), ApiError> {
-    let mut hash = Sha256::new();
+    let mut hash = Hasher::default();
     let mut into = |part: &[u8]| {
         hash.update(part);
         write(part)
@@ -148,7 +148,7 @@ pub(super) async fn whole_file(
     if file.chunks.is_empty() {
         return whole(source, file.digest, write).await;
     }
-    let mut hash = Sha256::new();
+    let mut hash = Hasher::default();
     let mut into = |part: &[u8]| {
         hash.update(part);
         write(part)
@@ -159,8 +159,8 @@ pub(super) async fn whole_file(
     expect("file", file.digest, hash)
 }
 
-fn expect(what: &str, digest: Digest, hash: Sha256) -> Result<(), ApiError> {
-    let found = Digest::from_bytes(hash.finalize().into());
+fn expect(what: &str, digest: Digest, hash: Hasher) -> Result<(), ApiError> {
+    let found = hash.finish();
     if found == digest {
         return Ok(());
     }

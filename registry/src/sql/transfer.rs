@@ -6,7 +6,7 @@
 use std::path::Path;
 
 use futures::TryStreamExt as _;
-use sha2::{Digest as _, Sha256};
+use protocol::digest::Hasher;
 use sqlx::Connection as _;
 
 use super::pool::Pool;
@@ -66,7 +66,7 @@ pub(crate) struct Sum {
 
 impl Sum {
     fn add(&mut self, values: &[Value<'static>]) {
-        let mut hasher = Sha256::new();
+        let mut hasher = Hasher::default();
         for value in values {
             let (kind, bytes) = match value {
                 Value::Integer(Some(value)) => (b'i', value.to_le_bytes().to_vec()),
@@ -74,12 +74,12 @@ impl Sum {
                 Value::Text(Some(value)) => (b't', value.as_bytes().to_vec()),
                 Value::Integer(None) | Value::Float(None) | Value::Text(None) => (b'n', Vec::new()),
             };
-            hasher.update([kind]);
-            hasher.update((bytes.len() as u64).to_le_bytes());
+            hasher.update(&[kind]);
+            hasher.update(&(bytes.len() as u64).to_le_bytes());
             hasher.update(&bytes);
         }
         let mut first = [0; 16];
-        first.copy_from_slice(&hasher.finalize()[..16]);
+        first.copy_from_slice(&hasher.finish().as_bytes()[..16]);
         self.rows += 1;
         // A sum does not depend on the order of the rows.
         self.digest = self.digest.wrapping_add(u128::from_le_bytes(first));

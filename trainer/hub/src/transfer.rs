@@ -9,10 +9,10 @@ use std::io::{Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use protocol::Digest;
 use reqwest::blocking::{Client, ClientBuilder, Response};
 use reqwest::header::{CONTENT_RANGE, ETAG, HeaderMap, IF_RANGE, RANGE, RETRY_AFTER};
 use reqwest::{StatusCode, Url};
-use sha2::{Digest as _, Sha256};
 
 /// Time limit for connecting.
 const CONNECT: Duration = Duration::from_secs(10);
@@ -105,9 +105,7 @@ pub(crate) fn discard(part: &Path) {
 
 /// The SHA-256 of a file in hexadecimal.
 pub(crate) fn file_sha256(file: &Path) -> std::io::Result<String> {
-    let mut hasher = Sha256::new();
-    std::io::copy(&mut File::open(file)?, &mut hasher)?;
-    Ok(protocol::Digest::from_bytes(hasher.finalize().into()).hex())
+    Ok(Digest::of_all(&mut File::open(file)?)?.0.hex())
 }
 
 fn length(part: &Path) -> u64 {

@@ -15,8 +15,8 @@ use std::os::unix::fs::{FileTypeExt as _, MetadataExt as _, OpenOptionsExt as _}
 use std::path::{self, Path, PathBuf};
 use std::sync::Arc;
 
+use protocol::digest::Hasher;
 use protocol::{Digest, excerpt, limits};
-use sha2::{Digest as _, Sha256};
 
 use crate::roots::Root;
 
@@ -114,20 +114,18 @@ impl DataPath {
     /// The digest of a regular file's content, and the stamp that it had when it was opened.
     ///
     /// # Errors
-    /// If the path is something else; the message says what, without the path.
-    ///
-    /// # Errors
-    /// The obstacle; [`io::ErrorKind::Interrupted`] once `go_on` returns false.
+    /// If the path is something else; the message says what, without the path. [`io::ErrorKind::Interrupted`] once
+    /// `go_on` returns false.
     pub(crate) fn digest(&self, go_on: &dyn Fn() -> bool) -> io::Result<(Digest, Stamp)> {
         let (mut file, found) = self.open_with_metadata()?;
-        let mut hasher = Sha256::new();
+        let mut hasher = Hasher::default();
         let mut part = vec![0; 256 << 10];
         loop {
             if !go_on() {
                 return Err(io::ErrorKind::Interrupted.into());
             }
             match file.read(&mut part)? {
-                0 => return Ok((Digest::from_bytes(hasher.finalize().into()), Stamp::of(&found))),
+                0 => return Ok((hasher.finish(), Stamp::of(&found))),
                 count => hasher.update(&part[..count]),
             }
         }

@@ -2,6 +2,7 @@
 
 use std::borrow::Cow;
 use std::fmt;
+use std::io::{self, Read};
 use std::str::FromStr;
 
 use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
@@ -33,6 +34,16 @@ impl Digest {
         hex::encode(self.0)
     }
 
+    /// Digest and number of the bytes of `source` up to its end.
+    ///
+    /// # Errors
+    /// Those of `source`.
+    pub fn of_all(source: &mut impl Read) -> io::Result<(Self, u64)> {
+        let mut hasher = Hasher::default();
+        let bytes = io::copy(source, &mut hasher)?;
+        Ok((hasher.finish(), bytes))
+    }
+
     /// The first 12 hexadecimal digits, for display.
     pub fn short(&self) -> String {
         self.hex()[..12].to_owned()
@@ -52,6 +63,17 @@ impl Hasher {
     /// Digest of all bytes so far.
     pub fn finish(self) -> Digest {
         Digest(self.0.finalize().into())
+    }
+}
+
+impl io::Write for Hasher {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        self.update(bytes);
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
     }
 }
 

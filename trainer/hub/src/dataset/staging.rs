@@ -6,7 +6,8 @@ use std::fs::{self, File, TryLockError};
 use std::io::{self, Read, Write};
 use std::path::{Path, PathBuf};
 
-use sha2::{Digest as _, Sha256};
+use protocol::digest::Hasher;
+
 
 use crate::dataset::error::{FetchError, io_error};
 use crate::dataset::list::Listed;
@@ -107,7 +108,7 @@ impl Staging {
     pub(crate) fn keep(&self, name: &str, listed: &Listed, mut bytes: impl Read) -> Result<(), Wrong> {
         let folder = self.files();
         let mut file = tempfile::NamedTempFile::new_in(&folder).map_err(Wrong::Io)?;
-        let mut hasher = Sha256::new();
+        let mut hasher = Hasher::default();
         let mut piece = vec![0; 256 << 10];
         let mut written = 0_u64;
         loop {
@@ -126,7 +127,7 @@ impl Staging {
         if written != listed.bytes {
             return Err(Wrong::Content(format!("`{name}` has {written} bytes; expected {}", listed.bytes)));
         }
-        if protocol::Digest::from_bytes(hasher.finalize().into()).hex() != listed.sha256 {
+        if hasher.finish().hex() != listed.sha256 {
             return Err(Wrong::Content(format!("`{name}` has another SHA-256 than the published file")));
         }
         let file = file.persist(folder.join(name)).map_err(|error| Wrong::Io(error.error))?;
