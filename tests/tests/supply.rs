@@ -50,7 +50,8 @@ fn every_crate_is_allowed() {
 #[test]
 fn a_build_of_the_trainer_needs_few_packages() {
     let packages = supply::built("trainer");
-    let has = |package: &str| packages.iter().any(|name| name.strip_prefix(package).is_some_and(|v| v.starts_with(" v")));
+    let has =
+        |package: &str| packages.iter().any(|name| name.strip_prefix(package).is_some_and(|v| v.starts_with(" v")));
     assert!(has("burn-flex") && !has("s3s"), "not a list of what is built: {packages:?}");
     let many = packages.len();
     assert!(

@@ -82,7 +82,9 @@ impl Cache {
         }
         let path = self.path(digest)?;
         let mut file = File::open(&path).ok()?;
-        if file.metadata().is_ok_and(|data| !data.is_file()) || !Digest::of_all(&mut file).is_ok_and(|(found, _)| found == digest) {
+        if file.metadata().is_ok_and(|data| !data.is_file())
+            || !Digest::of_all(&mut file).is_ok_and(|(found, _)| found == digest)
+        {
             tracing::warn!("a cached blob does not hash to its name and is fetched again: {}", path.display());
             remove(&path);
             return None;
@@ -96,7 +98,9 @@ impl Cache {
     /// Opens a blob of the store on this machine. `None` if it is missing or damaged; the coordinator reports that.
     fn in_store(&self, digest: Digest) -> Option<CachedFile> {
         let mut file = File::open(checkpoint::blob_path(self.store.as_ref()?, digest)).ok()?;
-        if file.metadata().is_ok_and(|data| !data.is_file()) || !Digest::of_all(&mut file).is_ok_and(|(found, _)| found == digest) {
+        if file.metadata().is_ok_and(|data| !data.is_file())
+            || !Digest::of_all(&mut file).is_ok_and(|(found, _)| found == digest)
+        {
             return None;
         }
         CachedFile::new(digest, file).ok()

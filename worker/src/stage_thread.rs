@@ -248,6 +248,9 @@ pub(crate) fn log_panics() {
     panic::set_hook(Box::new(|info| {
         let place = info.location().map_or_else(|| "an unknown place".to_owned(), ToString::to_string);
         tracing::error!("panic at {place}: {}", text(info.payload()));
+        // Unit tests have no log; the harness shows this beside the failed test.
+        #[cfg(test)]
+        eprintln!("panic at {place}: {}", text(info.payload()));
         let trace = Backtrace::capture();
         if trace.status() == BacktraceStatus::Captured {
             tracing::error!("{trace}");

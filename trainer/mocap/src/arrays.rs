@@ -182,9 +182,7 @@ mod tests {
         assert!(said(&[("x", kit.clone())]).contains("has x; expected joints"));
         assert!(said(&[("joints", kit.clone()), ("fps", number("<f8", &0_f64.to_le_bytes()))]).contains("frame rate"));
         assert!(said(&[("joints", npy::to_bytes(&[4, 5, 3], &data[..60]))]).contains("[4, 5, 3]"));
-        assert!(
-            said(&[("joints", npy::to_bytes(&[1, 22, 3], &[f32::NAN; 66]))]).contains("joint 0 of frame 0")
-        );
+        assert!(said(&[("joints", npy::to_bytes(&[1, 22, 3], &[f32::NAN; 66]))]).contains("joint 0 of frame 0"));
         let good = archive(&[("joints", kit)]);
         assert!(read_bytes(&good[..good.len() / 2]).unwrap_err().contains("not a .npz archive"));
     }

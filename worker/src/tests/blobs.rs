@@ -44,9 +44,13 @@ fn cut_transfers_go_on_where_they_were_cut() {
     const BYTES: usize = 30 << 20;
     let whole: Vec<u8> = (0..BYTES).map(|i| (i % 251) as u8).collect();
     let sent = whole.clone();
+    // The fake counts bytes of both directions.
+    let uploaded = Arc::new(Barrier::new(2));
+    let counted = Arc::clone(&uploaded);
     let worker = Worker::start(Box::new(move |context| {
         let blobs = context.blobs();
         let digest = blobs.put_pieces(&[&sent[..1000], &sent[1000..]]).expect("stored");
+        uploaded.wait();
         let read = blobs.open(digest).expect("fetched");
         assert_eq!(read.bytes(), BYTES as u64);
         let mut end = vec![0; 1000];
@@ -57,9 +61,10 @@ fn cut_transfers_go_on_where_they_were_cut() {
     worker.fake.cut.store(2, Ordering::SeqCst);
     worker.grant(1);
     worker.wait("an upload", |coordinator| coordinator.blobs.contains_key(&Digest::of(&whole)));
-    let uploaded = worker.fake.received.load(Ordering::SeqCst);
+    let bytes = worker.fake.received.load(Ordering::SeqCst);
+    counted.wait();
     // Half of two parts of 8 MiB arrived; sending all again would be twice as much.
-    assert!(uploaded < (BYTES + (10 << 20)) as u64, "{uploaded} bytes were sent");
+    assert!(bytes < (BYTES + (10 << 20)) as u64, "{bytes} bytes were sent");
     worker.wait("an outcome", |coordinator| !coordinator.outcomes.is_empty());
     let outcomes = worker.leave().outcomes.clone();
     assert!(matches!(outcomes[0].outcome, TaskOutcome::Finished { .. }), "{outcomes:?}");

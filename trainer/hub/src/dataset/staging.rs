@@ -8,7 +8,6 @@ use std::path::{Path, PathBuf};
 
 use protocol::digest::Hasher;
 
-
 use crate::dataset::error::{FetchError, io_error};
 use crate::dataset::list::Listed;
 use crate::transfer::file_sha256;
