@@ -1,6 +1,7 @@
 //! Reads and writes `.npy` files of f32, with errors that name the file and the expected content.
 //!
-//! A truncated or foreign file is reported, and nothing is allocated before the size of the file bears its header out.
+//! A truncated or foreign file is an error. The parser allocates nothing before it has compared the size that the header
+//! declares with that of the file. `docs/decisions/0033-packages.md` says why it is not a library's.
 
 use std::fs;
 use std::io::Write as _;
@@ -140,14 +141,15 @@ impl<'a> Header<'a> {
         }
         let (header, data) = rest.split_at_checked(length as usize).ok_or("its header is truncated")?;
         let fields = std::str::from_utf8(header).map_err(|_| "its header is not text")?;
-        let descr = field(fields, "'descr'")?;
-        let descr = descr.strip_prefix('\'').and_then(|text| text.split('\'').next()).unwrap_or(descr);
-        let is_column_major = match field(fields, "'fortran_order'")? {
+        let descr = field(fields, "descr")?;
+        let text = QUOTES.iter().find_map(|quote| descr.strip_prefix(*quote)?.split(*quote).next());
+        let descr = text.unwrap_or(descr);
+        let is_column_major = match field(fields, "fortran_order")? {
             order if order.starts_with("False") => false,
             order if order.starts_with("True") => true,
             _ => return Err("its `fortran_order` is neither True nor False".into()),
         };
-        let axes = field(fields, "'shape'")?.strip_prefix('(').and_then(|axes| axes.split_once(')'));
+        let axes = field(fields, "shape")?.strip_prefix('(').and_then(|axes| axes.split_once(')'));
         let axes = axes.ok_or("its shape is not a tuple")?.0.split(',').map(str::trim).filter(|axis| !axis.is_empty());
         let axes = axes.map(|axis| axis.parse().map_err(|_| "its shape has an axis that is not a number"));
         let shape = axes.collect::<Result<Vec<u64>, _>>()?;
@@ -157,10 +159,14 @@ impl<'a> Header<'a> {
     }
 }
 
+/// Quotes around a text in Python.
+const QUOTES: [char; 2] = ['\'', '"'];
+
 /// The text of a mapping from a key's value on.
 fn field<'a>(fields: &'a str, key: &str) -> Result<&'a str, String> {
-    let value = fields.split_once(key).and_then(|(_, rest)| rest.trim_start().strip_prefix(':'));
-    value.map(str::trim_start).ok_or_else(|| format!("its header has no {key}"))
+    let after = |quote: &char| Some(fields.split_once(&format!("{quote}{key}{quote}"))?.1);
+    let value = QUOTES.iter().find_map(after).and_then(|rest| rest.trim_start().strip_prefix(':'));
+    value.map(str::trim_start).ok_or_else(|| format!("its header has no `{key}`"))
 }
 
 /// Serialises an f32 array as a `.npy` file of version 1. As NumPy writes it, the data begin at a multiple of 64 bytes.
@@ -269,10 +275,12 @@ mod tests {
         refuse(&shaped("(4611686018427387904, 4)", b""), "more than 2^64 elements");
         refuse(&shaped("(0xffffffffffffffff, 2)", b""), "an axis that is not a number");
         refuse(&shaped(&format!("({most},)"), b""), "truncated");
-        refuse(&with_header(1, 2, b"{}", b""), "no 'descr'");
+        refuse(&with_header(1, 2, b"{}", b""), "no `descr`");
         refuse(&shaped("[2]", b""), "not a tuple");
         let order = b"{'descr': '<f4', 'fortran_order': 0, 'shape': ()}";
         refuse(&with_header(1, order.len() as u32, order, b""), "neither True nor False");
+        let double = br#"{"descr": "<f4", "fortran_order": False, "shape": (1,)}"#;
+        assert_eq!(parse(file, &with_header(1, double.len() as u32, double, &[0; 4]), false).unwrap().data, [0.0]);
         // An axis of zero has no elements, for any other axes.
         assert_eq!(parse(file, &shaped("(0, 9000000000)", b""), false).unwrap().data, [0.0; 0]);
         let nested = "(".repeat(900);
