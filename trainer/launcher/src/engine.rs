@@ -12,14 +12,22 @@ pub enum JobState {
     Running,
     /// It was asked to end.
     Ending,
+    /// The engine has ended it: cancelled, preempted, or its machine was lost. That says nothing against its template.
+    Revoked,
 }
 
 impl JobState {
+    /// Returns true if nothing of the job is left to end.
+    pub fn has_ended(self) -> bool {
+        self == Self::Revoked
+    }
+
     pub fn name(self) -> &'static str {
         match self {
             Self::Pending => "pending",
             Self::Running => "running",
             Self::Ending => "ending",
+            Self::Revoked => "revoked",
         }
     }
 }
@@ -62,7 +70,7 @@ impl EngineError {
 /// An engine that runs jobs. Every call returns within a bounded time.
 #[async_trait]
 pub trait Launcher: Send + Sync {
-    /// The jobs of this launcher that have not ended.
+    /// The jobs of this launcher that have not ended, and those that the engine still lists as revoked.
     async fn list(&self) -> Result<Vec<Job>, EngineError>;
 
     /// Submits a job that runs a worker with this name. After an error, the job may exist all the same.

@@ -1,9 +1,9 @@
 //! Decisions of a launcher: from demand and jobs to jobs to submit and to retire. No clock, no engine, no network.
 //!
 //! A worker counts as alive if it polls or if the engine lists its job; it is on its way until it first polls. A job
-//! that is neither listed nor polls has ended. If its worker never settled, that was a crash. A worker settles when it gets
-//! work or stays for a while; it proves the template good. After a crash, one job at a time is tried, with a growing pause;
-//! the limit of crashes ends the launcher.
+//! that is neither listed nor polls has ended. If its worker never settled, that was a crash, unless the engine says that it
+//! revoked the job. A worker settles when it gets work or stays for a while; it proves the template good. After a crash, one
+//! job at a time is tried, with a growing pause; the limit of crashes ends the launcher.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -85,6 +85,8 @@ struct Known {
     /// Since when it has nothing to do.
     surplus: Option<Duration>,
     retired: bool,
+    /// The engine ended its job, so its end is no crash.
+    revoked: bool,
 }
 
 impl Known {
@@ -98,6 +100,7 @@ impl Known {
             running: None,
             surplus: None,
             retired: false,
+            revoked: false,
         }
     }
 }
@@ -174,12 +177,18 @@ impl Fleet {
     fn learn(&mut self, seen: Observation<'_>) {
         let now = seen.now;
         for job in seen.jobs.iter().filter(|job| self.plan.is_ours(&job.worker)) {
+            if job.state.has_ended() {
+                // Its worker may live on if a node was lost.
+                if let Some(known) = self.known.get_mut(&job.worker) {
+                    (known.seen, known.revoked) = (true, true);
+                }
+                continue;
+            }
             let known = self.known.entry(job.worker.clone()).or_insert_with(|| Known::new(now));
             known.seen = true;
-            match job.state {
-                JobState::Pending => {}
-                JobState::Running => drop(known.running.get_or_insert(now)),
-                JobState::Ending => known.retired = true,
+            known.retired |= job.state == JobState::Ending;
+            if job.state == JobState::Running {
+                known.running.get_or_insert(now);
             }
         }
         for worker in seen.demand.workers.iter().filter(|worker| self.plan.is_ours(worker.worker.as_str())) {
@@ -192,14 +201,14 @@ impl Fleet {
             }
         }
         let is_alive = |name: &str| {
-            seen.jobs.iter().any(|job| job.worker == name)
+            seen.jobs.iter().any(|job| job.worker == name && !job.state.has_ended())
                 || seen.demand.workers.iter().any(|worker| worker.worker.as_str() == name)
         };
         let before = self.crashed.len();
         self.known.retain(|name, job| {
             let waits = !job.seen && now < job.since + UNLISTED;
             let has_ended = !waits && !is_alive(name);
-            if has_ended && !job.retired && !job.doubtful && !job.settled {
+            if has_ended && !job.retired && !job.revoked && !job.doubtful && !job.settled {
                 self.crashed.push(name.clone());
             }
             !has_ended
@@ -266,8 +275,9 @@ impl Fleet {
                 staying -= 1;
             }
         }
-        let is_retired = |job: &&Job| self.known.get(&job.worker).is_some_and(|known| known.retired);
-        seen.jobs.iter().filter(is_retired).map(|job| Action::Retire { job: job.clone() }).collect()
+        let is_due =
+            |job: &&Job| !job.state.has_ended() && self.known.get(&job.worker).is_some_and(|known| known.retired);
+        seen.jobs.iter().filter(is_due).map(|job| Action::Retire { job: job.clone() }).collect()
     }
 
     fn submit(&mut self, seen: Observation<'_>, need: usize) -> Vec<Action> {

@@ -218,7 +218,7 @@ pub async fn stop(plan: &Plan, engine: &dyn Launcher) -> Result<Vec<Job>, Engine
 pub async fn jobs(plan: &Plan, engine: &dyn Launcher) -> Result<Vec<Job>, EngineError> {
     let mut jobs = bounded("list", engine.list()).await?;
     let prefix = format!("{}-", plan.prefix);
-    jobs.retain(|job| job.worker.starts_with(&prefix));
+    jobs.retain(|job| job.worker.starts_with(&prefix) && !job.state.has_ended());
     Ok(jobs)
 }
 

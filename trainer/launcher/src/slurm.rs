@@ -36,8 +36,9 @@ impl Slurm {
     }
 }
 
+/// Lists ended jobs too, which Slurm forgets after some minutes.
 fn queue() -> EngineCommand {
-    EngineCommand::new("squeue", ["-h", "-u", &nix::unistd::getuid().to_string(), "-o", "%i|%T|%j"])
+    EngineCommand::new("squeue", ["-h", "-t", "all", "-u", &nix::unistd::getuid().to_string(), "-o", "%i|%T|%j"])
 }
 
 /// Reads the answer of [`queue`].
@@ -48,6 +49,8 @@ fn jobs(text: &str) -> Vec<Job> {
         let state = match state {
             "PENDING" | "CONFIGURING" => JobState::Pending,
             "COMPLETING" => JobState::Ending,
+            "CANCELLED" | "NODE_FAIL" | "PREEMPTED" => JobState::Revoked,
+            "BOOT_FAIL" | "COMPLETED" | "DEADLINE" | "FAILED" | "OUT_OF_MEMORY" | "TIMEOUT" => return None,
             _ => JobState::Running,
         };
         Some(Job { worker: worker.to_owned(), id: id.to_owned(), state })
@@ -60,7 +63,7 @@ fn ending(job: &Job) -> Option<EngineCommand> {
         // This has no effect if the job has started meanwhile. It then gets the signal at the next call.
         JobState::Pending => Some(EngineCommand::new("scancel", ["--state=PENDING", &job.id])),
         JobState::Running => Some(EngineCommand::new("scancel", ["--batch", "--signal=TERM", &job.id])),
-        JobState::Ending => None,
+        JobState::Ending | JobState::Revoked => None,
     }
 }
 
@@ -113,9 +116,19 @@ mod tests {
             "#!/bin/sh\nunset STRIDE_TOKEN STRIDE_TOKEN_FILE\nexec /opt/stride/trainer worker join \
              https://coordinator:7700 --name stride-a-1 --backend cuda --label gpu=h100 --data-root '/data sets'\n"
         );
-        let found = jobs("7|RUNNING|stride-a-1\n8|PENDING|stride-a-2\n9|COMPLETING|x\n\nslurm_load_jobs error\n");
+        let found = jobs(
+            "7|RUNNING|stride-a-1\n8|PENDING|stride-a-2\n9|COMPLETING|x\n5|PREEMPTED|y\n6|FAILED|z\n\nslurm_load_jobs error\n",
+        );
         let shown: Vec<_> = found.iter().map(|job| (job.id.as_str(), job.worker.as_str(), job.state.name())).collect();
-        assert_eq!(shown, [("7", "stride-a-1", "running"), ("8", "stride-a-2", "pending"), ("9", "x", "ending")]);
+        assert_eq!(
+            shown,
+            [
+                ("7", "stride-a-1", "running"),
+                ("8", "stride-a-2", "pending"),
+                ("9", "x", "ending"),
+                ("5", "y", "revoked")
+            ]
+        );
         let ends: Vec<_> = found.iter().filter_map(ending).map(|command| command.arguments.join(" ")).collect();
         assert_eq!(ends, ["--batch --signal=TERM 7", "--state=PENDING 8"]);
     }

@@ -257,6 +257,25 @@ fn a_worker_that_polls_is_alive_whatever_the_engine_reports() {
     }
 }
 
+/// Preempted in its first seconds, before it has worked.
+#[test]
+fn a_job_that_the_engine_revokes_is_replaced_at_once_and_is_no_crash() {
+    let (world, mut fleet) = (World { slots: 1, ..World::new() }, Fleet::new(plan(0, 8)));
+    let demand = world.demand();
+    let mut jobs: Vec<Job> = Vec::new();
+    for pass in 0..20 {
+        let actions =
+            fleet.decide(Observation { now: Duration::from_secs(pass), stamp: pass, demand: &demand, jobs: &jobs });
+        let [Action::Submit { worker }] = &actions[..] else { panic!("{pass}: {actions:?}") };
+        jobs.push(Job { worker: worker.clone(), id: worker.clone(), state: JobState::Running });
+        let now = Duration::from_millis(1_000 * pass + 500);
+        let actions = fleet.decide(Observation { now, stamp: pass, demand: &demand, jobs: &jobs });
+        assert!(actions.is_empty(), "{pass}: {actions:?}");
+        jobs.last_mut().unwrap().state = JobState::Revoked;
+    }
+    assert_eq!(fleet.take_crashed(), Vec::<String>::new());
+}
+
 #[test]
 fn a_submission_whose_call_hung_is_counted_until_the_engine_has_had_time_to_list_it() {
     let (world, mut fleet) = (World { slots: 1, ..World::new() }, Fleet::new(plan(0, 8)));

@@ -124,7 +124,7 @@ async fn wait_for_no_jobs(engine: &impl Launcher) {
     let begun = Instant::now();
     loop {
         let jobs = engine.list().await;
-        if jobs.as_ref().is_ok_and(Vec::is_empty) {
+        if jobs.as_ref().is_ok_and(|jobs| jobs.iter().all(|job| job.state.has_ended())) {
             return;
         }
         assert!(begun.elapsed() < PATIENCE, "{jobs:?}");
