@@ -13,30 +13,26 @@ use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use serde_json::Value;
 
-use crate::cluster::{Curves, config, equals};
+use crate::cluster::{Curves, VAE, config, equals};
 
 const TRAINER: &str = env!("CARGO_BIN_EXE_trainer");
-/// A stage that lasts as long as Slurm needs for all faults, and the one before it.
-const LONG: [&str; 8] = [
-    "--set",
-    "stages.vae.steps=1300",
-    "--set",
-    "stages.vae.windows.until=1",
-    "--set",
-    "stages.vae.checkpoint.every=200",
-    "--until",
-    "vae",
-];
 /// Time in which Slurm notices that a node is lost, and more.
 const NODE_LOSS: Duration = Duration::from_secs(120);
 /// Time of the whole training on a busy machine.
 const TRAINING: Duration = Duration::from_secs(400);
 
+/// A stage that lasts as long as Slurm needs for all faults, and the one before it.
+fn long() -> [&'static str; 8] {
+    let mut sets = VAE;
+    (sets[1], sets[5]) = ("stages.vae.steps=1300", "stages.vae.checkpoint.every=200");
+    sets
+}
+
 /// The same run of one worker as fast as it can, with SQLite and a folder.
 fn undisturbed() -> (Value, Curves) {
     let mut cluster = Cluster::start(TRAINER);
     cluster.join_by("w1", &["env".to_owned(), "STRIDE_WORKER_PACE=0".to_owned()], &[]);
-    let run = cluster.submit(&config(), &LONG);
+    let run = cluster.submit(&config(), &long());
     let view = cluster.wait_end_within(TRAINING, &run);
     let curves = cluster.metrics(&run, "vae");
     (view, curves)
@@ -127,7 +123,7 @@ fn p4_whatever_slurm_does_a_training_ends_on_the_digests_of_a_folder() {
     let name = format!("t{}", std::process::id());
     let options = ["--workers", "0..2", "--idle", "60s", "--program", TRAINER, "--", "--exclusive", "--mem=100"];
     cluster.launch(&name, &wrap, "slurm", &options);
-    let run = cluster.submit(&config(), &LONG);
+    let run = cluster.submit(&config(), &long());
     let mut site = Site { slurm, cluster, run, begun: Instant::now() };
     site.cluster.wait_step(&site.run, "vae", 20);
 
