@@ -155,6 +155,7 @@ mutation joins-without-reaching worker/src/prepare.rs 's/for Member \{ worker, p
 mutation only-whole-frames-count worker/src/gang/link.rs 's/if count > 0 \{/if count > 1 << 20 {/' worker:lib:relay
 mutation signs-behind-frames worker/src/gang/link.rs 's/writer\.sign\(sign, patience, abort\)\?;/let _ = sign;/' worker:lib:relay
 mutation slow-is-not-named worker/src/gang/pace.rs 's/const FAR_OVER: u32 = 3;/const FAR_OVER: u32 = 3_000_000;/' worker:lib:gang
+mutation silence-is-named-slow worker/src/gang/mesh.rs 's/ else if silent \{\n\s+self\.pace\.excuse_silence\(\);/ else if silent {/' worker:lib:gang::tests::relay
 mutation finished-as-last-reported trainer/coordinator/src/view.rs 's/    progress\.done = progress\.total;\n//' coordinator:decisions:views
 mutation new-run-with-each-start trainer/coordinator/src/decide/runs.rs 's/&& old\.until == run\.until/\&\& false/' coordinator:decisions:views
 mutation paused-if-interrupted trainer/coordinator/src/state/run.rs 's/self\.parked && self\.state == RunState::Paused/false/' coordinator:decisions:views

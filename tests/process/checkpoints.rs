@@ -42,11 +42,10 @@ fn peak(pid: u32) -> Option<u64> {
     Some(line.trim().strip_suffix(" kB")?.parse::<u64>().expect("a number") << 10)
 }
 
-/// Size of the largest blob, which is a state.
-fn largest_blob(cluster: &Cluster) -> u64 {
-    let shelves = fs::read_dir(cluster.bench().store().join("blobs/sha256")).expect("blobs").flatten();
-    let blobs = shelves.flat_map(|shelf| fs::read_dir(shelf.path()).expect("a shelf").flatten());
-    blobs.map(|blob| blob.metadata().expect("a blob").len()).max().expect("there are some")
+/// Size of a stage's state in bytes, from the logs of its workers. A large one is stored in several blobs.
+fn state_size(said: &str) -> u64 {
+    let after = said.split("with a state of ").nth(1).unwrap_or_else(|| panic!("no stage began:\n{said}"));
+    after.chars().take_while(|c| *c != ' ').filter(char::is_ascii_digit).collect::<String>().parse().expect("a number")
 }
 
 /// Log of a worker's first meeting with its gang: true if it adopted a peer's state, and its peak memory in bytes by
@@ -89,7 +88,7 @@ fn a_checkpoint_of(network: &str) {
         cluster.join(name);
     }
     cluster.wait_end(&run);
-    let state = largest_blob(&cluster);
+    let state = state_size(&(cluster.said("c") + &cluster.said("d")));
     let taken = ["c", "d"].map(|name| {
         let (adopts, then) = met(&cluster, name).unwrap_or_else(|| panic!("{name}:\n{}", cluster.said(name)));
         (name, adopts, then, peak(cluster.pid(name)).expect("it runs"))

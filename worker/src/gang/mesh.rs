@@ -106,10 +106,21 @@ impl Mesh {
         Sign { head, every: self.timing.keep_alive * 3 / 4 }
     }
 
-    /// Names the peers that delay the current exchange for too long. None is named while a member saves.
+    /// Names the peers that delay the current exchange for too long. None is named while a member saves. A peer that is
+    /// silent for once is not slow; it is given up after [`Timing::patience`].
     pub(super) fn watch_pace(&self) {
-        if lock(&self.peers).iter().any(|peer| peer.phase != Phase::Working) {
-            return self.pace.excuse();
+        let now = Instant::now();
+        let is_silent = |peer: &Peer| {
+            peer.standing == Standing::Up && now.duration_since(peer.pulse.last()) > self.timing.keep_alive * 2
+        };
+        let (saves, silent) = {
+            let peers = lock(&self.peers);
+            (peers.iter().any(|peer| peer.phase != Phase::Working), peers.iter().any(is_silent))
+        };
+        if saves {
+            self.pace.excuse();
+        } else if silent {
+            self.pace.excuse_silence();
         }
         let waits_for = self.waits_for.load(Ordering::SeqCst).checked_sub(1);
         self.pace.overdue(self.others(), waits_for).into_iter().for_each(|peer| self.complain(peer));

@@ -18,6 +18,8 @@ const TOLERANCE: f64 = 1.25;
 const COST: Duration = Duration::from_millis(100);
 /// Factor over a member's own time beyond which a single running step is too slow.
 const FAR_OVER: u32 = 3;
+/// Windows between two exchanges that are excused because of a silence.
+const RARELY: u32 = 30;
 
 /// The pace of one generation, measured by one member.
 #[derive(Debug)]
@@ -40,6 +42,8 @@ struct State {
     lags: Vec<Duration>,
     /// Ranks that are named.
     slow: BTreeSet<usize>,
+    /// Time at which an exchange was last excused because of a silence.
+    silence: Option<Instant>,
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -73,6 +77,7 @@ impl Pace {
             alone: Duration::ZERO,
             lags: vec![Duration::ZERO; members],
             slow: BTreeSet::new(),
+            silence: None,
         };
         Self { window, state: Mutex::new(state) }
     }
@@ -92,6 +97,16 @@ impl Pace {
     /// Excuses the current exchange, because a member saves or has saved since the last step.
     pub(super) fn excuse(&self) {
         lock(&self.state).exchange = None;
+    }
+
+    /// Excuses the current exchange, because a peer is silent. A link that is often silent is slow, so this has an effect
+    /// once in [`RARELY`] windows.
+    pub(super) fn excuse_silence(&self) {
+        let mut state = lock(&self.state);
+        let is_rare = state.silence.is_none_or(|at| at.elapsed() > self.window * RARELY);
+        if is_rare && state.exchange.take().is_some() {
+            state.silence = Some(Instant::now());
+        }
     }
 
     /// Records that all of this member's parts for `peer` are sent.
@@ -196,5 +211,16 @@ mod tests {
         excused.begin(Duration::from_millis(1), 4, 8);
         excused.excuse();
         assert_eq!((excused.overdue([1].into_iter(), Some(1)), excused.end([1].into_iter())), (vec![], None));
+    }
+
+    #[test]
+    fn a_silence_is_excused_once_in_a_while() {
+        let pace = Pace::new(2, Duration::from_millis(10));
+        for named in [vec![], vec![1]] {
+            pace.begin(Duration::from_millis(1), 4, 8);
+            std::thread::sleep(Duration::from_millis(20));
+            pace.excuse_silence();
+            assert_eq!(pace.overdue([1].into_iter(), Some(1)), named);
+        }
     }
 }

@@ -257,6 +257,46 @@ fn p20_a_link_that_costs_more_than_the_peer_brings_is_named_slow() {
     }
 }
 
+/// A line that is cut for a while, or a peer that is stopped: once it is back, its gang continues with it.
+#[test]
+fn a_link_that_is_silent_for_a_while_is_not_named_slow() {
+    let timing = Timing { slow: Duration::from_secs(1), patience: Duration::from_secs(20), ..QUICK };
+    let (relay, meshes) = pair(timing);
+    let over = AtomicBool::new(false);
+    let steps = [AtomicU64::new(0), AtomicU64::new(0)];
+    thread::scope(|scope| {
+        for (mesh, steps) in meshes.iter().zip(&steps) {
+            let over = &over;
+            scope.spawn(move || {
+                let interrupt = || over.load(Ordering::SeqCst).then_some(Halt::Regroup);
+                for at in 5.. {
+                    if step(mesh, at, &[1.0; 1000], &interrupt).is_err() {
+                        return;
+                    }
+                    steps.store(at, Ordering::SeqCst);
+                }
+            });
+        }
+        let moment = || thread::sleep(timing.keep_alive);
+        moment();
+        // Bytes of this moment arrive late, and all others after them.
+        relay.slow_down(0, 3_000);
+        moment();
+        relay.slow_down(0, 0);
+        let before = steps[0].load(Ordering::SeqCst);
+        let begun = Instant::now();
+        while steps[0].load(Ordering::SeqCst) < before + 100 && begun.elapsed() < timing.patience {
+            thread::sleep(Duration::from_millis(5));
+        }
+        let silent = begun.elapsed();
+        let lost = [meshes[0].lost(), meshes[1].lost()];
+        over.store(true, Ordering::SeqCst);
+        assert!(silent > timing.slow * 2, "silent for {silent:.1?}");
+        assert_eq!(lost, [[], []]);
+    });
+    meshes.into_iter().for_each(|mesh| mesh.close(None));
+}
+
 /// Without a relay no peer is named, although the steps are short.
 #[test]
 fn a_good_link_is_not_named_slow() {
