@@ -12,7 +12,7 @@ pub enum JobState {
     Running,
     /// It was asked to end.
     Ending,
-    /// The engine has ended it: cancelled, preempted, or its machine was lost. That says nothing against its template.
+    /// The engine has ended it: cancelled, preempted, or its machine was lost. Its template is not to blame.
     Revoked,
 }
 
@@ -70,7 +70,7 @@ impl EngineError {
 /// An engine that runs jobs. Every call returns within a bounded time.
 #[async_trait]
 pub trait Launcher: Send + Sync {
-    /// The jobs of this launcher that have not ended, and those that the engine still lists as revoked.
+    /// This launcher's jobs, without those that have ended by themselves. An engine may list revoked ones for a while.
     async fn list(&self) -> Result<Vec<Job>, EngineError>;
 
     /// Submits a job that runs a worker with this name. After an error, the job may exist all the same.
