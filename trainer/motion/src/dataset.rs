@@ -27,6 +27,7 @@ use crate::Floats;
 use crate::random::Stream;
 use crate::skeleton::Skeleton;
 pub use crate::text::Caption;
+use crate::vocabulary;
 
 /// The list that contains an entry.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
@@ -127,6 +128,20 @@ impl Dataset {
     /// Indices of the entries of a split, in order.
     pub fn entries_of(&self, split: protocol::stage::Split) -> Vec<usize> {
         (0..self.entries.len()).filter(|i| self.entries[*i].split.is_in(split)).collect()
+    }
+
+    /// The number of times that an epoch draws each entry: see [`vocabulary::draws`]. 1 for all outside the training split.
+    pub fn draws(&self, exponent: f64) -> Vec<usize> {
+        let mut draws = vec![1; self.entries.len()];
+        if exponent > 0.0 {
+            let train = self.entries_of(protocol::stage::Split::Train);
+            let texts = |e: &usize| self.entries[*e].captions.iter().map(|c| self.captions[*c].text.as_str()).collect();
+            let captions: Vec<Vec<&str>> = train.iter().map(texts).collect();
+            for (e, times) in train.into_iter().zip(vocabulary::draws(&captions, exponent)) {
+                draws[e] = times;
+            }
+        }
+        draws
     }
 
     /// The deviations [D], those of root and contacts divided by `bias`, which increases their weight.

@@ -4,7 +4,7 @@ mod common;
 
 use std::collections::BTreeMap;
 
-use protocol::stage::Shape;
+use protocol::stage::{DataSynthetic, Shape, StageSettings, TrainVae};
 use protocol::{Digest, Steps};
 use stage_lab::{Bench, Script};
 use stages::context::Outcome;
@@ -66,6 +66,24 @@ fn a_stage_that_yields_and_goes_on_gives_the_same_bytes() {
         cut.members = 2;
         outputs.insert(name, expected);
     }
+}
+
+#[test]
+fn balance_changes_the_clips_that_a_vae_draws() {
+    let mut bench = bench(1);
+    let links: Vec<Link> = chain(1).into_iter().filter(|(name, ..)| ["dataset", "vae"].contains(name)).collect();
+    let [(data, ..), (name, StageSettings::TrainVae(vae), _)] = &links[..] else { panic!("{links:?}") };
+    // Of few clips, each has a word of its own.
+    let many = DataSynthetic { clips: 200, ..DataSynthetic::default() };
+    let clips = bench.run(data, &many.into(), &[]).expect("clips").output();
+    let mut trained = |balance| {
+        bench.forget(name);
+        let settings = TrainVae { balance, ..vae.clone() };
+        bench.run(name, &settings.into(), &[("dataset", clips)]).expect("a VAE").output()
+    };
+    let [evenly, balanced] = [trained(0.0), trained(2.0)];
+    assert_ne!(evenly, balanced);
+    assert_eq!(balanced, trained(2.0));
 }
 
 /// A trial trained in rungs is bit for bit the stage trained in one piece; sweeps depend on it.

@@ -100,6 +100,9 @@ pub struct TrainVae {
     pub loss: VaeLoss,
     /// Short crops for the first part of the training.
     pub windows: Windows,
+    /// Exponent by which clips with rare words are drawn more often, as `balance` of `encode.latents` says.
+    #[schemars(range(min = 0.0, max = 2.0))]
+    pub balance: f64,
     /// Changes the paths of clips, differently each time. With little data the VAE otherwise memorises paths and fails
     /// on new ones.
     pub augment: Augment,
@@ -123,6 +126,7 @@ impl Default for TrainVae {
             network: Network::default(),
             loss: VaeLoss::default(),
             windows: Windows::default(),
+            balance: 0.0,
             augment: Augment::default(),
             ema: 0.0,
             init: String::new(),

@@ -6,8 +6,7 @@
 use std::collections::BTreeMap;
 
 use motion::Stream;
-use motion::dataset::{Dataset, Split, crop};
-use motion::vocabulary;
+use motion::dataset::{Split, crop};
 use protocol::stage::{self, EncodeLatents};
 use protocol::{ArtifactKind, Digest};
 use serde::{Deserialize, Serialize};
@@ -49,21 +48,6 @@ fn encode_crops(vae: &Autoencoder, crops: &[(usize, usize)], rows: &dyn Fn(usize
     (mu, sigma)
 }
 
-/// The number of times that an epoch draws each entry; empty if the settings do not balance. Only training entries count.
-fn draws(settings: &EncodeLatents, dataset: &Dataset) -> Vec<usize> {
-    if settings.balance == 0.0 {
-        return Vec::new();
-    }
-    let train = dataset.entries_of(stage::Split::Train);
-    let texts = |e: &usize| dataset.entries[*e].captions.iter().map(|c| dataset.captions[*c].text.as_str()).collect();
-    let captions: Vec<Vec<&str>> = train.iter().map(texts).collect();
-    let mut all = vec![1; dataset.entries.len()];
-    for (e, draws) in train.into_iter().zip(vocabulary::draws(&captions, settings.balance)) {
-        all[e] = draws;
-    }
-    all
-}
-
 impl Map for EncodeLatents {
     fn repetitions(&self, entries: &dyn Fn(stage::Split) -> f64) -> f64 {
         entries(stage::Split::All) * self.crops as f64
@@ -86,6 +70,7 @@ impl Map for EncodeLatents {
         let seed = cx.task().seed;
         let mut mu = Vec::new();
         let mut sigma = Vec::new();
+        let draws = if self.balance > 0.0 { dataset.draws(self.balance) } else { Vec::new() };
         let mut meta = LatentsMeta {
             format,
             vae: vae_digest,
@@ -95,7 +80,7 @@ impl Map for EncodeLatents {
             captions: Vec::new(),
             lengths: Vec::new(),
             starts: Vec::new(),
-            draws: draws(self, &dataset).get(range.clone()).unwrap_or_default().to_vec(),
+            draws: draws.get(range.clone()).unwrap_or_default().to_vec(),
             augmented: (!self.augment.is_none()).then(|| Augmented {
                 augment: self.augment.clone(),
                 seed,

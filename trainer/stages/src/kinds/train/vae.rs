@@ -5,6 +5,8 @@
 //! length. Terms on joints and feet may start later. The unmasked loss of v1 counts padding up to the longest clip of a
 //! slice, not of the batch.
 
+use std::iter::repeat_n;
+
 use burn::tensor::{Device, Tensor, TensorData};
 use models::kernels::Dropout;
 use models::losses::{self, Body, VaeRecipe};
@@ -28,6 +30,7 @@ const POOL: usize = 4;
 struct VaeObjective {
     settings: TrainVae,
     dataset: Dataset,
+    /// Entries of an epoch, each as many times as it is drawn.
     train: Vec<usize>,
     network: Vae,
     windows: Order,
@@ -138,7 +141,9 @@ impl Objective for VaeObjective {
 impl Gang for TrainVae {
     fn run(&self, cx: &mut dyn GangContext) -> Result<Outcome, StageError> {
         let dataset = artifacts::input_dataset(cx)?;
-        let train_entries = dataset.entries_of(Split::Train);
+        let draws = dataset.draws(self.balance);
+        let train_entries: Vec<usize> =
+            dataset.entries_of(Split::Train).into_iter().flat_map(|e| repeat_n(e, draws[e])).collect();
         let stage = cx.task().name.clone();
         if train_entries.is_empty() {
             return Err(no_clips());
