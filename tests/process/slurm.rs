@@ -24,7 +24,7 @@ const TRAINING: Duration = Duration::from_secs(400);
 /// A stage that lasts as long as Slurm needs for all faults, and the one before it.
 fn long() -> [&'static str; 8] {
     let mut sets = VAE;
-    (sets[1], sets[5]) = ("stages.vae.steps=1300", "stages.vae.checkpoint.every=200");
+    (sets[1], sets[5]) = ("stages.vae.steps=1000", "stages.vae.checkpoint.every=200");
     sets
 }
 
@@ -117,8 +117,8 @@ fn p4_whatever_slurm_does_a_training_ends_on_the_digests_of_a_folder() {
     let catalog = postgres.address(&postgres.create());
     let mut cluster = Cluster::on_bucket_with(TRAINER, &bucket, "slurm", &["--catalog", &catalog]);
     cluster.stand_by(&["--store", "second"]);
-    // Its jobs inherit both. A step of 60 ms lets the stage outlast all faults on a fast machine, too.
-    let variables = [format!("SLURM_CONF={}", slurm.configuration().display()), "STRIDE_WORKER_PACE=60".to_owned()];
+    // Its jobs inherit both. A step of 80 ms lets the stage outlast all faults on a fast machine, too.
+    let variables = [format!("SLURM_CONF={}", slurm.configuration().display()), "STRIDE_WORKER_PACE=80".to_owned()];
     let wrap = [&["env".to_owned()], &variables[..]].concat();
     let name = format!("t{}", std::process::id());
     let options = ["--workers", "0..2", "--idle", "60s", "--program", TRAINER, "--", "--exclusive", "--mem=100"];
