@@ -11,7 +11,7 @@
 //! | C6 | An accepted artifact of a task, and a done stage of a run, never change. |
 //! | C7 | A merge is held only after all shards are done. |
 //! | C8 | Tasks that no running run waits for are asked to drain. |
-//! | C9 | A stage is active or done only if all of its inputs are done; an active stage has an execution that is not over. |
+//! | C9 | A stage is active or done only if all of its inputs are done; an active stage has an execution that is not over, and what is made again for it is in memory. |
 //! | C10 | A run is finished exactly if all requested stages are done, and failed only with a failed stage. |
 //! | C11 | While a small task is ready and not in back-off, no worker of its backend that is in its group's share is idle. |
 //! | C12 | The steps of a task's checkpoints increase. |
@@ -116,6 +116,11 @@ fn check_index(state: &State) -> Vec<String> {
     for (key, execution) in &state.executions {
         if execution.users.is_empty() && !execution.is_busy() {
             broken.push(format!("C15: execution {key} is unused and idle, and still in memory"));
+        }
+        if let ExecutionState::Mending { inputs } = &execution.state
+            && let Some(input) = inputs.iter().find(|input| !state.executions.contains_key(input))
+        {
+            broken.push(format!("C9: execution {key} waits for {input}, which is not in memory"));
         }
         if !execution.tasks.is_indexed() {
             broken.push(format!("C14: the index of execution {key} is not that of {:?}", execution.tasks));

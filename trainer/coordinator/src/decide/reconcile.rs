@@ -26,6 +26,9 @@ impl Deciding<'_> {
                 continue;
             }
             self.state.visits += 1;
+            if self.state.runs[&number].state.is_final() {
+                self.give_no_longer(number);
+            }
             self.go_on_with_whole_inputs(number);
             self.take_over_results(number);
             self.sweep(number);

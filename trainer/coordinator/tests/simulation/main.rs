@@ -17,12 +17,15 @@ mod worker;
 mod world;
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
+use coordinator::state::execution::{ExecutionState, StageExecution};
+use coordinator::state::run::Status;
 use coordinator::value::Known;
-use coordinator::{Event, Millis};
-use protocol::message::StageState;
-use protocol::stage::WorkerRange;
+use coordinator::{Control, Event, Millis};
+use protocol::message::{RunState, StageState};
+use protocol::stage::{DataSynthetic, WorkerRange};
 
 use crate::world::{CHAOS_MS, INJECTED, World};
 
@@ -140,21 +143,23 @@ fn every_event_in_every_state_is_taken_or_refused() {
     }
 }
 
+fn submission(pipeline: pipeline::Pipeline) -> Event {
+    Event::Submit {
+        submission: None,
+        pipeline: Box::new(pipeline),
+        source: String::new(),
+        idempotency_key: None,
+        until: None,
+        owner: protocol::Owner::local("me"),
+    }
+}
+
 /// A damaged input is recomputed while its reader waits, and all stages keep their values.
 #[test]
 fn a_damaged_input_is_made_again_within_the_run() {
     let mut world = World::new(7);
     world.now = Millis(CHAOS_MS);
-    let pipeline = Box::new(pipelines::quickstart(9, WorkerRange::default(), &[]));
-    let submit = Event::Submit {
-        submission: None,
-        pipeline,
-        source: String::new(),
-        idempotency_key: None,
-        until: None,
-        owner: protocol::Owner::local("me"),
-    };
-    world.submissions = vec![(Millis(0), submit)];
+    world.submissions = vec![(Millis(0), submission(pipelines::quickstart(9, WorkerRange::default(), &[])))];
     let damaged = loop {
         world.step();
         let reads =
@@ -180,18 +185,90 @@ fn a_damaged_input_is_made_again_within_the_run() {
     assert!(world.views()[0].stages.iter().all(|stage| stage.state == StageState::Ran), "{:?}", world.views());
 }
 
+/// A run needs a value that is made again, and another run with the same value ends meanwhile. `shared` brings the first run
+/// to the stage that finds the damage, with the second one.
+fn damaged_while_another_run_ends(shared: impl Fn(&mut World)) {
+    let mut world = World::new(7);
+    world.now = Millis(CHAOS_MS);
+    shared(&mut world);
+    let [first, second] = [0, 1].map(|i| world.runs()[i].id.clone());
+    let reads =
+        |worker: &&mut worker::FakeWorker| worker.grant().is_some_and(|grant| grant.task.as_str().ends_with("/vae"));
+    let waits = |execution: &Arc<StageExecution>| matches!(execution.state, ExecutionState::Mending { .. });
+    let mut damaged = None;
+    while !world.state().executions.values().any(waits) {
+        world.step();
+        let now = world.now;
+        // A report is too late if the gang has changed since, so there may be several.
+        if world.runs().iter().all(|run| run.is_at_work() && run.status(&"vae".into()).is_some_and(is_active))
+            && let Some(reader) = world.workers.iter_mut().find(reads)
+            && let Some(input) = reader.finds_damage(now, |_| true)
+        {
+            world.store.damage(input);
+            damaged = Some(input);
+        }
+    }
+    world.cancelled.push(second.clone());
+    world.control(&second, Control::Cancel).expect("it runs");
+    world.run();
+    let states = world.runs().iter().map(|run| (run.id.clone(), run.state)).collect::<Vec<_>>();
+    assert_eq!(states, [(first, RunState::Finished), (second, RunState::Cancelled)]);
+    let mut outputs = world.store.results.values().flat_map(|(known, ..)| known.outputs.values());
+    assert!(outputs.any(|output| Some(*output) == damaged), "it was made again");
+}
+
+fn is_active(status: &Status) -> bool {
+    matches!(status, Status::Active { .. })
+}
+
+/// The second run gives the value under another key.
+#[test]
+fn a_value_is_made_again_though_another_run_that_gives_it_ends() {
+    damaged_while_another_run_ends(|world| {
+        let other = DataSynthetic { clips: 7, ..DataSynthetic::default() };
+        let mut second = pipelines::quickstart(9, WorkerRange::default(), &[]);
+        second.stages[0].settings = other.into();
+        world.submissions = vec![
+            (Millis(0), submission(pipelines::quickstart(9, WorkerRange::default(), &[]))),
+            (Millis(0), submission(second)),
+        ];
+        while world.runs().len() < 2 {
+            world.step();
+        }
+    });
+}
+
+/// The first run is resumed, so the second one has begun the execution that gives the value.
+#[test]
+fn a_value_of_a_resumed_run_is_made_again_though_another_run_ends() {
+    damaged_while_another_run_ends(|world| {
+        let quickstart = || submission(pipelines::quickstart(9, WorkerRange::default(), &[]));
+        let until_active = |world: &mut World| {
+            while !world.runs().last().and_then(|run| run.status(&"vae".into())).is_some_and(is_active) {
+                world.step();
+            }
+        };
+        world.submissions = vec![(Millis(0), quickstart())];
+        until_active(world);
+        let first = world.runs()[0].id.clone();
+        world.control(&first, Control::Cancel).expect("it runs");
+        while !world.state().executions.is_empty() {
+            world.step();
+        }
+        world.control(&first, Control::Resume).expect("it was cancelled");
+        until_active(world);
+        world.submissions = vec![(Millis(0), quickstart())];
+        while world.runs().len() < 2 {
+            world.step();
+        }
+    });
+}
+
 #[test]
 fn two_runs_of_one_pipeline_compute_once_and_a_third_finds_everything() {
     let mut world = World::new(7);
     world.now = Millis(CHAOS_MS);
-    let submit = || Event::Submit {
-        submission: None,
-        pipeline: Box::new(pipelines::quickstart(9, WorkerRange::default(), &[])),
-        source: String::new(),
-        idempotency_key: None,
-        until: None,
-        owner: protocol::Owner::local("me"),
-    };
+    let submit = || submission(pipelines::quickstart(9, WorkerRange::default(), &[]));
     world.submissions = vec![(Millis(0), submit()), (Millis(0), submit())];
     world.run();
     let results = world.store.results.len();
