@@ -2,7 +2,7 @@
 
     python ops/ray_workers.py --workers 4 --gpus 1 URL --token-file FILE --ca FILE
 
-What follows the workers' options is passed to `trainer worker join`. The program and the files are at the same paths on all nodes.
+All other options are passed to `trainer worker join`. The program and the files are at the same paths on all nodes.
 """
 
 import argparse
@@ -12,15 +12,19 @@ import subprocess
 import ray
 
 
-# Ray replaces an actor whose node is lost. Its process is killed with it.
+# Ray starts a lost actor again. The worker of an actor is killed with it.
 @ray.remote(max_restarts=-1, max_task_retries=-1, max_concurrency=2)
 class Worker:
+    def __init__(self):
+        self.process = None
+
     def work(self, command):
         self.process = subprocess.Popen(command)
         return self.process.wait()
 
     def leave(self):
-        self.process.terminate()
+        if self.process:
+            self.process.terminate()
 
 
 def main():
@@ -38,9 +42,11 @@ def main():
     try:
         statuses = ray.get(ends)
     except KeyboardInterrupt:
-        ray.get([worker.leave.remote() for worker in workers])
-        statuses = ray.get(ends)
-    return max(statuses)
+        leaving = [worker.leave.remote() for worker in workers]
+        # An actor for which the cluster has no place has not started, and has no worker.
+        ended, _ = ray.wait(ends, num_returns=len(leaving), timeout=60)
+        statuses = ray.get(ended)
+    return int(any(statuses))
 
 
 if __name__ == "__main__":

@@ -60,7 +60,12 @@ joined 2
 worker=$(pgrep -f "worker join .*$dir/nodes.token" | head -1)
 kill -9 "$(ps -o ppid= -p "$worker" | tr -d ' ')"
 joined 3
-! kill -0 "$worker" 2>/dev/null || { echo "a worker outlives its actor"; exit 1; }
+for _ in $(seq 50); do
+    # A dead process that its parent has not read yet is a zombie.
+    case $(ps -o stat= -p "$worker" || true) in "" | Z*) worker= && break ;; esac
+    sleep 0.2
+done
+[ -z "$worker" ] || { echo "a worker outlives its actor"; exit 1; }
 "$trainer" submit configs/smoke.yaml --follow --server "$url" --token-file "$dir/me.token" >"$dir/run.log" 2>&1 ||
     { cat "$dir/run.log" "$dir/ray.log"; exit 1; }
 kill -TERM "$actors"
