@@ -2,18 +2,11 @@
 # Runs configs/smoke.yaml on the workers that the command of docs/book/src/clusters.md starts as actors of a real Ray here.
 # Needs python3 with pip, and a built `trainer` (STRIDE_TRAINER, or that of `target`).
 set -euo pipefail
-cd "$(dirname "$0")/.."
-skipped() {
-    echo "SKIPPED ray: $1"
-    [ -z "${CI:-}" ] || exit 1
-    exit 0
-}
-command -v python3 >/dev/null || skipped "no python3 here"
-target=${CARGO_TARGET_DIR:-target}
-trainer=$(realpath "${STRIDE_TRAINER:-$target/debug/trainer}")
+name=ray
+. "$(dirname "$0")/common.sh"
+cd "$root"
 environment=$(realpath -m "${STRIDE_RAY_ENV:-$target/ray}")
-[ -x "$environment/bin/python" ] || python3 -m venv "$environment" >/dev/null 2>&1 || skipped "python3 has no venv"
-"$environment/bin/python" -m pip install --quiet --disable-pip-version-check 'ray>=2.40,<3' || skipped "pip cannot install it"
+python_with "$environment" 'ray>=2.40,<3'
 
 dir=$(mktemp -d)
 server= actors=
@@ -26,18 +19,10 @@ cleanup() {
 }
 trap cleanup EXIT
 umask 077
-echo "me admin $(head -c 24 /dev/urandom | base64 | tr '/+' '_-')" >"$dir/me.token"
-echo "nodes worker $(head -c 24 /dev/urandom | base64 | tr '/+' '_-')" >"$dir/nodes.token"
+echo "me admin $(secret)" >"$dir/me.token"
+echo "nodes worker $(secret)" >"$dir/nodes.token"
 cat "$dir"/*.token >"$dir/tokens"
-"$trainer" serve --store "$dir/store" --bind 127.0.0.1:0 --token-file "$dir/tokens" >"$dir/log" 2>&1 &
-server=$!
-url=
-for _ in $(seq 100); do
-    url=$(grep -oE 'http://127\.0\.0\.1:[0-9]+' "$dir/log" | head -1 || true)
-    [ -z "$url" ] || break
-    sleep 0.2
-done
-[ -n "$url" ] || { cat "$dir/log"; exit 1; }
+serve "$dir"
 
 # The book's command, with this server, our files, two workers and no GPU.
 command=$(awk '/<!-- run by tests\/ray.sh -->/ { found = 1 } found && /^python/ { print; exit }' docs/book/src/clusters.md)
