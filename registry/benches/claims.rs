@@ -2,6 +2,8 @@
 //! it with `cargo bench -p registry`.
 
 use std::io::Write as _;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Instant;
 
 use protocol::message::{Grant, MetricRow};
@@ -9,23 +11,26 @@ use protocol::{Attempt, Fence, Incarnation, TaskId};
 use registry::{Holder, Store, Write};
 use serde_json::json;
 
-#[tokio::main]
+/// On one thread, so that writes are sent in the order of their decisions, as a coordinator sends them.
+#[tokio::main(flavor = "current_thread")]
 async fn main() -> Result<(), Box<dyn std::error::Error>> {
     let dir = tempfile::tempdir()?;
     let store = Store::open(dir.path(), Holder::this_process("bench")).await?;
     let mut out = std::io::stdout().lock();
+    let decisions = Arc::new(AtomicU64::new(0));
     for (round, callers) in [1_u64, 8, 64, 256].into_iter().enumerate() {
         let each = (2000 / callers).max(20);
         let started = Instant::now();
         let tasks: Vec<_> = (0..callers)
             .map(|caller| {
-                let store = store.clone();
+                let (store, decisions) = (store.clone(), Arc::clone(&decisions));
                 tokio::spawn(async move {
                     for fence in 1..=each {
                         let task = TaskId::new(format!("r{round}/s/{caller}"));
+                        let seq = decisions.fetch_add(1, Ordering::Relaxed) + 1;
                         let writes = vec![
                             Write::Fence { task, fence: Fence(fence) },
-                            Write::Facts { seq: fence, facts: json!({ "fence": fence }).to_string() },
+                            Write::Facts { seq, facts: json!({ "fence": fence }).to_string() },
                         ];
                         store.write(writes).await?;
                     }
