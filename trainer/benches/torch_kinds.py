@@ -36,7 +36,7 @@ def cases() -> dict[str, tuple[str, dict]]:
         dict(codes=512, dim=512, layers=6, width=512, depth=3, growth=3, window=64, batch=256))
     add("momask",
         dict(codes=128, layers=3, width=96, blocks=3, heads=4, ff=192, dropout=0.1, dim=64, batch=32),
-        dict(codes=512, layers=6, width=384, blocks=8, heads=6, ff=1024, dropout=0.2, dim=384, batch=64))
+        dict(codes=512, layers=6, width=384, blocks=8, heads=6, ff=1024, dropout=0.2, dim=512, batch=64))
     add("t2mgpt",
         dict(codes=128, width=96, half=2, heads=4, ff=384, dropout=0.1, batch=32),
         dict(codes=512, width=1024, half=9, heads=16, ff=4096, dropout=0.1, batch=128))

@@ -323,7 +323,7 @@ impl GangContext for Member {
         &mut self,
         steps: Range<u64>,
         slices: usize,
-        parts: &[(Node, Vec<f32>)],
+        parts: &mut [(Node, Vec<f32>)],
     ) -> Result<Exchange, ContextError> {
         let step = steps.start;
         let gang = Arc::clone(&self.gang);
@@ -464,7 +464,7 @@ mod tests {
                 .share(SLICES)
                 .map(|slice| (slice..slice + 1, vec![(value + slice as f32 * 0.1 + step as f32 * 1e3).sin()]))
                 .collect();
-            match cx.exchange(step..step + 1, SLICES, &parts)? {
+            match cx.exchange(step..step + 1, SLICES, &mut parts)? {
                 Exchange::Regroup => (step, value) = meet(cx, applied, (step, value))?,
                 Exchange::Sum { sum, drain } => {
                     (step, value) = (step + 1, value + sum[0]);

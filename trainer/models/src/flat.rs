@@ -1,12 +1,16 @@
 //! Parameters and gradients as flat f32 buffers in declaration order, for reduction, clipping, updates, storage and
 //! comparison.
 
+use std::cell::RefCell;
+use std::collections::HashSet;
 use std::convert::Infallible;
 
 use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
 use burn::tensor::{Gradients, Tensor, TensorData};
 
 use crate::device::is_accelerator;
+#[cfg(feature = "flex")]
+use crate::kernels::Collector;
 use crate::kernels::with_values;
 
 /// One parameter tensor inside a flat buffer.
@@ -221,27 +225,93 @@ impl ModuleMapper for Cut<'_> {
     }
 }
 
+/// Room behind a network's gradients for the values that a step sends with them.
+const ROOM: usize = 4096;
+
+/// Buffers that a thread keeps for its next gradients.
+const SPARES: usize = 2;
+
+thread_local! {
+    static SPARE: RefCell<Vec<Vec<f32>>> = const { RefCell::new(Vec::new()) };
+}
+
+/// Keeps the memory of a buffer for the next gradients of this thread, so that it is neither freed nor zeroed.
+pub fn recycle(buffer: Vec<f32>) {
+    SPARE.with_borrow_mut(|spare| {
+        if spare.len() < SPARES && buffer.capacity() > 0 {
+            spare.push(buffer);
+        }
+    });
+}
+
+/// A buffer of `len` values of any content. A few thousand can be appended without a copy.
+fn buffer(len: usize) -> Vec<f32> {
+    let fits = |spare: &Vec<f32>| (len..=len + 2 * ROOM).contains(&spare.capacity());
+    let spare = SPARE.with_borrow_mut(|spares| spares.iter().position(fits).map(|at| spares.swap_remove(at)));
+    let mut buffer = spare.unwrap_or_else(|| Vec::with_capacity(len + ROOM));
+    buffer.resize(len, 0.0);
+    buffer
+}
+
+/// The gradient of `loss` for all parameters, in the order of [`read`]; zeros for a parameter without one. On flex, most
+/// of it is written as the backward pass goes. [`recycle`] the result.
+pub fn gradient<M: Module>(module: &M, loss: Tensor<1>) -> Vec<f32> {
+    let out = buffer(module.num_params());
+    #[cfg(feature = "flex")]
+    {
+        struct Places(Collector, usize);
+        impl ModuleVisitor for Places {
+            fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
+                let end = self.1 + param.dims().iter().product::<usize>();
+                self.0.add(&param.val(), self.1..end);
+                self.1 = end;
+            }
+        }
+        let mut places = Places(Collector::new(out), 0);
+        module.visit(&mut places);
+        let (mut gradients, out, written) = places.0.during(|| loss.backward());
+        take_rest(module, &mut gradients, out, &written.into_iter().map(|place| place.start).collect())
+    }
+    #[cfg(not(feature = "flex"))]
+    take_rest(module, &mut loss.backward(), out, &HashSet::new())
+}
+
 /// Takes the gradients of all parameters, in the order of [`read`]; zeros for a parameter without one.
 pub fn take_gradients<M: Module>(module: &M, gradients: &mut Gradients) -> Vec<f32> {
+    take_rest(module, gradients, buffer(module.num_params()), &HashSet::new())
+}
+
+/// Fills `out` with gradients. Those that begin at `written` are there already; what is still found is added to them.
+fn take_rest<M: Module>(module: &M, gradients: &mut Gradients, out: Vec<f32>, written: &HashSet<usize>) -> Vec<f32> {
     struct Take<'a> {
         gradients: &'a mut Gradients,
+        written: &'a HashSet<usize>,
         out: Vec<f32>,
+        at: usize,
         /// Gradients on an accelerator with their offsets in `out`; one transfer copies them all.
         there: Vec<(usize, Tensor<1>)>,
     }
     impl ModuleVisitor for Take<'_> {
         fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
-            let len = param.dims().iter().product::<usize>();
-            let end = self.out.len() + len;
+            let (at, len) = (self.at, param.dims().iter().product::<usize>());
+            self.at += len;
+            let out = &mut self.out[at..self.at];
+            let is_written = len > 0 && self.written.contains(&at);
             match param.val().grad_remove(self.gradients).map(|gradient| gradient.reshape([len])) {
-                Some(gradient) if is_accelerator(&gradient.device()) => self.there.push((self.out.len(), gradient)),
-                Some(gradient) => with_values(gradient, |from| self.out.extend_from_slice(from)),
-                None => {}
+                Some(gradient) if is_accelerator(&gradient.device()) => self.there.push((at, gradient)),
+                Some(gradient) => with_values(gradient, |from| {
+                    if is_written {
+                        out.iter_mut().zip(from).for_each(|(out, from)| *out += from);
+                    } else {
+                        out.copy_from_slice(from);
+                    }
+                }),
+                None if is_written => {}
+                None => out.fill(0.0),
             }
-            self.out.resize(end, 0.0);
         }
     }
-    let mut visitor = Take { gradients, out: Vec::with_capacity(module.num_params()), there: Vec::new() };
+    let mut visitor = Take { gradients, written, out, at: 0, there: Vec::new() };
     module.visit(&mut visitor);
     let Take { mut out, there, .. } = visitor;
     if !there.is_empty() {

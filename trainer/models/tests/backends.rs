@@ -25,7 +25,7 @@ fn wave<const D: usize>(shape: [usize; D], k: f32, device: &Device) -> Tensor<D>
 fn update<M: Module>(network: M, loss: Tensor<1>) -> Step {
     let value = loss.clone().inner().into_data().as_slice::<f32>().expect("f32")[0];
     let mut params = flat::read(&network);
-    let gradient = flat::take_gradients(&network, &mut loss.backward());
+    let gradient = flat::gradient(&network, loss);
     let factor = clip_factor(global_norm(&gradient), 1.0) as f32;
     let clipped: Vec<f32> = gradient.iter().map(|g| g * factor).collect();
     let (mut m, mut v) = (vec![0.0; params.len()], vec![0.0; params.len()]);

@@ -1,10 +1,14 @@
 //! The fused kernels against Burn's operations and against differences of their own values, forward and backward.
 #![cfg(feature = "flex")]
 
+use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
+use models::flat;
 use models::kernels::{self, Derivative, Dropout, KeyMask, Sweep, stock};
+use models::networks::{Init, Linear};
 use motion::skeleton::Skeleton;
-use protocol::stage::DataFormat;
+use protocol::Seed;
+use protocol::stage::{DataFormat, Positions};
 
 /// Smooth, distinct values of either sign.
 fn wave(count: usize, seed: usize) -> Vec<f32> {
@@ -519,4 +523,26 @@ fn joints_and_their_derivatives_are_the_stock_ones() {
             });
         }
     }
+}
+
+#[test]
+fn gradients_that_are_collected_are_those_of_the_tape() {
+    let device = Device::flex().autodiff();
+    let mut init = Init::new(Seed(3), "collected", Positions::Uniform, &device);
+    let layers: Vec<Linear> = (0..4).map(|_| Linear::new(&mut init, 5, 5)).collect();
+    // The first has two uses, the second none, the third one on the tape of Burn, and the last one of each.
+    let loss = || {
+        let x = layers[0].forward(layers[0].forward(tensor([3, 5], 1, &device)));
+        let x = layers[3].forward(x).matmul(layers[2].weight.val())
+            * layers[3].bias.as_ref().expect("a bias").val().unsqueeze();
+        weighted(x)
+    };
+    let tape = flat::take_gradients(&layers, &mut loss().backward());
+    // The content of memory that is used again does not matter.
+    flat::recycle(vec![f32::NAN; layers.num_params()]);
+    let collected = flat::gradient(&layers, loss());
+    assert_eq!(collected, tape);
+    let of_layer = tape.len() / 4;
+    assert!(tape[of_layer..2 * of_layer].iter().all(|g| *g == 0.0));
+    assert!(tape[..of_layer].iter().chain(&tape[3 * of_layer..]).all(|g| *g != 0.0));
 }

@@ -198,13 +198,14 @@ pub trait GangContext: AttemptContext {
     fn share(&self, slices: usize) -> Range<usize>;
 
     /// Sums `parts` from all members, along the fixed binary tree over `0..slices`. `parts` are vectors of equal length:
-    /// the sums of nodes of this tree that together are this worker's slices, in order. `steps` are the updates that the sum makes: one, or those of a round of replicas,
-    /// which are then the slices.
+    /// the sums of nodes of this tree that together are this worker's slices, in order. The vectors may be taken if the
+    /// result is a sum. `steps` are the updates that the sum makes: one, or those of a round of replicas, which are then
+    /// the slices.
     fn exchange(
         &mut self,
         steps: Range<u64>,
         slices: usize,
-        parts: &[(Node, Vec<f32>)],
+        parts: &mut [(Node, Vec<f32>)],
     ) -> Result<Exchange, ContextError>;
 
     /// Number of values from which the results of a slice are large: they are added as soon as both parts of a node of

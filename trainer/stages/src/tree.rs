@@ -6,6 +6,8 @@
 
 use std::ops::Range;
 
+use models::flat::recycle;
+
 /// A range of slices that is a node of the tree.
 pub type Node = Range<usize>;
 
@@ -73,19 +75,20 @@ impl Sums {
             let (_, right) = self.nodes.remove(left + 1);
             let (node, sum) = &mut self.nodes[left];
             assert_eq!(sum.len(), right.len(), "slices give vectors of one length");
-            sum.iter_mut().zip(right).for_each(|(a, b)| *a += b);
+            sum.iter_mut().zip(&right).for_each(|(a, b)| *a += b);
+            recycle(right);
             *node = above;
             at = left;
         }
     }
 
     /// The sums for an exchange.
-    pub(crate) fn parts(&self) -> &[(Node, Vec<f32>)] {
-        &self.nodes
+    pub(crate) fn parts(&mut self) -> &mut [(Node, Vec<f32>)] {
+        &mut self.nodes
     }
 
     pub(crate) fn clear(&mut self) {
-        self.nodes.clear();
+        self.nodes.drain(..).for_each(|(_, values)| recycle(values));
     }
 }
 

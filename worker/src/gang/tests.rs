@@ -196,7 +196,7 @@ fn train(context: &mut HttpContext, plan: Plan, mut before: impl FnMut(u64)) -> 
             parts.entry(slice).or_insert_with(|| gradient(step, slice, plan.length));
         }
         let brought: Vec<_> = parts.iter().map(|(s, p)| (*s..*s + 1, p.clone())).collect();
-        match context.exchange(step..step + 1, plan.slices, &brought)? {
+        match context.exchange(step..step + 1, plan.slices, &mut brought)? {
             Exchange::Regroup => met = false,
             Exchange::Sum { sum, .. } => {
                 apply(&mut state, &sum);
@@ -392,7 +392,7 @@ fn one_wish_to_drain_is_heard_by_all_after_the_same_step() {
                             desired.drain = true;
                             held.update(desired);
                         }
-                        match context.exchange(step..step + 1, 3, &parts).expect("summed") {
+                        match context.exchange(step..step + 1, 3, &mut parts).expect("summed") {
                             Exchange::Sum { drain, sum } => {
                                 assert_eq!(sum, [3.0]);
                                 stops.push(drain);
@@ -508,7 +508,7 @@ fn throughput() {
                     barrier.wait();
                     lock(begun).get_or_insert_with(Instant::now);
                     for step in 0..4 {
-                        context.exchange(step..step + 1, 8, &parts).expect("summed");
+                        context.exchange(step..step + 1, 8, &mut parts).expect("summed");
                     }
                     barrier.wait();
                     if i == 0 {

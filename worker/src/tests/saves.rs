@@ -11,7 +11,7 @@ const LARGE: usize = 17 << 20;
 fn steps(context: &mut dyn GangContext, done: u64, count: u64) -> Result<(), StageError> {
     for step in done..done + count {
         let parts: Vec<_> = context.share(2).map(|slice| (slice..slice + 1, vec![1.0])).collect();
-        let exchanged = context.exchange(step..step + 1, 2, &parts)?;
+        let exchanged = context.exchange(step..step + 1, 2, &mut parts)?;
         assert!(matches!(exchanged, Exchange::Sum { .. }), "{exchanged:?}");
         context.record(step + 1, &[("loss", 1.0)]);
         context.progress(step + 1, 10, "steps", &[]);

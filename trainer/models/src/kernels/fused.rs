@@ -1,8 +1,11 @@
 //! The side of a fused kernel that faces Burn: where its tensors live, and how its gradient joins the backward pass.
 
-use std::cell::Cell;
+use std::cell::{Cell, RefCell};
+use std::collections::HashMap;
 use std::fmt::Debug;
+use std::ops::Range;
 
+use burn::backend::autodiff::NodeId;
 use burn::backend::autodiff::checkpoint::{base::Checkpointer, strategy::NoCheckpointing};
 use burn::backend::autodiff::grads::Gradients;
 use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
@@ -59,7 +62,9 @@ impl<K: Fused<N>, const N: usize> Backward<Flex, N> for Taped<K> {
         let wanted = ops.parents.each_ref().map(Option::is_some);
         let found = self.0.backward(ops.state, dy, wanted);
         for (parent, gradient) in ops.parents.into_iter().zip(found) {
-            if let (Some(parent), Some(gradient)) = (parent, gradient) {
+            if let (Some(parent), Some(gradient)) = (parent, gradient)
+                && !Collector::takes(parent.id, &gradient)
+            {
                 grads.register::<Flex>(parent.id, gradient);
             }
         }
@@ -93,6 +98,56 @@ pub(super) fn run<const N: usize, const D: usize, K: Fused<N>>(kernel: K, inputs
 
 thread_local! {
     static STOCK: Cell<bool> = const { Cell::new(false) };
+    static COLLECTOR: RefCell<Option<Collector>> = const { RefCell::new(None) };
+}
+
+/// Copies gradients of parameters into one buffer as a backward pass makes them. Burn would keep each as a tensor to the
+/// end of the pass, and the parameters' memory would be needed once more.
+#[derive(Debug)]
+pub(crate) struct Collector {
+    /// The place of each parameter, and true once its gradient is there.
+    places: HashMap<NodeId, (Range<usize>, bool)>,
+    values: Vec<f32>,
+}
+
+impl Collector {
+    /// Writes into `values`, whose old content is not read.
+    pub(crate) fn new(values: Vec<f32>) -> Self {
+        Self { places: HashMap::new(), values }
+    }
+
+    /// Collects the gradient of `parameter` at `place`, if the tensor is on the tape of the CPU backend.
+    pub(crate) fn add<const D: usize>(&mut self, parameter: &Tensor<D>, place: Range<usize>) {
+        if let Ok(tracked) = parameter.clone().try_into_primitive::<Tracked>() {
+            self.places.insert(tracked.node().id(), (place, false));
+        }
+    }
+
+    /// Collects during `backward`, which stays on this thread. Returns the values, and the places that were written.
+    pub(crate) fn during<T>(self, backward: impl FnOnce() -> T) -> (T, Vec<f32>, Vec<Range<usize>>) {
+        COLLECTOR.set(Some(self));
+        let result = backward();
+        let Self { places, values } = COLLECTOR.take().expect("set above");
+        let written = places.into_values().filter_map(|(place, is_there)| is_there.then_some(place)).collect();
+        (result, values, written)
+    }
+
+    /// Takes a gradient, or adds it if the parameter has several uses. Returns false if it is not one to collect.
+    fn takes(id: NodeId, gradient: &FlexTensor) -> bool {
+        COLLECTOR.with_borrow_mut(|collector| {
+            let Some(Self { places, values }) = collector else { return false };
+            let Some((place, is_there)) = places.get_mut(&id) else { return false };
+            let gradient = contiguous(gradient.clone());
+            let (to, from) = (&mut values[place.clone()], slice(&gradient));
+            if *is_there {
+                to.iter_mut().zip(from).for_each(|(to, from)| *to += from);
+            } else {
+                to.copy_from_slice(from);
+            }
+            *is_there = true;
+            true
+        })
+    }
 }
 
 /// Runs `body` without fused kernels on this thread.

@@ -36,6 +36,8 @@ pub use attention::{KeyMask, causal_attention, cross_attention, self_attention};
 pub use conv::{Sweep, conv, transposed_conv};
 pub use distance::{Pointwise, weighted_distance};
 pub use dropout::{Dropout, dropout};
+#[cfg(feature = "flex")]
+pub(crate) use fused::Collector;
 pub use gelu::gelu;
 pub use gru::gru;
 pub use joints::{Derivative, joint_derivative, joints};

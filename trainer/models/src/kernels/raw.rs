@@ -206,6 +206,19 @@ mod tests {
         }
         // Rows that fall on the same lines of a cache are packed.
         check((10, 256, 3));
+        // The left operand is packed in strips, and the panels pass by its rows in rounds; the last of each is shorter.
+        check((1023, 258, 3));
+        check((514, 256, 257));
+    }
+
+    #[test]
+    fn bits_do_not_depend_on_the_order_of_an_operand() {
+        let sizes @ (m, n, k) = (1023, 258, 300);
+        let (a, b) = (wave(m * k), wave(k * n));
+        let turned: Vec<f32> = (0..k * m).map(|i| a[i % m * k + i / m]).collect();
+        let [rows, columns] = [(&a, View::rows(k)), (&turned, View::rows(m).t())]
+            .map(|(a, view)| product(sizes, a, view, &b, View::rows(n)));
+        assert!(rows == columns);
     }
 
     #[test]

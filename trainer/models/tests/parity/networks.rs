@@ -133,7 +133,7 @@ pub(crate) fn load<M: Module>(module: M, weights: &Path, prefix: &str) -> M {
 
 /// Gradients of `loss`, flat.
 pub(crate) fn gradients<M: Module>(module: &M, loss: Tensor<1>) -> Vec<f32> {
-    flat::take_gradients(module, &mut loss.backward())
+    flat::gradient(module, loss)
 }
 
 /// Calls `each` with the name and values of every parameter of a flat buffer.

@@ -143,9 +143,10 @@ impl GangContext for Solo {
         &mut self,
         steps: Range<u64>,
         slices: usize,
-        parts: &[(Node, Vec<f32>)],
+        parts: &mut [(Node, Vec<f32>)],
     ) -> Result<Exchange, ContextError> {
-        Ok(Exchange::Sum { sum: tree_sum(slices, parts.iter().cloned()), drain: steps.end >= self.until })
+        let parts = parts.iter_mut().map(|(node, part)| (node.clone(), std::mem::take(part)));
+        Ok(Exchange::Sum { sum: tree_sum(slices, parts), drain: steps.end >= self.until })
     }
 
     fn hold(&mut self) -> Result<(), ContextError> {

@@ -1,8 +1,7 @@
 //! A network in a training: its parameters as a group, and the gradient of a slice's loss.
 
 use burn::module::Module;
-use burn::tensor::Tensor;
-use models::flat::{self, take_gradients};
+use models::flat;
 use motion::Stream;
 use protocol::stage::Training;
 
@@ -24,11 +23,6 @@ pub(crate) fn group<M: Module>(name: &'static str, module: &M, training: &Traini
     }
 }
 
-/// The gradient of a slice's loss for all parameters of `module`, as a flat buffer.
-pub(crate) fn slice_gradient<M: Module>(module: &M, loss: Tensor<1>) -> Vec<f32> {
-    take_gradients(module, &mut loss.backward())
-}
-
 /// The result of a slice that trains only `module`, on all of `losses`.
 pub(crate) fn slice_result<M: Module>(
     module: &M,
@@ -38,7 +32,7 @@ pub(crate) fn slice_result<M: Module>(
     let total = losses.total().ok_or_else(|| {
         StageError::Input("every weight of the loss is 0, so nothing is learned; set at least one above 0".into())
     })?;
-    let gradients = vec![slice_gradient(module, total)];
+    let gradients = vec![flat::gradient(module, total)];
     Ok(SliceResult { gradients, terms: losses.values(terms), ..SliceResult::default() })
 }
 

@@ -44,8 +44,10 @@ impl Layout {
                 self.gradients, self.terms, self.sums
             )));
         }
-        let mut flat = Vec::with_capacity(self.len());
-        result.gradients.into_iter().for_each(|gradient| flat.extend(gradient));
+        // The first gradient may be gigabytes. It is not copied if the rest fits behind it.
+        let mut gradients = result.gradients.into_iter();
+        let mut flat = gradients.next().unwrap_or_default();
+        gradients.for_each(|gradient| flat.extend(gradient));
         flat.extend(result.terms);
         result.sums.into_iter().for_each(|sum| flat.extend(sum));
         Ok(flat)

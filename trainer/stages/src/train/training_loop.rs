@@ -3,6 +3,7 @@
 use std::ops::Range;
 
 use burn::tensor::Device;
+use models::flat::recycle;
 use protocol::stage::Training;
 use protocol::{Digest, limits};
 
@@ -206,7 +207,9 @@ impl<'a> TrainingLoop<'a> {
             let applied = apply(&mut self.state, layout, &sum)?;
             hook(self.objective, &mut self.state, layout.sums(&sum, &self.sums), self.cx.task())?;
             self.objective.load(&self.state);
-            (layout.terms(&sum).to_vec(), applied)
+            let terms = layout.terms(&sum).to_vec();
+            recycle(sum);
+            (terms, applied)
         };
 
         let values = self.terms.iter().copied().zip(terms.into_iter().map(f64::from));

@@ -53,7 +53,7 @@ fn members_of_two_generations_keep_their_connection_and_others_do_not() {
             .map(|context| {
                 scope.spawn(|| {
                     let parts: Vec<_> = context.share(3).map(|slice| (slice..slice + 1, vec![1.0; 10])).collect();
-                    context.exchange(3..4, 3, &parts).expect("summed")
+                    context.exchange(3..4, 3, &mut parts).expect("summed")
                 })
             })
             .collect();

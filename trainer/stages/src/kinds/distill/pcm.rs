@@ -13,6 +13,7 @@
 
 use burn::tensor::Tensor;
 use models::diffusion::{Phases, affine, unzip};
+use models::flat;
 use models::kernels::Dropout;
 use models::losses;
 use models::networks::{Discriminator, Init};
@@ -21,7 +22,7 @@ use protocol::stage::{DistillPcm, StageSpec, Training};
 use crate::context::{GangContext, Outcome, StageError};
 use crate::kinds::shape::Gang;
 use crate::train::consistency::{Distiller, SolverStep};
-use crate::train::network::{group, slice_gradient, slice_result};
+use crate::train::network::{group, slice_result};
 use crate::train::{GroupPlan, Losses, Objective, SliceResult, TrainState, Turns, train};
 use burn::module::Module;
 
@@ -97,8 +98,8 @@ impl Objective for Pcm {
         let total = all.total().expect("the consistency is part of it");
         let [student_turns, critic_turns] = self.turns().map(|turns| turns.turn(step).is_some());
         let gradients = vec![
-            if student_turns { slice_gradient(&self.distiller.student, total) } else { Vec::new() },
-            if critic_turns { slice_gradient(heads, critic) } else { Vec::new() },
+            if student_turns { flat::gradient(&self.distiller.student, total) } else { Vec::new() },
+            if critic_turns { flat::gradient(heads, critic) } else { Vec::new() },
         ];
         Ok(SliceResult { gradients, terms: all.values(&self.terms()), ..SliceResult::default() })
     }

@@ -16,7 +16,7 @@ use std::collections::BTreeMap;
 
 use burn::tensor::{Device, Tensor};
 use checkpoint::model::Parts;
-use models::flat::Entry;
+use models::flat::{self, Entry};
 use models::kernels::Dropout;
 use models::networks::{Gpt, GptConfig, Init, MaskedTransformer, MomaskConfig, ResidualTransformer};
 use models::tokens::{autoregressive, cross_entropy, masked, residual};
@@ -34,7 +34,7 @@ use crate::parts::tokenizer::Tokens;
 use crate::parts::warm_start::WarmStart;
 use crate::parts::{self, weights};
 use crate::train::data::tokens::{TokenData, uniforms};
-use crate::train::network::{dropout_seed, group, no_clips, slice_gradient, slice_result};
+use crate::train::network::{dropout_seed, group, no_clips, slice_result};
 use crate::train::{GroupPlan, Losses, Objective, Order, Pick, SliceResult, TrainState, train};
 
 struct Autoregressive {
@@ -198,11 +198,11 @@ impl Objective for Masked {
         let mut losses = Losses::new(1);
         let first = self.first_loss(picks, &all, &mut dropout);
         losses.add("first", first.clone(), 1.0);
-        let mut gradients = vec![slice_gradient(&self.first, first)];
+        let mut gradients = vec![flat::gradient(&self.first, first)];
         if let Some(network) = &self.above {
             let above = self.above_loss(network, picks, &all, &mut dropout);
             losses.add("above", above.clone(), 1.0);
-            gradients.push(slice_gradient(network, above));
+            gradients.push(flat::gradient(network, above));
         }
         Ok(SliceResult { gradients, terms: losses.values(&self.terms()), ..SliceResult::default() })
     }
