@@ -240,7 +240,7 @@ fn train(context: &mut dyn GangContext, steps: u64, pause: Duration) -> Result<O
     context.rendezvous(None, &[])?;
     let mut step = 0;
     while step < steps {
-        let parts: Vec<_> = context.share(2).map(|slice| (slice..slice + 1, vec![1.0])).collect();
+        let mut parts: Vec<_> = context.share(2).map(|slice| (slice..slice + 1, vec![1.0])).collect();
         match context.exchange(step..step + 1, 2, &mut parts)? {
             Exchange::Regroup => {
                 context.rendezvous(Some(step), &[])?;

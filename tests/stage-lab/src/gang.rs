@@ -460,7 +460,7 @@ mod tests {
         };
         (step, value) = meet(cx, applied, (step, value))?;
         while step < STEPS {
-            let parts: Vec<_> = cx
+            let mut parts: Vec<_> = cx
                 .share(SLICES)
                 .map(|slice| (slice..slice + 1, vec![(value + slice as f32 * 0.1 + step as f32 * 1e3).sin()]))
                 .collect();

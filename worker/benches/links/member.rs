@@ -75,7 +75,7 @@ impl Trainee {
             let length = self.parameters;
             let parts = share
                 .map(|slice| (slice..slice + 1, self.parts.remove(&slice).unwrap_or_else(|| gradient(slice, length))));
-            let parts: Vec<_> = parts.collect();
+            let mut parts: Vec<_> = parts.collect();
             let exchanged = self.context.gang().exchange(step..step + 1, self.slices, &mut parts)?;
             self.parts.extend(parts.into_iter().map(|(node, part)| (node.start, part)));
             match exchanged {

@@ -195,7 +195,7 @@ fn train(context: &mut HttpContext, plan: Plan, mut before: impl FnMut(u64)) -> 
         for slice in share {
             parts.entry(slice).or_insert_with(|| gradient(step, slice, plan.length));
         }
-        let brought: Vec<_> = parts.iter().map(|(s, p)| (*s..*s + 1, p.clone())).collect();
+        let mut brought: Vec<_> = parts.iter().map(|(s, p)| (*s..*s + 1, p.clone())).collect();
         match context.exchange(step..step + 1, plan.slices, &mut brought)? {
             Exchange::Regroup => met = false,
             Exchange::Sum { sum, .. } => {
@@ -386,7 +386,7 @@ fn one_wish_to_drain_is_heard_by_all_after_the_same_step() {
                     context.rendezvous(None, &[]).expect("met");
                     let mut stops = Vec::new();
                     for step in 0..4 {
-                        let parts: Vec<_> = context.share(3).map(|s| (s..s + 1, vec![1.0])).collect();
+                        let mut parts: Vec<_> = context.share(3).map(|s| (s..s + 1, vec![1.0])).collect();
                         if step == 2 {
                             let mut desired = held.assignment();
                             desired.drain = true;
@@ -504,7 +504,7 @@ fn throughput() {
                 scope.spawn(move || {
                     let mut context = gang.context(i);
                     context.rendezvous(None, &[]).expect("met");
-                    let parts: Vec<_> = context.share(8).map(|s| (s..s + 1, vec![0.5f32; length])).collect();
+                    let mut parts: Vec<_> = context.share(8).map(|s| (s..s + 1, vec![0.5f32; length])).collect();
                     barrier.wait();
                     lock(begun).get_or_insert_with(Instant::now);
                     for step in 0..4 {

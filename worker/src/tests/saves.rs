@@ -10,7 +10,7 @@ const LARGE: usize = 17 << 20;
 /// Makes `count` steps after `done` ones with a gang of this worker alone.
 fn steps(context: &mut dyn GangContext, done: u64, count: u64) -> Result<(), StageError> {
     for step in done..done + count {
-        let parts: Vec<_> = context.share(2).map(|slice| (slice..slice + 1, vec![1.0])).collect();
+        let mut parts: Vec<_> = context.share(2).map(|slice| (slice..slice + 1, vec![1.0])).collect();
         let exchanged = context.exchange(step..step + 1, 2, &mut parts)?;
         assert!(matches!(exchanged, Exchange::Sum { .. }), "{exchanged:?}");
         context.record(step + 1, &[("loss", 1.0)]);

@@ -52,7 +52,7 @@ fn members_of_two_generations_keep_their_connection_and_others_do_not() {
             .iter_mut()
             .map(|context| {
                 scope.spawn(|| {
-                    let parts: Vec<_> = context.share(3).map(|slice| (slice..slice + 1, vec![1.0; 10])).collect();
+                    let mut parts: Vec<_> = context.share(3).map(|slice| (slice..slice + 1, vec![1.0; 10])).collect();
                     context.exchange(3..4, 3, &mut parts).expect("summed")
                 })
             })

@@ -1,0 +1,56 @@
+//! Rates of the products of linear layers: the output, and the gradients of input and weight. `trainer/benches/products.py`
+//! runs it beside PyTorch.
+//!
+//! Arguments are layers such as `408x1024x4096`: rows, inputs, outputs. Prints billions of operations a second of each
+//! product, from the least of 15 times.
+#![expect(clippy::print_stdout, reason = "a bench prints what it measured")]
+
+use std::time::Instant;
+
+use burn::tensor::{Device, Tensor, TensorData};
+use models::{device, kernels};
+use protocol::stage::Backend;
+
+const TIMES: usize = 15;
+
+fn tensor<const D: usize>(shape: [usize; D], device: &Device) -> Tensor<D> {
+    let values: Vec<f32> = (0..shape.iter().product()).map(|i| (i as f32 * 0.37).sin()).collect();
+    Tensor::from_data(TensorData::new(values, shape), device)
+}
+
+/// The least time in seconds of what `make` returns.
+fn least<F: FnOnce()>(mut make: impl FnMut() -> F) -> f64 {
+    let time = |work: F| {
+        let start = Instant::now();
+        work();
+        start.elapsed().as_secs_f64()
+    };
+    (0..TIMES).map(|_| time(make())).fold(f64::INFINITY, f64::min)
+}
+
+fn main() {
+    let plain = device::open(Backend::Flex, 0).expect("built with flex");
+    let tracked = plain.clone().autodiff();
+    for layer in std::env::args().skip(1).filter(|argument| !argument.starts_with('-')) {
+        let sizes: Vec<usize> = layer.split('x').map(|size| size.parse().expect("a number")).collect();
+        let [rows, inputs, outputs] = sizes[..] else { panic!("`{layer}`: expected rows x inputs x outputs") };
+        let (x, w) = (tensor([rows, inputs], &plain), tensor([outputs, inputs], &plain));
+        let forward = least(|| {
+            || {
+                kernels::linear(x.clone(), w.clone(), None);
+            }
+        });
+        // The tape of one operand computes one product; the loss is the sum, whose gradient is 1 everywhere.
+        let (tracked_x, tracked_w) = (tensor([rows, inputs], &tracked), tensor([outputs, inputs], &tracked));
+        let input = least(|| {
+            let loss = kernels::linear(tracked_x.clone().require_grad(), tracked_w.clone(), None).sum();
+            move || drop(loss.backward())
+        });
+        let weight = least(|| {
+            let loss = kernels::linear(tracked_x.clone(), tracked_w.clone().require_grad(), None).sum();
+            move || drop(loss.backward())
+        });
+        let rate = |seconds: f64| 2e-9 * (rows * inputs * outputs) as f64 / seconds;
+        println!("{layer} {:.1} {:.1} {:.1}", rate(forward), rate(input), rate(weight));
+    }
+}
