@@ -18,7 +18,7 @@ fn tensor<const D: usize>(shape: [usize; D], device: &Device) -> Tensor<D> {
     Tensor::from_data(TensorData::new(values, shape), device)
 }
 
-/// The least time in seconds of what `make` returns.
+/// The least time in seconds that work of `make` takes.
 fn least<F: FnOnce()>(mut make: impl FnMut() -> F) -> f64 {
     let time = |work: F| {
         let start = Instant::now();

@@ -281,7 +281,7 @@ pub fn take_gradients<M: Module>(module: &M, gradients: &mut Gradients) -> Vec<f
     take_rest(module, gradients, buffer(module.num_params()), &HashSet::new())
 }
 
-/// Fills `out` with gradients. Those that begin at `written` are there already; what is still found is added to them.
+/// Fills `out` with gradients. The ones that begin at `written` are there already, and later uses are added to them.
 fn take_rest<M: Module>(module: &M, gradients: &mut Gradients, out: Vec<f32>, written: &HashSet<usize>) -> Vec<f32> {
     struct Take<'a> {
         gradients: &'a mut Gradients,
