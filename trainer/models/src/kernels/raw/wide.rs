@@ -138,10 +138,10 @@ unsafe fn by_panels(product: &Product<'_>, left: Left<'_>, c: *mut f32, cv: View
                 let to = c.add(cv.offset + from);
                 let range = range.clone();
                 match across {
-                    1 => rows::<12, 1>(product, left, range, (columns, k), from, right, to, cv.row),
-                    2 => rows::<12, 2>(product, left, range, (columns, k), from, right, to, cv.row),
-                    3 => rows::<8, 3>(product, left, range, (columns, k), from, right, to, cv.row),
-                    _ => rows::<6, 4>(product, left, range, (columns, k), from, right, to, cv.row),
+                    1 => rows::<12, 1>(product, left, range, (from, columns, k), right, to, cv.row),
+                    2 => rows::<12, 2>(product, left, range, (from, columns, k), right, to, cv.row),
+                    3 => rows::<8, 3>(product, left, range, (from, columns, k), right, to, cv.row),
+                    _ => rows::<6, 4>(product, left, range, (from, columns, k), right, to, cv.row),
                 }
             }
             first += across;
@@ -223,8 +223,7 @@ unsafe fn rows<const R: usize, const V: usize>(
     product: &Product<'_>,
     left: Left<'_>,
     range: Range<usize>,
-    (columns, k): (usize, usize),
-    from: usize,
+    (from, columns, k): (usize, usize, usize),
     (b, b_row): (*const f32, usize),
     c: *mut f32,
     c_row: usize,
