@@ -1,8 +1,8 @@
 //! Rates of the products of linear layers: the output, and the gradients of input and weight. `trainer/benches/products.py`
 //! runs it beside PyTorch.
 //!
-//! Arguments are layers such as `408x1024x4096`: rows, inputs, outputs. Prints billions of operations a second of each
-//! product, from the least of 15 times.
+//! Prints rows, inputs and outputs of each layer, and billions of operations a second of each product, from the least of
+//! 15 times. The work of the tape counts too.
 #![expect(clippy::print_stdout, reason = "a bench prints what it measured")]
 
 use std::time::Instant;
@@ -12,6 +12,18 @@ use models::{device, kernels};
 use protocol::stage::Backend;
 
 const TIMES: usize = 15;
+
+/// Rows, inputs, outputs: the quickstart's denoiser, MotionLCM, the tokenizer of MoMask, T2M-GPT.
+const LAYERS: [[usize; 3]; 8] = [
+    [576, 96, 192],
+    [576, 192, 96],
+    [400, 256, 1024],
+    [400, 1024, 256],
+    [512, 1536, 512],
+    [408, 1024, 1024],
+    [408, 1024, 4096],
+    [408, 4096, 1024],
+];
 
 fn tensor<const D: usize>(shape: [usize; D], device: &Device) -> Tensor<D> {
     let values: Vec<f32> = (0..shape.iter().product()).map(|i| (i as f32 * 0.37).sin()).collect();
@@ -31,9 +43,7 @@ fn least<F: FnOnce()>(mut make: impl FnMut() -> F) -> f64 {
 fn main() {
     let plain = device::open(Backend::Flex, 0).expect("built with flex");
     let tracked = plain.clone().autodiff();
-    for layer in std::env::args().skip(1).filter(|argument| !argument.starts_with('-')) {
-        let sizes: Vec<usize> = layer.split('x').map(|size| size.parse().expect("a number")).collect();
-        let [rows, inputs, outputs] = sizes[..] else { panic!("`{layer}`: expected rows x inputs x outputs") };
+    for [rows, inputs, outputs] in LAYERS {
         let (x, w) = (tensor([rows, inputs], &plain), tensor([outputs, inputs], &plain));
         let forward = least(|| {
             || {
@@ -51,6 +61,6 @@ fn main() {
             move || drop(loss.backward())
         });
         let rate = |seconds: f64| 2e-9 * (rows * inputs * outputs) as f64 / seconds;
-        println!("{layer} {:.1} {:.1} {:.1}", rate(forward), rate(input), rate(weight));
+        println!("{rows} {inputs} {outputs} {:.1} {:.1} {:.1}", rate(forward), rate(input), rate(weight));
     }
 }

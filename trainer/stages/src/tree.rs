@@ -82,7 +82,7 @@ impl Sums {
         }
     }
 
-    /// The sums for an exchange.
+    /// The sums for an exchange, which may take them.
     pub(crate) fn parts(&mut self) -> &mut [(Node, Vec<f32>)] {
         &mut self.nodes
     }

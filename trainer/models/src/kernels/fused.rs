@@ -105,7 +105,7 @@ thread_local! {
 /// end of the pass, and the parameters' memory would be needed once more.
 #[derive(Debug)]
 pub(crate) struct Collector {
-    /// The place of each parameter, and true once its gradient is there.
+    /// The place of each parameter, and true if its gradient is there.
     places: HashMap<NodeId, (Range<usize>, bool)>,
     values: Vec<f32>,
 }
