@@ -1,8 +1,8 @@
 """Rates of the products of linear layers beside PyTorch's, on one core.
 
-    trainer/benches/products.py PROGRAM [--rounds N]
+    python3 trainer/benches/products.py PROGRAM [--rounds N]
 
-PROGRAM is the bench `products` of the package `models`, as `cargo bench -p models --bench products --no-run` builds it.
+It needs PyTorch. PROGRAM is the bench `products` of the package `models`, as `cargo bench -p models --bench products --no-run` builds it.
 The two programs alternate, and the best rate of each counts, so that other work on the machine counts little.
 """
 
