@@ -4,8 +4,8 @@ Each row alternates between the programs for several rounds and takes medians. A
 store that has its inputs; its time is the stage's own by the wall, checkpoints and start included. With two workers
 PyTorch has the better of one process with two threads and two processes with gloo.
 
-At published sizes a few updates are compared. Stride's time of an update is the difference between a long and a short
-stage, so that start and checkpoint do not count. Memory is the largest resident set of a process.
+At published sizes a few updates are compared by their median, which a stage's log names. Start and checkpoints do not
+count. Memory is the largest resident set of a process.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import re
 import shutil
 import statistics
 import subprocess
@@ -192,6 +193,15 @@ def seconds_of(stage: dict[str, object], what: str) -> float:
     return float(stage["wall_s"])
 
 
+def step_of(store: Path, stage: str) -> float:
+    """Median seconds of a step of the last run, as the stage's log has it."""
+    lines = run([str(TRAINER), "logs", "@last", "--store", str(store), "--stage", stage])
+    found = re.findall(r", ([0-9.]+) s a step", lines)
+    if not found:
+        sys.exit(f"{stage}: its log has no time of a step; expected one in its last line")
+    return float(found[-1])
+
+
 def trained(size: Size, base: Path, training: Training, workers: int, seconds: float) -> float:
     """Samples per second of a stage, whose inputs are in `base`."""
     steps = max(20, round(training.pace * seconds * (1.5 if workers > 1 else 1)))
@@ -326,7 +336,7 @@ def recipe(published: Published) -> list[str]:
 
 def published(rounds: int) -> Iterator[str]:
     """One worker at published widths: updates and memory. Each table has one more row."""
-    few, many = 2, 6
+    few, many = 2, 9
     rows = []
     for case in PUBLISHED:
         settings = recipe(case)
@@ -334,13 +344,13 @@ def published(rounds: int) -> Iterator[str]:
         own, theirs, memory = [], [], [0.0, 0.0]
         for _ in range(rounds):
             with tempfile.TemporaryDirectory() as folder:
-                store, spent = Path(folder), []
+                store = Path(folder)
+                # The first run makes the inputs, whose peaks do not count.
                 for steps in (few, many):
                     stage, peak = stride(case.config, store, 1, case.stage, with_steps(settings, case.stage, steps))
-                    spent.append(seconds_of(stage, case.name))
-                    # The inputs' peaks count in the first run, not in the second.
-                    memory[0] = max(memory[0], peak) if steps == many else memory[0]
-                own.append((spent[1] - spent[0]) / (many - few))
+                seconds_of(stage, case.name)
+                own.append(step_of(store, case.stage))
+                memory[0] = max(memory[0], peak)
             line, peak = torch(case.program, case.case, 5, "--threads", "1", *batch)
             if case.program == KINDS:
                 check(case.name, case.config, case.stage, with_steps(settings, case.stage, few), line)

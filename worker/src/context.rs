@@ -142,7 +142,7 @@ impl HttpContext {
 
     /// Logs the end of the attempt.
     pub(crate) fn log_end(&mut self, outcome: &TaskOutcome) {
-        let line = stage_log::end(outcome, self.begun.elapsed(), self.spent, self.held.peak_memory());
+        let line = stage_log::end(outcome, self.begun.elapsed(), &self.spent, self.held.peak_memory());
         self.log(&line);
     }
 
@@ -430,10 +430,8 @@ impl GangContext for HttpContext {
             exchange::exchange(&mesh, &contribution, &|| held.halt(generation))
         };
         self.computes_since = Instant::now();
-        if mesh.size() > 1 {
-            self.spent.computing += computed;
-            self.spent.exchanging += self.computes_since - begun;
-        }
+        let exchanging = if mesh.size() > 1 { self.computes_since - begun } else { Duration::ZERO };
+        self.spent.add(steps.end - steps.start, computed, exchanging);
         match exchanged {
             Ok(total) => {
                 self.held.set_holds(Some(steps.end));

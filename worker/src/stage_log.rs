@@ -2,7 +2,7 @@
 //!
 //! Kinds add lines of their own through [`AttemptContext::log`](stages::context::AttemptContext::log).
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
 use std::time::{Duration, Instant};
 
 use protocol::message::{Assignment, Progress, Role, TaskOutcome};
@@ -60,32 +60,51 @@ pub(crate) fn regrouped(generation: impl std::fmt::Display, members: usize, step
 }
 
 /// Time that a member of a gang has spent on its steps.
-#[derive(Debug, Clone, Copy, Default)]
+#[derive(Debug, Clone, Default)]
 pub(crate) struct Spent {
-    /// From the end of an exchange to the next one.
-    pub(crate) computing: Duration,
+    /// From the end of an exchange to the next one, in a gang of several members.
+    computing: Duration,
     /// In exchanges with other members, waiting included.
-    pub(crate) exchanging: Duration,
+    exchanging: Duration,
+    /// Seconds of each of the newest steps.
+    steps: VecDeque<f64>,
 }
 
 impl Spent {
-    /// The exchanges' share in percent; `None` for a member that was always alone.
-    fn exchange(self) -> Option<f64> {
+    const NEWEST: usize = 1001;
+
+    /// Adds an exchange after `computed` on `steps` steps. `exchanged` is zero for a member that is alone.
+    pub(crate) fn add(&mut self, steps: u64, computed: Duration, exchanged: Duration) {
+        if !exchanged.is_zero() {
+            self.computing += computed;
+            self.exchanging += exchanged;
+        }
+        if self.steps.len() == Self::NEWEST {
+            self.steps.pop_front();
+        }
+        self.steps.push_back((computed + exchanged).as_secs_f64() / steps.max(1) as f64);
+    }
+
+    /// The median time of a step, and the exchanges' share for a member that was not always alone.
+    fn line(&self) -> String {
+        let mut steps: Vec<f64> = self.steps.iter().copied().collect();
+        steps.sort_by(f64::total_cmp);
+        let median = steps.get(steps.len() / 2).map(|step| format!(", {step:.4} s a step")).unwrap_or_default();
         let all = (self.computing + self.exchanging).as_secs_f64();
-        (!self.exchanging.is_zero()).then(|| 100.0 * self.exchanging.as_secs_f64() / all)
+        let share = (!self.exchanging.is_zero()).then(|| 100.0 * self.exchanging.as_secs_f64() / all);
+        median + &share.map(|share| format!(" ({share:.0} % in exchanges)")).unwrap_or_default()
     }
 }
 
 /// The last line of an attempt. `peak` is the highest memory of the process, in bytes.
-pub(crate) fn end(outcome: &TaskOutcome, took: Duration, spent: Spent, peak: Option<u64>) -> String {
+pub(crate) fn end(outcome: &TaskOutcome, took: Duration, spent: &Spent, peak: Option<u64>) -> String {
     let seconds = took.as_secs_f64();
     match outcome {
         TaskOutcome::Finished { output, metrics } => {
             let values = values(metrics);
             let memory = peak.map(|bytes| format!(" with at most {} of memory", size(bytes))).unwrap_or_default();
-            let exchange = spent.exchange().map(|share| format!(" ({share:.0} % of its steps in exchanges)"));
-            let exchange = exchange.unwrap_or_default();
-            format!("finished in {seconds:.1} s{exchange}{memory}: {}{values}", output.short())
+            let steps = spent.line();
+            format!("finished in {seconds:.1} s{steps}{memory}: {}{values}", output.short())
         }
         TaskOutcome::Resolved { digests } => {
             format!("digested {} in {seconds:.1} s", counted(digests.len() as u64, "input"))
@@ -158,16 +177,23 @@ mod tests {
     }
 
     #[test]
-    fn the_end_tells_the_share_of_exchanges_in_a_gang() {
+    fn the_end_tells_the_time_of_a_step_and_the_share_of_exchanges() {
         let output = Digest::of(b"x");
         let outcome = TaskOutcome::Finished { output, metrics: BTreeMap::new() };
-        let mut spent = Spent { computing: Duration::from_secs(3), exchanging: Duration::ZERO };
-        let alone = end(&outcome, Duration::from_secs(4), spent, None);
-        assert_eq!(alone, format!("finished in 4.0 s: {}", output.short()));
-        spent.exchanging = Duration::from_secs(1);
-        let line = end(&outcome, Duration::from_secs(4), spent, Some(1 << 20));
-        let expected = "finished in 4.0 s (25 % of its steps in exchanges) with at most 1.0 MiB of memory";
+        let took = Duration::from_secs(9);
+        let mut spent = Spent::default();
+        assert_eq!(end(&outcome, took, &spent, None), format!("finished in 9.0 s: {}", output.short()));
+        for milliseconds in [250, 4000, 270] {
+            spent.add(1, Duration::from_millis(milliseconds), Duration::ZERO);
+        }
+        let alone = end(&outcome, took, &spent, None);
+        assert_eq!(alone, format!("finished in 9.0 s, 0.2700 s a step: {}", output.short()));
+        spent.add(10, Duration::from_millis(2250), Duration::from_millis(750));
+        let line = end(&outcome, took, &spent, Some(1 << 20));
+        let expected = "finished in 9.0 s, 0.3000 s a step (25 % in exchanges) with at most 1.0 MiB of memory";
         assert_eq!(line, format!("{expected}: {}", output.short()));
+        (0..3000).for_each(|_| spent.add(1, Duration::ZERO, Duration::ZERO));
+        assert_eq!(spent.steps.len(), Spent::NEWEST);
     }
 
     #[test]

@@ -30,6 +30,7 @@ mod rms;
 pub(crate) mod simd;
 #[cfg(feature = "flex")]
 mod tile;
+mod work;
 
 pub(crate) use attention::HIDDEN;
 pub use attention::{KeyMask, causal_attention, cross_attention, self_attention};
@@ -46,6 +47,7 @@ pub use mish::mish;
 pub use norm::{add_layer_norm, layer_norm, leaky_layer_norm};
 pub use relu::leaky_relu;
 pub use rms::{rms_norm, rms_norm_silu};
+pub use work::Work;
 
 /// Gives `to` the values of `x` in row-major order. On flex no value is copied, unless `x` is a view; `into_data` copies
 /// twice.

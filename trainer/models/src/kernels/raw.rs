@@ -4,8 +4,12 @@ mod matrix;
 #[cfg(target_arch = "x86_64")]
 mod wide;
 
+use std::time::Instant;
+
 use matrix::Product;
 pub(super) use matrix::{Start, View};
+
+use super::work::Work;
 
 /// Terms that are summed before they are added to the result. The general product would divide longer sums than 512 by the
 /// sizes of the processor's caches, so that the bits depended on them. A panel of so many rows stays in the second-level
@@ -27,7 +31,7 @@ impl Product<'_> {
         #[expect(unsafe_code, reason = "the product is written into memory that is not zeroed first")]
         // SAFETY: the extents of the operands were checked, `c` has room for m n elements, and all of them are written.
         unsafe {
-            self.multiply(c.as_mut_ptr(), View::rows(n));
+            self.count(c.as_mut_ptr(), View::rows(n));
             c.set_len(m * n);
         }
         c
@@ -48,8 +52,20 @@ impl Product<'_> {
         // SAFETY: all elements that the strides reach lie inside the slices, and `c` overlaps no operand because it is
         // borrowed exclusively.
         unsafe {
-            self.multiply(c.as_mut_ptr(), cv);
+            self.count(c.as_mut_ptr(), cv);
         }
+    }
+
+    /// Computes the product, and counts it in [`Work`].
+    ///
+    /// # Safety
+    /// As for [`multiply`](Self::multiply).
+    #[expect(unsafe_code, reason = "the product works on strided pointers")]
+    unsafe fn count(self, c: *mut f32, cv: View) {
+        let begun = Instant::now();
+        // SAFETY: as promised by the caller.
+        unsafe { self.multiply(c, cv) };
+        Work::add(self.sizes, begun);
     }
 
     /// Adds up [`TERMS`] terms at a time.

@@ -1,9 +1,11 @@
 //! The loop: exchanges slices or replicas, updates the state, and saves it when a checkpoint is due.
 
 use std::ops::Range;
+use std::time::{Duration, Instant};
 
 use burn::tensor::Device;
 use models::flat::recycle;
+use models::kernels::Work;
 use protocol::stage::Training;
 use protocol::{Digest, limits};
 
@@ -77,6 +79,10 @@ struct TrainingLoop<'a> {
     save_is_due: bool,
     stop: bool,
     recent: Recent,
+    /// Time of slices and updates, without exchanges and saves.
+    computing: Duration,
+    /// The thread's matrix products when the training began.
+    work: Work,
 }
 
 impl<'a> TrainingLoop<'a> {
@@ -120,6 +126,8 @@ impl<'a> TrainingLoop<'a> {
             save_is_due: false,
             stop: false,
             recent: Recent::default(),
+            computing: Duration::ZERO,
+            work: Work::so_far(),
         };
         run.load();
         Ok(run)
@@ -153,7 +161,9 @@ impl<'a> TrainingLoop<'a> {
         // Large results are added one by one: in memory there are few at once.
         let at_once = if layout.len() >= self.cx.large() { 1 } else { missing.len().max(1) };
         for parts in missing.chunks(at_once) {
+            let begun = Instant::now();
             let results = self.compute(layout, parts)?;
+            self.computing += begun.elapsed();
             parts.iter().zip(results).for_each(|(part, values)| self.done.insert(*part, values));
         }
         match self.cx.exchange(self.coming(), self.parts, self.done.parts())? {
@@ -198,6 +208,7 @@ impl<'a> TrainingLoop<'a> {
 
     /// Applies the sum over all parts and records the values of the step, or the means of the round.
     fn update(&mut self, layout: &Layout, sum: Vec<f32>) -> Result<(), StageError> {
+        let begun = Instant::now();
         let coming = self.coming();
         let (terms, applied) = if let Some(averaging) = self.averaging {
             let averaged = averaging.apply(&mut self.state, &coming, sum);
@@ -211,6 +222,7 @@ impl<'a> TrainingLoop<'a> {
             recycle(sum);
             (terms, applied)
         };
+        self.computing += begun.elapsed();
 
         let values = self.terms.iter().copied().zip(terms.into_iter().map(f64::from));
         let mut values: Vec<(&str, f64)> = values.collect();
@@ -289,9 +301,37 @@ impl<'a> TrainingLoop<'a> {
 
     fn end(mut self) -> Trained {
         self.state.fetch();
+        if let Some(line) = products(Work::so_far() - self.work, self.computing) {
+            self.cx.log(&line);
+        }
         if self.state.step < self.steps {
             return Trained::Yielded { at: self.state.step };
         }
         Trained::Finished { state: self.state, metrics: self.recent.means() }
+    }
+}
+
+/// A line on the matrix products of the fused kernels in `computing`; other backends have none.
+fn products(work: Work, computing: Duration) -> Option<String> {
+    let share = 100.0 * work.time.as_secs_f64() / computing.as_secs_f64();
+    let rate = work.operations as f64 / work.time.as_secs_f64() / 1e9;
+    let known = work.operations > 0 && share.is_finite() && rate.is_finite();
+    known.then(|| {
+        format!("matrix products took {share:.0} % of its computation, at {rate:.0} billion operations a second")
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_share_of_products_is_of_computation() {
+        let work = Work { operations: 260_000_000_000, time: Duration::from_secs(2) };
+        let line = products(work, Duration::from_secs(4));
+        let expected = "matrix products took 50 % of its computation, at 130 billion operations a second";
+        assert_eq!(line.as_deref(), Some(expected));
+        assert_eq!(products(Work::default(), Duration::from_secs(4)), None);
+        assert_eq!(products(work, Duration::ZERO), None);
     }
 }
