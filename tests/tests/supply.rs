@@ -10,7 +10,7 @@ use serde_json::Value;
 
 /// Largest number of packages in a build of the trainer. Each costs time in every build and may bring faults (decision
 /// 0033).
-const MOST_PACKAGES: usize = 427;
+const MOST_PACKAGES: usize = 430;
 
 /// The texts of `key = [...]` in `deny.toml`, or of a field of its tables.
 fn listed<'a>(deny: &'a str, begin: &str, before: &str) -> BTreeSet<&'a str> {

@@ -11,6 +11,9 @@ mod report;
 
 use std::process::ExitCode;
 
+#[global_allocator]
+static ALLOCATOR: worker::process::Allocator = worker::process::Allocator;
+
 fn main() -> ExitCode {
     registry::failpoints::arm_from_env();
     coordinator::failpoints::arm_from_env();

@@ -4,6 +4,9 @@ use std::process::ExitCode;
 
 use clap::Parser;
 
+#[global_allocator]
+static ALLOCATOR: worker::process::Allocator = worker::process::Allocator;
+
 /// Computes stages for a Stride coordinator.
 #[derive(Debug, Parser)]
 #[command(name = "worker", version)]
