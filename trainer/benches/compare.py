@@ -193,13 +193,15 @@ def seconds_of(stage: dict[str, object], what: str) -> float:
     return float(stage["wall_s"])
 
 
-def step_of(store: Path, stage: str) -> float:
-    """Median seconds of a step of the last run, as the stage's log has it."""
+def logged(store: Path, stage: str) -> tuple[float, str, str]:
+    """Median seconds of a step of the last run, the share of its matrix products in percent, and their rate in billions of
+    operations a second, as the stage's log has them."""
     lines = run([str(TRAINER), "logs", "@last", "--store", str(store), "--stage", stage])
-    found = re.findall(r", ([0-9.]+) s a step", lines)
-    if not found:
-        sys.exit(f"{stage}: its log has no time of a step; expected one in its last line")
-    return float(found[-1])
+    steps = re.findall(r", ([0-9.]+) s a step", lines)
+    products = re.findall(r"matrix products took ([0-9]+) % of its computation, at ([0-9]+) billion", lines)
+    if not steps or not products:
+        sys.exit(f"{stage}: its log has no time of a step or of products; expected both in its last lines")
+    return float(steps[-1]), *products[-1]
 
 
 def trained(size: Size, base: Path, training: Training, workers: int, seconds: float) -> float:
@@ -349,7 +351,8 @@ def published(rounds: int) -> Iterator[str]:
                 for steps in (few, many):
                     stage, peak = stride(case.config, store, 1, case.stage, with_steps(settings, case.stage, steps))
                 seconds_of(stage, case.name)
-                own.append(step_of(store, case.stage))
+                step, *products = logged(store, case.stage)
+                own.append(step)
                 memory[0] = max(memory[0], peak)
             line, peak = torch(case.program, case.case, 5, "--threads", "1", *batch)
             if case.program == KINDS:
@@ -357,9 +360,9 @@ def published(rounds: int) -> Iterator[str]:
             theirs.append(line["step_ms"] / 1e3)
             memory[1] = max(memory[1], peak)
         mine, other = statistics.median(own), statistics.median(theirs)
-        rows.append([case.name, f"{mine:.2f}", f"{other:.2f}", f"{other / mine:.2f}", f"{memory[0]:.1f}", f"{memory[1]:.1f}"])
+        rows.append([case.name, f"{mine:.2f}", f"{other:.2f}", f"{other / mine:.2f}", f"{memory[0]:.1f}", f"{memory[1]:.1f}", *products])
         print(rows[-1], flush=True)
-        yield table(["published widths, 8 examples", "Stride, s", "tuned, s", "times faster", "Stride, GB", "PyTorch, GB"], rows)
+        yield table(["published widths, 8 examples", "Stride, s", "tuned, s", "times faster", "Stride, GB", "PyTorch, GB", "products, %", "their rate"], rows)
 
 
 def main() -> None:
@@ -404,7 +407,8 @@ def main() -> None:
     if asked.sizes != "quickstart":
         what = (
             "## Published widths\n\nOne worker and one thread, an update of eight examples in one slice. "
-            "Memory is the largest resident set of a process.\n\n"
+            "Memory is the largest resident set of a process. The share of Stride's matrix products is of computation, their rate in "
+            "billions of operations a second.\n\n"
         )
         rows = ""
         for rows in published(asked.rounds):
