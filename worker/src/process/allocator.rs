@@ -1,14 +1,15 @@
 //! The allocator of a program with several roles: mimalloc if it computes, the system's otherwise.
 //!
 //! Every operation of a training allocates buffers of up to megabytes. With the system's allocator trainings take some 5 %
-//! more time (decision 0034). In a server, mimalloc keeps more of what passes through it than a checkpoint has bytes.
+//! more time (decision 0034). A server with mimalloc grew by more than the bytes of a checkpoint that it took in. Not its
+//! job: the settings of the two allocators.
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use mimalloc::MiMalloc;
 
-/// Whether this process computes. It is set before the first allocation, or never.
+/// True in a process that computes. It is set before the first allocation, or never.
 static COMPUTES: AtomicBool = AtomicBool::new(false);
 
 /// mimalloc in a process whose first argument is `worker`, `join`, `generate`, `demo` or `time`, the system's allocator in
@@ -47,6 +48,12 @@ unsafe impl GlobalAlloc for Allocator {
     }
 }
 
+/// Returns true if a program with this first argument computes.
+#[cfg(all(target_os = "linux", target_env = "gnu"))]
+fn computes(first: &std::ffi::CStr) -> bool {
+    [c"worker", c"join", c"generate", c"demo", c"time"].contains(&first)
+}
+
 /// The C library passes the arguments to such functions before `main`, when nothing has been allocated yet. Others than
 /// glibc do not, and keep the system's allocator.
 #[cfg(all(target_os = "linux", target_env = "gnu"))]
@@ -68,7 +75,17 @@ mod choice {
         #[expect(unsafe_code, reason = "arguments of a program are pointers")]
         // SAFETY: there are `count` arguments, and each is a text that ends with a zero.
         let first = unsafe { CStr::from_ptr(*arguments.add(1)) };
-        let computes = [c"worker", c"join", c"generate", c"demo", c"time"].contains(&first);
-        super::COMPUTES.store(computes, Ordering::Relaxed);
+        super::COMPUTES.store(super::computes(first), Ordering::Relaxed);
+    }
+}
+
+#[cfg(all(test, target_os = "linux", target_env = "gnu"))]
+mod tests {
+    use super::computes;
+
+    #[test]
+    fn workers_and_samplers_compute_and_servers_do_not() {
+        assert!([c"worker", c"join", c"generate", c"demo", c"time"].into_iter().all(computes));
+        assert!(![c"serve", c"run", c"submit", c"registry", c"", c"workers"].into_iter().any(computes));
     }
 }
