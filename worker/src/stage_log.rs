@@ -66,12 +66,17 @@ pub(crate) struct Spent {
     computing: Duration,
     /// In exchanges with other members, waiting included.
     exchanging: Duration,
-    /// Seconds of each of the newest steps.
-    steps: VecDeque<f64>,
+    /// Steps and time of the round under way.
+    round: (u64, Duration),
+    /// Mean seconds of a step in each of the newest rounds.
+    rounds: VecDeque<f64>,
 }
 
 impl Spent {
     const NEWEST: usize = 1001;
+
+    /// Length of a round: steps of milliseconds differ by what the rest of the machine does.
+    const ROUND: Duration = Duration::from_millis(250);
 
     /// Adds an exchange after `computed` on `steps` steps. `exchanged` is zero for a member that is alone.
     pub(crate) fn add(&mut self, steps: u64, computed: Duration, exchanged: Duration) {
@@ -79,17 +84,26 @@ impl Spent {
             self.computing += computed;
             self.exchanging += exchanged;
         }
-        if self.steps.len() == Self::NEWEST {
-            self.steps.pop_front();
+        let (done, took) = (self.round.0 + steps, self.round.1 + computed + exchanged);
+        self.round = (done, took);
+        if took < Self::ROUND {
+            return;
         }
-        self.steps.push_back((computed + exchanged).as_secs_f64() / steps.max(1) as f64);
+        self.round = Default::default();
+        if self.rounds.len() == Self::NEWEST {
+            self.rounds.pop_front();
+        }
+        self.rounds.push_back(took.as_secs_f64() / done.max(1) as f64);
     }
 
-    /// The median time of a step, and the exchanges' share for a member that was not always alone.
+    /// The time of a step as the median of rounds, and the exchanges' share for a member that was not always alone.
     fn line(&self) -> String {
-        let mut steps: Vec<f64> = self.steps.iter().copied().collect();
-        steps.sort_by(f64::total_cmp);
-        let median = steps.get(steps.len() / 2).map(|step| format!(", {step:.4} s a step")).unwrap_or_default();
+        let mut rounds: Vec<f64> = self.rounds.iter().copied().collect();
+        if rounds.is_empty() && self.round.0 > 0 {
+            rounds.push(self.round.1.as_secs_f64() / self.round.0 as f64);
+        }
+        rounds.sort_by(f64::total_cmp);
+        let median = rounds.get(rounds.len() / 2).map(|step| format!(", {step:.4} s a step")).unwrap_or_default();
         let all = (self.computing + self.exchanging).as_secs_f64();
         let share = (!self.exchanging.is_zero()).then(|| 100.0 * self.exchanging.as_secs_f64() / all);
         median + &share.map(|share| format!(" ({share:.0} % in exchanges)")).unwrap_or_default()
@@ -192,8 +206,22 @@ mod tests {
         let line = end(&outcome, took, &spent, Some(1 << 20));
         let expected = "finished in 9.0 s, 0.3000 s a step (25 % in exchanges) with at most 1.0 MiB of memory";
         assert_eq!(line, format!("{expected}: {}", output.short()));
-        (0..3000).for_each(|_| spent.add(1, Duration::ZERO, Duration::ZERO));
-        assert_eq!(spent.steps.len(), Spent::NEWEST);
+        (0..3000).for_each(|_| spent.add(1, Spent::ROUND, Duration::ZERO));
+        assert_eq!(spent.rounds.len(), Spent::NEWEST);
+    }
+
+    #[test]
+    fn short_steps_are_measured_in_rounds() {
+        let line = |spent: &Spent| spent.line();
+        let mut spent = Spent::default();
+        spent.add(1, Duration::from_millis(40), Duration::ZERO);
+        assert_eq!(line(&spent), ", 0.0400 s a step", "no round has ended");
+        // Every fifth step takes ten times as long: a median of single steps would leave these out.
+        let mut spent = Spent::default();
+        for step in 0..100 {
+            spent.add(1, Duration::from_millis(if step % 5 == 0 { 210 } else { 10 }), Duration::ZERO);
+        }
+        assert_eq!(line(&spent), ", 0.0500 s a step");
     }
 
     #[test]
