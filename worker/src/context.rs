@@ -11,7 +11,7 @@ use protocol::message::{Progress, StageTask, TaskOutcome};
 use protocol::{ArtifactKind, Digest, Manifest};
 use stages::context::{Adopted, AttemptContext, Checkpoint, ContextError, Exchange, GangContext, Rendezvous};
 use stages::external::DataAccess;
-use stages::tree::Node;
+use stages::tree::{Node, tree_sum};
 
 use crate::active_assignment::ActiveAssignment;
 use crate::blobs::HttpBlobs;
@@ -422,15 +422,17 @@ impl GangContext for HttpContext {
         let durable = self.telemetry.durable();
         let held = self.held.clone();
         let begun = Instant::now();
-        let exchanged = if mesh.size() == 1 && matches!(&own[..], [(node, _)] if *node == (0..slices)) {
+        let exchanged = if mesh.size() == 1 {
             // The sum may be gigabytes; it is not copied.
-            Ok(Total { sum: std::mem::take(&mut parts[0].1), drain, durable })
+            let own = parts.iter_mut().map(|(node, part)| (node.clone(), std::mem::take(part)));
+            Ok(Total { sum: tree_sum(slices, own), drain, durable })
         } else {
             let contribution = Contribution { step, slices, parts: own, drain, saves, computed, durable };
             exchange::exchange(&mesh, &contribution, &|| held.halt(generation))
         };
         self.computes_since = Instant::now();
-        let exchanging = if mesh.size() > 1 { self.computes_since - begun } else { Duration::ZERO };
+        let took = self.computes_since - begun;
+        let (computed, exchanging) = if mesh.size() > 1 { (computed, took) } else { (computed + took, Duration::ZERO) };
         self.spent.add(steps.end - steps.start, computed, exchanging);
         match exchanged {
             Ok(total) => {

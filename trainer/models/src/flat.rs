@@ -229,7 +229,7 @@ impl ModuleMapper for Cut<'_> {
 const ROOM: usize = 4096;
 
 /// Buffers that a thread keeps for its next gradients.
-const SPARES: usize = 2;
+const SPARES: usize = 4;
 
 thread_local! {
     static SPARE: RefCell<Vec<Vec<f32>>> = const { RefCell::new(Vec::new()) };
@@ -244,8 +244,8 @@ pub fn recycle(buffer: Vec<f32>) {
     });
 }
 
-/// A buffer of `len` values of any content. A few thousand can be appended without a copy.
-fn buffer(len: usize) -> Vec<f32> {
+/// A buffer of `len` values of any content. A few thousand can be appended without a copy. [`recycle`] it.
+pub fn buffer(len: usize) -> Vec<f32> {
     let fits = |spare: &Vec<f32>| (len..=len + 2 * ROOM).contains(&spare.capacity());
     let spare = SPARE.with_borrow_mut(|spares| spares.iter().position(fits).map(|at| spares.swap_remove(at)));
     let mut buffer = spare.unwrap_or_else(|| Vec::with_capacity(len + ROOM));

@@ -12,6 +12,7 @@ use std::ops::Range;
 use std::time::{Duration, Instant};
 
 use bytemuck::cast_slice;
+use models::flat;
 use protocol::message::LossCause;
 
 use super::frame::{Frame, Head, Kind, PIECE, Payload};
@@ -57,12 +58,6 @@ pub(crate) fn exchange(mesh: &Mesh, contribution: &Contribution<'_>, interrupt: 
     let own = mesh.config.rank;
     let size = mesh.size();
     let root = 0..contribution.slices;
-    if size == 1 {
-        let length = contribution.parts.first().map_or(0, |(_, part)| part.len());
-        let mut sum = vec![0.0; length];
-        tree::sum(&root, &contribution.parts, &mut sum);
-        return Ok(Total { sum, drain: contribution.drain, durable: contribution.durable });
-    }
     let barrier = format!("barrier `exchange` of step {} in generation {}", contribution.step, mesh.config.generation);
     let halt = interrupt;
     let interrupt: Interrupt<'_> = &|| {
@@ -89,8 +84,9 @@ pub(crate) fn exchange(mesh: &Mesh, contribution: &Contribution<'_>, interrupt: 
         contribution.parts.iter().map(|(slice, part)| (slice.clone(), &part[chunk.clone()])).collect();
     known.extend(received.sums.iter().map(|(node, sum)| (node.clone(), sum.as_slice())));
     known.sort_by_key(|(node, _)| node.start);
-    let mut sum = vec![0.0; length];
+    let mut sum = flat::buffer(length);
     tree::sum(&root, &known, &mut sum[chunk.clone()]);
+    received.sums.into_iter().for_each(|(_, part)| flat::recycle(part));
     gather(mesh, &barrier, contribution, &mut sum, interrupt)?;
     if let Some(slow) = mesh.pace.end(mesh.others()) {
         mesh.complain(slow);
@@ -190,14 +186,14 @@ fn receive_part(
     interrupt: Interrupt<'_>,
 ) -> Result<(Option<Instant>, Vec<f32>), Halt> {
     let mut came = None;
-    let mut numbers = Vec::with_capacity(chunk.len());
+    let mut numbers = Vec::new();
     for (p, range) in pieces(chunk).enumerate() {
         let (at, frame) = mesh.next_timed(peer, barrier, interrupt)?;
         came = Some(at);
         let unexpected = || disagree(mesh, barrier, peer, &format!("sends an unexpected part at node {n}, piece {p}"));
         let place = (frame.a, frame.b) == (number(n), number(p));
         if place && p == 0 && frame.kind == Kind::SharedPart {
-            numbers = vec![0.0; chunk.len()];
+            numbers = flat::buffer(chunk.len());
             if !mesh.memory(peer).read_parts(n * chunk.len(), &mut numbers) {
                 return Err(unexpected());
             }
@@ -205,7 +201,12 @@ fn receive_part(
         }
         let frame = expect(frame, Kind::Part, mesh, peer)?;
         let part = floats(frame).filter(|part| place && part.len() == range.len()).ok_or_else(unexpected)?;
-        if numbers.is_empty() && range.len() == chunk.len() { numbers = part } else { numbers.extend(part) }
+        if range.len() == chunk.len() {
+            numbers = part;
+        } else {
+            numbers.reserve_exact(chunk.len() - numbers.len());
+            numbers.extend(part);
+        }
     }
     Ok((came, numbers))
 }
@@ -274,18 +275,24 @@ fn send_parts(
     let greeting = Greeting { length: length as u64, durable: contribution.durable, announced };
     let flags = [(contribution.drain, DRAIN), (contribution.saves, SAVES), (memory.has_incoming(), MAPPED)];
     let flags = flags.iter().filter(|(is_set, _)| *is_set).fold(0, |all, (_, flag)| all | flag);
-    let head = Head::new(Kind::Begin, step, number(contribution.slices), flags);
-    mesh.send(peer, barrier, head, &greeting.to_bytes(), interrupt)?;
     let sum = |node: &Node, range: Range<usize>, out: &mut [f32]| {
         let parts = &contribution.parts[within(&contribution.parts, node)];
         let leaves: Vec<(Node, &[f32])> =
             parts.iter().map(|(slice, part)| (slice.clone(), &part[range.clone()])).collect();
         tree::sum(node, &leaves, out);
     };
+    // Shared parts are written before the peer hears of them, so that it never waits for one after the greeting.
+    let shared = memory.outgoing().filter(|_| !chunk.is_empty()).map(|memory| {
+        for (n, node) in nodes.iter().enumerate() {
+            sum(node, chunk.clone(), memory.parts(n * chunk.len()..(n + 1) * chunk.len()));
+        }
+    });
+    let is_shared = shared.is_some();
+    let head = Head::new(Kind::Begin, step, number(contribution.slices), flags);
+    mesh.send(peer, barrier, head, &greeting.to_bytes(), interrupt)?;
     let mut piece = vec![0.0f32; PIECE.min(chunk.len())];
     for (n, node) in nodes.iter().enumerate() {
-        if let Some(memory) = memory.outgoing().filter(|_| !chunk.is_empty()) {
-            sum(node, chunk.clone(), memory.parts(n * chunk.len()..(n + 1) * chunk.len()));
+        if is_shared {
             let head = Head::new(Kind::SharedPart, step, number(n), 0);
             mesh.send(peer, barrier, head, &[], interrupt)?;
             continue;

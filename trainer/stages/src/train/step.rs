@@ -44,8 +44,9 @@ impl Layout {
                 self.gradients, self.terms, self.sums
             )));
         }
-        // The first gradient may be gigabytes. It is not copied if the rest fits behind it.
-        let mut gradients = result.gradients.into_iter();
+        // The first gradient may be gigabytes. It is not copied if the rest fits behind it. A network that is not trained has
+        // an empty one.
+        let mut gradients = result.gradients.into_iter().filter(|gradient| !gradient.is_empty());
         let mut flat = gradients.next().unwrap_or_default();
         gradients.for_each(|gradient| flat.extend(gradient));
         flat.extend(result.terms);
