@@ -81,9 +81,9 @@ mod kernel {
     use burn::backend::flex::FlexTensor;
 
     use super::Sweep;
-    use crate::kernels::fused::{Fused, make, shape, slice};
+    use crate::kernels::fused::{Fused, Places, column_sums, make, shape, slice};
     use crate::kernels::raw::{View, affine, product};
-    use crate::kernels::simd::{add_rows, multiversion, repeat_row};
+    use crate::kernels::simd::{multiversion, repeat_row};
 
     /// A convolution, with a bias if there are three inputs.
     #[derive(Debug, Clone)]
@@ -188,13 +188,24 @@ mod kernel {
         out
     }
 
-    /// [outer, taps, channels] -> [outer, channels, taps].
-    fn taps_last(weight: &[f32], channels: usize, taps: usize) -> Vec<f32> {
-        let mut out = vec![0.0; weight.len()];
+    /// A gradient [outer, taps, channels] as one of `shape` [outer, channels, taps]: written to `place` if there is one, and
+    /// returned otherwise.
+    fn taps_last(gradient: &[f32], shape: &[usize], place: Option<&mut [f32]>) -> Option<FlexTensor> {
+        let Some(place) = place else {
+            let mut out = vec![0.0; gradient.len()];
+            turn_all_back(gradient, shape, &mut out);
+            return Some(make(out, shape));
+        };
+        turn_all_back(gradient, shape, place);
+        None
+    }
+
+    fn turn_all_back(weight: &[f32], shape: &[usize], out: &mut [f32]) {
+        let [_, channels, taps] = *shape else { unreachable!("a weight has three axes") };
         match taps {
-            3 => turn_back::<3>(weight, channels, &mut out),
-            4 => turn_back::<4>(weight, channels, &mut out),
-            5 => turn_back::<5>(weight, channels, &mut out),
+            3 => turn_back::<3>(weight, channels, out),
+            4 => turn_back::<4>(weight, channels, out),
+            5 => turn_back::<5>(weight, channels, out),
             _ => {
                 for (i, out) in out.iter_mut().enumerate() {
                     let (row, at) = (i / (channels * taps), i % (channels * taps));
@@ -202,7 +213,6 @@ mod kernel {
                 }
             }
         }
-        out
     }
 
     /// The common numbers of taps are constants, so that the compiler can vectorise.
@@ -230,12 +240,6 @@ mod kernel {
         }
     }
 
-    fn column_sums(rows: &[f32], width: usize) -> FlexTensor {
-        let mut sum = vec![0.0; width];
-        add_rows(&mut sum, rows);
-        make(sum, &[width])
-    }
-
     impl Conv {
         fn windows(&self, x: &FlexTensor, w: &FlexTensor) -> Windows {
             let [batch, frames, channels] = shape(x)[..] else { unreachable!("a sequence has three axes") };
@@ -257,8 +261,15 @@ mod kernel {
             make(y, &[windows.batch, windows.count, out])
         }
 
-        /// The gradients of input and weight.
-        fn gradients(&self, x: &FlexTensor, w: &FlexTensor, dy: &[f32], wanted: [bool; 2]) -> [Option<FlexTensor>; 2] {
+        /// The gradients of input and weight; the weight's is written to its place if there is one.
+        fn gradients(
+            &self,
+            x: &FlexTensor,
+            w: &FlexTensor,
+            dy: &[f32],
+            wanted: [bool; 2],
+            place: Option<&mut [f32]>,
+        ) -> [Option<FlexTensor>; 2] {
             let windows = self.windows(x, w);
             let (out, width) = (shape(w)[0], windows.width());
             let dx = || {
@@ -271,9 +282,9 @@ mod kernel {
             let dw = || {
                 let rows = windows.gather(slice(x));
                 let dw = product((out, width, windows.rows()), dy, View::rows(out).t(), &rows, View::rows(width));
-                make(taps_last(&dw, windows.channels, windows.taps), &shape(w))
+                taps_last(&dw, &shape(w), place)
             };
-            [wanted[0].then(dx), wanted[1].then(dw)]
+            [wanted[0].then(dx), wanted[1].then(dw).flatten()]
         }
     }
 
@@ -284,8 +295,14 @@ mod kernel {
             (Conv::value(self, &x, &w, None), (x, w))
         }
 
-        fn backward(&self, (x, w): Self::Kept, dy: FlexTensor, wanted: [bool; 2]) -> [Option<FlexTensor>; 2] {
-            self.gradients(&x, &w, slice(&dy), wanted)
+        fn backward_to(
+            &self,
+            (x, w): Self::Kept,
+            dy: FlexTensor,
+            wanted: [bool; 2],
+            [_, place]: Places<'_, 2>,
+        ) -> [Option<FlexTensor>; 2] {
+            self.gradients(&x, &w, slice(&dy), wanted, place)
         }
     }
 
@@ -296,10 +313,16 @@ mod kernel {
             (Conv::value(self, &x, &w, Some(&bias)), (x, w))
         }
 
-        fn backward(&self, (x, w): Self::Kept, dy: FlexTensor, wanted: [bool; 3]) -> [Option<FlexTensor>; 3] {
+        fn backward_to(
+            &self,
+            (x, w): Self::Kept,
+            dy: FlexTensor,
+            wanted: [bool; 3],
+            [_, of_weight, of_bias]: Places<'_, 3>,
+        ) -> [Option<FlexTensor>; 3] {
             let dy = slice(&dy);
-            let [dx, dw] = self.gradients(&x, &w, dy, [wanted[0], wanted[1]]);
-            [dx, dw, wanted[2].then(|| column_sums(dy, shape(&w)[0]))]
+            let [dx, dw] = self.gradients(&x, &w, dy, [wanted[0], wanted[1]], of_weight);
+            [dx, dw, wanted[2].then(|| column_sums(dy, shape(&w)[0], of_bias)).flatten()]
         }
     }
 
@@ -326,7 +349,13 @@ mod kernel {
             (make(y, &[windows.batch, windows.frames, windows.channels]), (x, w))
         }
 
-        fn backward(&self, (x, w): Self::Kept, dy: FlexTensor, wanted: [bool; 3]) -> [Option<FlexTensor>; 3] {
+        fn backward_to(
+            &self,
+            (x, w): Self::Kept,
+            dy: FlexTensor,
+            wanted: [bool; 3],
+            [_, of_weight, of_bias]: Places<'_, 3>,
+        ) -> [Option<FlexTensor>; 3] {
             let windows = self.windows(&x, &w);
             let (inner, width) = (shape(&w)[0], windows.width());
             let rows = windows.gather(slice(&dy));
@@ -338,10 +367,10 @@ mod kernel {
             let dw = || {
                 let sizes = (inner, width, windows.rows());
                 let dw = product(sizes, slice(&x), View::rows(inner).t(), &rows, View::rows(width));
-                make(taps_last(&dw, windows.channels, windows.taps), &shape(&w))
+                taps_last(&dw, &shape(&w), of_weight)
             };
-            let bias = || column_sums(slice(&dy), windows.channels);
-            [wanted[0].then(dx), wanted[1].then(dw), wanted[2].then(bias)]
+            let bias = || column_sums(slice(&dy), windows.channels, of_bias);
+            [wanted[0].then(dx), wanted[1].then(dw).flatten(), wanted[2].then(bias).flatten()]
         }
     }
 }

@@ -13,6 +13,8 @@ use burn::backend::flex::FlexTensor;
 use burn::backend::{Autodiff, BackendTypes, Flex};
 use burn::tensor::{Tensor, TensorData};
 
+use super::simd::add_rows;
+
 /// The CPU backend under autodiff.
 type Tracked = Autodiff<Flex, NoCheckpointing>;
 
@@ -29,9 +31,27 @@ pub(super) trait Fused<const N: usize>: Clone + Debug + Send + 'static {
         self.forward(inputs).0
     }
 
-    /// The gradients of the inputs that are `wanted`, from the output's gradient `dy`.
-    fn backward(&self, kept: Self::Kept, dy: FlexTensor, wanted: [bool; N]) -> [Option<FlexTensor>; N];
+    /// The gradients of the inputs that are `wanted`, from the output's gradient `dy`. A kernel has this function or
+    /// [`backward_to`](Self::backward_to).
+    fn backward(&self, kept: Self::Kept, dy: FlexTensor, wanted: [bool; N]) -> [Option<FlexTensor>; N] {
+        self.backward_to(kept, dy, wanted, [const { None }; N])
+    }
+
+    /// As [`backward`](Self::backward). The gradient of an input that has a place may be written there instead of returned;
+    /// the place's old content is not read.
+    fn backward_to(
+        &self,
+        kept: Self::Kept,
+        dy: FlexTensor,
+        wanted: [bool; N],
+        _places: Places<'_, N>,
+    ) -> [Option<FlexTensor>; N] {
+        self.backward(kept, dy, wanted)
+    }
 }
+
+/// For each input of a kernel, the place of its gradient in the buffer of all gradients, if it is a parameter's first.
+pub(super) type Places<'a, const N: usize> = [Option<&'a mut [f32]>; N];
 
 /// An input of a kernel.
 pub(super) enum Input {
@@ -60,7 +80,8 @@ impl<K: Fused<N>, const N: usize> Backward<Flex, N> for Taped<K> {
     fn backward(self, ops: Ops<Self::State, N>, grads: &mut Gradients, _: &mut Checkpointer) {
         let dy = contiguous(grads.consume::<Flex>(&ops.node));
         let wanted = ops.parents.each_ref().map(Option::is_some);
-        let found = self.0.backward(ops.state, dy, wanted);
+        let parents = ops.parents.each_ref().map(|parent| parent.as_ref().map(|parent| parent.id));
+        let found = Collector::lend(parents, |places| self.0.backward_to(ops.state, dy, wanted, places));
         for (parent, gradient) in ops.parents.into_iter().zip(found) {
             if let (Some(parent), Some(gradient)) = (parent, gradient)
                 && !Collector::takes(parent.id, &gradient)
@@ -132,6 +153,30 @@ impl Collector {
         (result, values, written)
     }
 
+    /// Lends `write` the places of the parameters that have no gradient yet. Those whose gradient it leaves out are there.
+    fn lend<const N: usize>(
+        ids: [Option<NodeId>; N],
+        write: impl FnOnce(Places<'_, N>) -> [Option<FlexTensor>; N],
+    ) -> [Option<FlexTensor>; N] {
+        COLLECTOR.with_borrow_mut(|collector| {
+            let Some(Self { places, values }) = collector else { return write([const { None }; N]) };
+            let free = |id: &NodeId| places.get(id).filter(|(_, is_there)| !is_there).map(|(place, _)| place.clone());
+            let ranges = ids.each_ref().map(|id| id.as_ref().and_then(free));
+            let whole = ranges.clone().map(Option::unwrap_or_default);
+            // An input that is used twice in one call has one place.
+            let Ok(lent) = values.get_disjoint_mut(whole) else { return write([const { None }; N]) };
+            let mut lent = lent.into_iter();
+            let places_of = ranges.each_ref().map(|range| lent.next().filter(|_| range.is_some()));
+            let found = write(places_of);
+            for ((id, range), gradient) in ids.iter().zip(&ranges).zip(&found) {
+                if let (Some(id), Some(_), None) = (id, range, gradient) {
+                    places.get_mut(id).expect("it was lent").1 = true;
+                }
+            }
+            found
+        })
+    }
+
     /// Takes a gradient, or adds it if the parameter has several uses. Returns false if it is not one to collect.
     fn takes(id: NodeId, gradient: &FlexTensor) -> bool {
         COLLECTOR.with_borrow_mut(|collector| {
@@ -200,6 +245,18 @@ pub(super) fn shape(x: &FlexTensor) -> Vec<usize> {
 /// Makes a tensor of `values` in `shape`.
 pub(super) fn make(values: Vec<f32>, shape: &[usize]) -> FlexTensor {
     FlexTensor::from_data(TensorData::new(values, shape.to_vec()))
+}
+
+/// The sums of the columns of `rows`: written to `place` if there is one, and returned otherwise.
+pub(super) fn column_sums(rows: &[f32], width: usize, place: Option<&mut [f32]>) -> Option<FlexTensor> {
+    let Some(place) = place else {
+        let mut sum = vec![0.0; width];
+        add_rows(&mut sum, rows);
+        return Some(make(sum, &[width]));
+    };
+    place.fill(0.0);
+    add_rows(place, rows);
+    None
 }
 
 /// A function of every element, whose gradient follows from the input.

@@ -72,9 +72,9 @@ fn composed(
 mod kernel {
     use burn::backend::flex::FlexTensor;
 
-    use crate::kernels::fused::{Fused, make, slice};
-    use crate::kernels::raw::{Start, View, affine, matmul, product};
-    use crate::kernels::simd::{Lanes, add_rows, multiversion, update};
+    use crate::kernels::fused::{Fused, Places, column_sums, make, slice};
+    use crate::kernels::raw::{Start, View, affine, matmul, product_to};
+    use crate::kernels::simd::{Lanes, multiversion, update};
 
     /// One direction over a batch.
     #[derive(Debug, Clone)]
@@ -226,7 +226,13 @@ mod kernel {
             (make(states, &[self.batch, self.tokens, self.width]), (run, weight))
         }
 
-        fn backward(&self, (run, weight): Self::Kept, dy: FlexTensor, wanted: [bool; 4]) -> [Option<FlexTensor>; 4] {
+        fn backward_to(
+            &self,
+            (run, weight): Self::Kept,
+            dy: FlexTensor,
+            wanted: [bool; 4],
+            [_, _, of_weight, of_bias]: Places<'_, 4>,
+        ) -> [Option<FlexTensor>; 4] {
             let shape = self;
             let &Gru { batch, tokens, width, .. } = shape;
             let order = shape.order();
@@ -273,22 +279,18 @@ mod kernel {
             let by_weight = || {
                 let rows = olds.len() / width;
                 let dw = match rows {
-                    0 => vec![0.0; 3 * width * width],
-                    _ => product((3 * width, width, rows), &du, by_gate.t(), olds, by_row),
+                    0 => Some(vec![0.0; 3 * width * width]),
+                    _ => product_to((3 * width, width, rows), &du, by_gate.t(), olds, by_row, of_weight),
                 };
-                make(dw, &[3 * width, width])
+                dw.map(|dw| make(dw, &[3 * width, width]))
             };
-            let by_bias = || {
-                let mut db = vec![0.0; 3 * width];
-                add_rows(&mut db, &du);
-                make(db, &[3 * width])
-            };
+            let by_bias = || column_sums(&du, 3 * width, of_bias);
             let mut dstart = vec![0.0; batch * width];
             for (b, dh) in order.iter().zip(dh.chunks_exact(width)) {
                 dstart[b * width..(b + 1) * width].copy_from_slice(dh);
             }
-            let weight = wanted[2].then(by_weight);
-            let bias = wanted[3].then(by_bias);
+            let weight = wanted[2].then(by_weight).flatten();
+            let bias = wanted[3].then(by_bias).flatten();
             [Some(make(da, &[batch, tokens, 3 * width])), Some(make(dstart, &[batch, width])), weight, bias]
         }
     }

@@ -32,9 +32,8 @@ pub fn linear<const D: usize>(x: Tensor<D>, weight: Tensor<2>, bias: Option<Tens
 mod kernel {
     use burn::backend::flex::FlexTensor;
 
-    use crate::kernels::fused::{Fused, make, shape, slice};
-    use crate::kernels::raw::{View, affine, product};
-    use crate::kernels::simd::add_rows;
+    use crate::kernels::fused::{Fused, Places, column_sums, make, shape, slice};
+    use crate::kernels::raw::{View, affine, product, product_to};
 
     /// The product with a weight, and a bias if there are three inputs.
     #[derive(Debug, Clone)]
@@ -56,8 +55,14 @@ mod kernel {
         make(y, &to)
     }
 
-    /// The gradients of input and weight.
-    fn backward(x: &FlexTensor, w: &FlexTensor, dy: &[f32], wanted: [bool; 2]) -> [Option<FlexTensor>; 2] {
+    /// The gradients of input and weight; the weight's is written to its place if there is one.
+    fn backward(
+        x: &FlexTensor,
+        w: &FlexTensor,
+        dy: &[f32],
+        wanted: [bool; 2],
+        place: Option<&mut [f32]>,
+    ) -> [Option<FlexTensor>; 2] {
         let to = shape(x);
         let weight = shape(w);
         let inner = to[to.len() - 1];
@@ -67,10 +72,9 @@ mod kernel {
         let out = w.len() / inner;
         let wide = View::rows(inner);
         let narrow = View::rows(out);
-        [
-            wanted[0].then(|| make(product((rows, inner, out), dy, narrow, w, wide), &to)),
-            wanted[1].then(|| make(product((out, inner, rows), dy, narrow.t(), x, wide), &weight)),
-        ]
+        let dx = || make(product((rows, inner, out), dy, narrow, w, wide), &to);
+        let dw = || product_to((out, inner, rows), dy, narrow.t(), x, wide, place).map(|dw| make(dw, &weight));
+        [wanted[0].then(dx), wanted[1].then(dw).flatten()]
     }
 
     impl Fused<2> for Linear {
@@ -80,8 +84,14 @@ mod kernel {
             (forward(&x, &w, None), (x, w))
         }
 
-        fn backward(&self, (x, w): Self::Kept, dy: FlexTensor, wanted: [bool; 2]) -> [Option<FlexTensor>; 2] {
-            backward(&x, &w, slice(&dy), wanted)
+        fn backward_to(
+            &self,
+            (x, w): Self::Kept,
+            dy: FlexTensor,
+            wanted: [bool; 2],
+            [_, place]: Places<'_, 2>,
+        ) -> [Option<FlexTensor>; 2] {
+            backward(&x, &w, slice(&dy), wanted, place)
         }
     }
 
@@ -92,16 +102,17 @@ mod kernel {
             (forward(&x, &w, Some(&bias)), (x, w))
         }
 
-        fn backward(&self, (x, w): Self::Kept, dy: FlexTensor, wanted: [bool; 3]) -> [Option<FlexTensor>; 3] {
+        fn backward_to(
+            &self,
+            (x, w): Self::Kept,
+            dy: FlexTensor,
+            wanted: [bool; 3],
+            [_, of_weight, of_bias]: Places<'_, 3>,
+        ) -> [Option<FlexTensor>; 3] {
             let dy = slice(&dy);
-            let [dx, dw] = backward(&x, &w, dy, [wanted[0], wanted[1]]);
-            let out = shape(&w)[0];
-            let bias = || {
-                let mut sum = vec![0.0; out];
-                add_rows(&mut sum, dy);
-                make(sum, &[out])
-            };
-            [dx, dw, wanted[2].then(bias)]
+            let [dx, dw] = backward(&x, &w, dy, [wanted[0], wanted[1]], of_weight);
+            let bias = || column_sums(dy, shape(&w)[0], of_bias);
+            [dx, dw, wanted[2].then(bias).flatten()]
         }
     }
 }

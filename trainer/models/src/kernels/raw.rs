@@ -146,6 +146,21 @@ pub(super) fn product(sizes: (usize, usize, usize), a: &[f32], av: View, b: &[f3
     Product { sizes, a: (a, av), b: (b, bv), scale: 1.0, start: Start::Zero }.made()
 }
 
+/// `a b` written to `place` if there is one, and returned otherwise.
+pub(super) fn product_to(
+    sizes: (usize, usize, usize),
+    a: &[f32],
+    av: View,
+    b: &[f32],
+    bv: View,
+    place: Option<&mut [f32]>,
+) -> Option<Vec<f32>> {
+    let product = Product { sizes, a: (a, av), b: (b, bv), scale: 1.0, start: Start::Zero };
+    let Some(place) = place else { return Some(product.made()) };
+    product.write_to(place, View::rows(sizes.1));
+    None
+}
+
 /// Adds `scale a b` to what `start` says, with `a` m x k, `b` k x n and `c` m x n.
 #[expect(clippy::too_many_arguments, reason = "a matrix product has three matrices and three sizes")]
 pub(super) fn matmul(
