@@ -121,7 +121,7 @@ impl Default for TrainEvaluator {
 
 impl StageSpec for TrainEvaluator {
     const KIND: &'static str = "train.evaluator";
-    const VERSION: u32 = 3;
+    const VERSION: u32 = 4;
     const SHAPE: Shape = Shape::Gang;
     const OUTPUT: Output = Output { name: "evaluator", kind: ArtifactKind::Evaluator };
 

@@ -12,7 +12,7 @@
 use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
 use models::flat;
-use models::kernels::Dropout;
+use models::kernels::{Dropout, Pointwise, weighted_distance};
 use models::networks::{Evaluator, Init, MotionEncoder, MovementDecoder, MovementEncoder, TextEncoder};
 use motion::Stream;
 use motion::dataset::normalise;
@@ -140,26 +140,24 @@ impl EvaluatorObjective {
         let made = self.movements.decoder.forward(movements.clone());
         let [_, count, latent] = movements.dims();
 
-        let mean = |x: Tensor<3>, valid: &[usize]| {
-            let [_, places, channels] = x.dims();
-            (x * self.weights(valid, places)).sum() / channels as f32
+        let mean = |found: Tensor<3>, expected: Tensor<3>, valid: &[usize]| {
+            let [_, places, channels] = found.dims();
+            weighted_distance(Pointwise::L1, found, expected, self.weights(valid, places)) / channels as f32
         };
         let valid: Vec<usize> = lengths.iter().map(|len| (len / UNIT).max(1)).collect();
         let pairs: Vec<usize> = valid.iter().map(|n| (n - 1).max(1)).collect();
-        let reconstruction = mean((made - rows).abs(), &lengths);
-        let sparsity = mean(movements.clone().abs(), &valid);
+        let reconstruction = mean(made, rows, &lengths);
+        let sparsity = mean(movements.clone(), Tensor::zeros([batch, count, latent], &self.device), &valid);
         let at = |from: usize| movements.clone().slice([0..batch, from..from + count - 1, 0..latent]);
-        let smoothness = mean((at(1) - at(0)).abs(), &pairs);
+        let smoothness = mean(at(1), at(0), &pairs);
         let phase = &self.settings.movement;
         let loss = reconstruction.clone() + sparsity * phase.sparsity + smoothness * phase.smoothness;
 
         let reconstruction = reconstruction.inner().into_scalar::<f32>() / global as f32;
         let loss = loss / global as f32;
         let value = loss.clone().inner().into_scalar::<f32>();
-        let mut gradients = loss.backward();
-        let flat = flat::take_gradients(&self.movements, &mut gradients);
         Ok(SliceResult {
-            gradients: vec![Vec::new(), Vec::new(), flat],
+            gradients: vec![Vec::new(), Vec::new(), flat::gradient(&self.movements, loss)],
             terms: vec![value, reconstruction, 0.0, 0.0],
             ..SliceResult::default()
         })
@@ -260,13 +258,13 @@ impl Objective for EvaluatorObjective {
     }
 
     fn load(&mut self, state: &TrainState) {
+        if state.step < self.turning_point() {
+            return state.groups[2].trained().assign(&mut self.movements);
+        }
         state.groups[0].trained().assign(&mut self.text);
         state.groups[1].trained().assign(&mut self.motion);
-        state.groups[2].trained().assign(&mut self.movements);
-        if state.step >= self.turning_point() {
-            // The average, if one is kept: the evaluator will have its weights.
-            state.groups[2].averaged().assign_first(&mut self.frozen);
-        }
+        // The average, if one is kept: the evaluator will have its weights.
+        state.groups[2].averaged().assign_first(&mut self.frozen);
     }
 
     fn slice(&mut self, step: u64, slice: usize) -> Result<SliceResult, StageError> {
