@@ -1,11 +1,11 @@
 """Samples per second of trainings, milliseconds of a sample, and peak memory, beside PyTorch. See compare.sh.
 
 Each row alternates between the programs for several rounds and takes medians. A stage of Stride starts in a copy of a
-store that has its inputs; its time is the stage's own by the wall, checkpoints and start included. With two workers
-PyTorch has the better of one process with two threads and two processes with gloo.
+store that has its inputs. A step's time is the median that the stage's log names, as PyTorch's is the median of the
+program's own rounds: start and checkpoints do not count on either side. With two workers PyTorch has the better of one
+process with two threads and two processes with gloo.
 
-At published sizes a few updates are compared by their median, which a stage's log names. Start and checkpoints do not
-count. Memory is the largest resident set of a process.
+Memory is the largest resident set of a process.
 """
 
 from __future__ import annotations
@@ -187,10 +187,9 @@ def with_steps(settings: list[str], stage: str, steps: int) -> list[str]:
     return [*kept, f"{own[0]}{steps}", f"{own[1]}{min(5, steps - 1)}"]
 
 
-def seconds_of(stage: dict[str, object], what: str) -> float:
+def must_have_run(stage: dict[str, object], what: str) -> None:
     if stage["state"] != "ran":
         sys.exit(f"{what}: the stage is {stage['state']}; expected it to run")
-    return float(stage["wall_s"])
 
 
 def logged(store: Path, stage: str) -> tuple[float, str, str]:
@@ -212,7 +211,8 @@ def trained(size: Size, base: Path, training: Training, workers: int, seconds: f
         shutil.copytree(base, store)
         settings = with_steps([*size.short, *training.settings], training.stage, steps)
         stage, _ = stride(size.config, store, workers, training.stage, settings)
-    return steps * training.batch / seconds_of(stage, training.name)
+        must_have_run(stage, training.name)
+        return training.batch / logged(store, training.stage)[0]
 
 
 def apart(size: Size, base: Path, training: Training, seconds: float) -> float:
@@ -319,7 +319,7 @@ def recipe(published: Published) -> list[str]:
     lines = [line for line in (ROOT / published.config).read_text().splitlines() if not line.strip().startswith("#")]
     data = "dataset" if any(line.startswith("dataset:") for line in lines) else "stages.dataset"
     made = "format: synthetic" if data == "dataset" else "kind: data.synthetic"
-    settings = ["text={encoder: hashed}", f"{data}={{{made}, clips: 40, val: 0.1, test: 0.2}}", *published.settings]
+    settings = ["text={encoder: hashed}", f"{data}={{{made}, clips: 40, val: 0.1, test: 0.2}}"]
     name = ""
     for line in lines:
         if line.startswith("  ") and not line.startswith("   ") and ":" in line:
@@ -333,7 +333,8 @@ def recipe(published: Published) -> list[str]:
             settings += [f"stages.{name}.steps=2", f"stages.{name}.warmup=0", f"stages.{name}.batch={{global: {PUBLISHED_BATCH}, slices: 1}}"]
             settings += [f"stages.{name}.movement.batch={PUBLISHED_BATCH}"] if "train.evaluator" in line else []
             settings += [f"stages.{name}.windows.batch={PUBLISHED_BATCH}"] if "train.vae" in line else []
-    return settings
+    # A setting of the row comes last, because one above replaces whole stages.
+    return [*settings, *published.settings]
 
 
 def published(rounds: int) -> Iterator[str]:
@@ -350,7 +351,7 @@ def published(rounds: int) -> Iterator[str]:
                 # The first run makes the inputs, whose peaks do not count.
                 for steps in (few, many):
                     stage, peak = stride(case.config, store, 1, case.stage, with_steps(settings, case.stage, steps))
-                seconds_of(stage, case.name)
+                must_have_run(stage, case.name)
                 step, *products = logged(store, case.stage)
                 own.append(step)
                 memory[0] = max(memory[0], peak)
@@ -398,7 +399,8 @@ def main() -> None:
     parts = []
     if asked.sizes != "published":
         parts.append(
-            f"## The quickstart's size\n\nBy the wall, the median of {asked.rounds} x {asked.seconds:.0f} s; the programs alternate. "
+            f"## The quickstart's size\n\nBy the wall, from the median time of a step in {asked.rounds} x {asked.seconds:.0f} s; the programs alternate. "
+            "Start and checkpoints do not count on either side. "
             '"Tuned" is PyTorch with the fastest kernels of MKL and settings of glibc, "stock" as pip installs it. '
             "Beside two workers, PyTorch has the better of two threads and two processes (gloo). "
             '"Scaling" compares two workers with two runs of one worker at the same time.\n\n' + small(asked)
