@@ -5,7 +5,7 @@ use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
 use models::flat;
 use models::kernels::{self, Derivative, Dropout, KeyMask, Sweep, stock};
-use models::networks::{Init, Linear};
+use models::networks::{BiGru, EvaluatorConfig, Init, Linear, MovementDecoder, MovementEncoder};
 use motion::skeleton::Skeleton;
 use protocol::Seed;
 use protocol::stage::{DataFormat, Positions};
@@ -545,4 +545,37 @@ fn gradients_that_are_collected_are_those_of_the_tape() {
     let of_layer = tape.len() / 4;
     assert!(tape[of_layer..2 * of_layer].iter().all(|g| *g == 0.0));
     assert!(tape[..of_layer].iter().chain(&tape[3 * of_layer..]).all(|g| *g != 0.0));
+}
+
+#[test]
+fn collected_gradients_of_convolutions_and_recurrent_units_are_those_of_the_tape() {
+    let device = Device::flex().autodiff();
+    let mut init = Init::new(Seed(4), "collected", Positions::Uniform, &device);
+    let config = EvaluatorConfig {
+        features: 6,
+        movement_hidden: 5,
+        movement: 4,
+        motion_hidden: 4,
+        word: 1,
+        classes: 1,
+        text_hidden: 1,
+        embedding: 1,
+    };
+    let encoder = MovementEncoder::new(&config, &mut init);
+    let decoder = MovementDecoder::new(&config, 6, &mut init);
+    let network = (encoder, decoder, BiGru::new(&mut init, 4, 4));
+    // The encoder has two uses.
+    let loss = || {
+        let (encoder, decoder, gru) = &network;
+        let encode = |x: Tensor<3>| encoder.forward(x, &mut Dropout::off());
+        let x = encode(decoder.forward(encode(tensor([2, 16, 6], 1, &device))));
+        let start = [2, 3].map(|seed| tensor([2, 4], seed, &device));
+        let [ahead, back] = gru.forward(x, &[4, 3], start);
+        weighted(ahead) + weighted(back) * 0.5
+    };
+    let tape = flat::take_gradients(&network, &mut loss().backward());
+    flat::recycle(vec![f32::NAN; network.num_params()]);
+    let collected = flat::gradient(&network, loss());
+    assert_eq!(collected, tape);
+    assert!(tape.iter().filter(|g| **g != 0.0).count() > tape.len() * 9 / 10);
 }
