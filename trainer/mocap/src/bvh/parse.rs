@@ -73,7 +73,8 @@ impl<'a> Reader<'a> {
 
     /// The rest of the line up to a brace.
     fn name(&mut self) -> Result<String, Fault> {
-        let end = self.rest.find(['\n', '{', '}']).unwrap_or(self.rest.len());
+        let ends = |byte| matches!(byte, b'\n' | b'{' | b'}');
+        let end = self.rest.bytes().position(ends).unwrap_or(self.rest.len());
         let name = self.rest[..end].trim();
         if name.is_empty() {
             return self.fault("the joint has no name");
