@@ -38,7 +38,7 @@ pub(super) trait Fused<const N: usize>: Clone + Debug + Send + 'static {
     }
 
     /// As [`backward`](Self::backward). The gradient of an input that has a place may be written there instead of returned;
-    /// the place's old content is not read.
+    /// the place's old content is not read. An input that has a place and is left out of the result counts as written.
     fn backward_to(
         &self,
         kept: Self::Kept,
